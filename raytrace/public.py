@@ -17,7 +17,7 @@ from typing import Union, get_args, get_origin
 import torch
 from torch import Tensor
 
-from raytrace.formats import as_lens
+from raytrace.io import as_lens
 from raytrace.system.lens import Lens
 from raytrace.words import known_option, named_value, nameless, with_article
 

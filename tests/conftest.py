@@ -13,9 +13,9 @@ import torch
 from hypothesis import settings
 
 from raytrace.cli import main
-from raytrace.formats import read_lens
-from raytrace.fused import NoCompiler, prepare, tracing
-from raytrace.fused.library import library
+from raytrace.io import read_lens
+from raytrace.tracing.compiled import NoCompiler, prepare, trace_engine
+from raytrace.tracing.compiled.library import library
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
@@ -61,7 +61,7 @@ def triplet():
 def engine(request):
     """Traces by torch alone, or as `problems.both_engines` says."""
     name = getattr(request, "param", "eager")
-    with tracing(name):
+    with trace_engine(name):
         yield name
 
 

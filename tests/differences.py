@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from raytrace.merit.merit import Evaluation
+from raytrace.optimization.merit_rows import Evaluation
 
 
 def slopes_by_differences(evaluation: Evaluation, start: np.ndarray, relative: float = 1e-4) -> np.ndarray:

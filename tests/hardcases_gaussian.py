@@ -10,9 +10,9 @@ from decimal import Decimal, getcontext
 import torch
 from problems import floats
 
-from raytrace.kernels.pixels import gaussian_pixels
 from raytrace.maths.grid import Grid
-from raytrace.optics.spot import spot_of_points
+from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.tracing.spot import spot_of_points
 
 getcontext().prec = 60
 

@@ -12,9 +12,9 @@ from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import turned
 from torch.testing import assert_close
 
-from raytrace.fused import engine
-from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import Rays, start
+from raytrace.tracing.compiled import engine
+from raytrace.tracing.trace import trace_surfaces
 
 SYSTEMS = {case["id"]: case for case in CASES if case["kind"] == "trace"}
 SCALE = 2.0**20

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
+from raytrace.materials.glass import AIR, MIRROR, constant
 from raytrace.maths.numerics import dot, unit
-from raytrace.media.glass import AIR, MIRROR, constant
-from raytrace.optics.launch import rays_from_infinity, rays_from_point
-from raytrace.optics.trace import axial_path, steps
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Aperture, Surface
+from raytrace.tracing.launch import rays_from_infinity, rays_from_point
+from raytrace.tracing.trace import axial_path, steps
 
 ORACLE = Path(__file__).parent / "oracles" / "hardcases.json.gz"
 OUTPUTS = ("x", "y", "z", "L", "M", "N", "opl")

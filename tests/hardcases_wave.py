@@ -6,7 +6,7 @@ from decimal import Decimal, getcontext
 import pytest
 import torch
 
-from raytrace.kernels.dft import Aliased, EmptyPupil, fft_psf, huygens
+from raytrace.psf_models.dft import Aliased, EmptyPupil, fft_psf, huygens
 
 AMPLITUDE = 1e-13  # of U/ΣA, for every radius of the sphere
 INTENSITY = 1e-13  # of the diffraction peak

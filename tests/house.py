@@ -18,11 +18,11 @@ import torch
 from test_layers import FLOORS
 
 import raytrace as rt
-from raytrace.optics.trace import cross, media
+from raytrace.tracing.trace import cross, media
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Rooms that nothing imports: experiments and measurements, no part of the library.
-APART = ("studies", "bench")
+APART = ("bench",)
 
 
 def lines_of_rooms() -> Counter[str]:
@@ -107,8 +107,8 @@ def walks() -> dict[str, Callable[[], object]]:
 def tell_walks() -> None:
     for name, run in walks().items():
         files, upward = walked(run)
-        work = sorted(file for file in files if _floor(file) >= FLOORS["optics"])
-        print(f"{name}: {len(files)} files, {len(work)} of them from optics/ up, {len(upward)} calls upward")
+        work = sorted(file for file in files if _floor(file) >= FLOORS["tracing"])
+        print(f"{name}: {len(files)} files, {len(work)} of them from tracing/ up, {len(upward)} calls upward")
         print(f"  {' '.join(sorted(files))}")
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from test_seidel import SYSTEMS
 
 import raytrace as rt
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.system.intent import Solve, Vary
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.system.optimization_data import Solve, Vary
 
 LENSES = {
     **SYSTEMS,

@@ -15,20 +15,20 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
-from raytrace.formats.zemax_keywords import AIMINGS
-from raytrace.kernels import diffraction
+from raytrace.io.zemax.keywords import AIMINGS
+from raytrace.materials import glass
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.environment import Environment
 from raytrace.maths import pupil, zernike
-from raytrace.media import glass
-from raytrace.media.catalog import find_glass
-from raytrace.media.environment import Environment
-from raytrace.optics.launch import launch, stop_radius
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene, scene
-from raytrace.optics.trace import media, steps, trace_lens
-from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
+from raytrace.psf_models import wave
 from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
+from raytrace.tracing.launch import launch, stop_radius
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, scene
+from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of
 
 ORACLE = Path(__file__).parent / "oracles" / "opticstudio.json.gz"
 
@@ -397,8 +397,8 @@ def intensities(case, x, y):
     """
     lens = lens_of(case)
     view = scene_at(case, lens.wavelengths)
-    light = diffraction.waves(view, torch.hypot(x.abs().max(), y.abs().max()), order=2)
-    U = diffraction.amplitude(light, x, y)[0, 0]
+    light = wave.waves(view, torch.hypot(x.abs().max(), y.abs().max()), order=2)
+    U = wave.amplitude(light, x, y)[0, 0]
     best = light.amplitude.sum(-1)[0, 0] / (1e-3 * lens.wavelengths / light.wavefront.index)
     return U.real**2 + U.imag**2, best**2
 
@@ -427,7 +427,7 @@ def mtf_huygens(case):
 def strehl(case):
     """The peak of all wavelengths together, by weight."""
     if len(lens_of(case).wavelengths) == 1:
-        return flat(diffraction.strehl(scene_at(case, waves_of(case))))
+        return flat(wave.strehl(scene_at(case, waves_of(case))))
     found, best = intensities(case, tensor([0.0]), tensor([0.0]))
     return flat((share_of(case) * found / best[:, None, None]).sum(0))
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.formats import read_lens
-from raytrace.media.glass import AIR, MIRROR, Glass, constant
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene, scene
-from raytrace.system.intent import Row
+from raytrace.io import read_lens
+from raytrace.materials.glass import AIR, MIRROR, Glass, constant
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
 from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Aperture, Surface
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, scene
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
-both_engines = pytest.mark.parametrize("engine", ["eager", "fused"], indirect=True)
+both_engines = pytest.mark.parametrize("engine", ["eager", "compiled"], indirect=True)
 
 #: Lengths in mm, for tolerances that carry a unit.
 MICROMETRE = 1e-3

@@ -11,10 +11,10 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.kernels.dft import phasor
 from raytrace.maths.pupil import gauss_rings
-from raytrace.wave.element import path
-from raytrace.wave.scene import WaveScene, aperture, excess, millimetres
+from raytrace.psf_models.dft import phasor
+from raytrace.wave_optics.element import path
+from raytrace.wave_optics.scene import WaveScene, aperture, excess, millimetres
 
 
 def field(

@@ -10,10 +10,10 @@ from problems import MICROMETRE, NANOMETRE, double_gauss, fields, lens, scalar, 
 import raytrace as rt
 from raytrace import chromatic_focal_shift, distortion, distortion_grid, incidence, longitudinal_aberration
 from raytrace.cli import main
-from raytrace.media.glass import MIRROR
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.materials.glass import MIRROR
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 INF = math.inf
 SPHERE = lens([surface(None, 300.0), surface(-0.01, -50.0, MIRROR)], aperture=("entrance_pupil_diameter", 80.0))

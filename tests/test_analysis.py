@@ -12,17 +12,16 @@ import raytrace as rt
 from raytrace.analysis.mtf import cutoff
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
+from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.media.glass import model_glass
-from raytrace.optics.focus import image_rays
-from raytrace.optics.launch import launch
-from raytrace.optics.losses import OutOfReach
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.spot import EmptySpot
-from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.ray_failures import OutOfReach
+from raytrace.tracing.spot import EmptySpot, image_rays
+from raytrace.tracing.trace import trace_lens
 
 WAVELENGTH = 0.55e-3  # mm
 

@@ -8,8 +8,9 @@ import torch
 from problems import surface
 from torch.autograd import gradcheck, gradgradcheck
 
+from raytrace.system.intersection import intersect
 from raytrace.system.shapes import EVEN, sag_and_derivatives
-from raytrace.system.surface import intersect, sag
+from raytrace.system.surface import sag
 
 ROUNDING = 2.0**-53
 

@@ -8,9 +8,8 @@ import torch
 from bends import pose, real
 
 import raytrace as rt
-from raytrace.optics.aiming import at_stop
-from raytrace.optics.axis import Bent, is_bent
-from raytrace.optics.paraxial import largest_field
+from raytrace.tracing.aiming import Bent, at_stop, is_bent
+from raytrace.tracing.paraxial import largest_field
 
 
 def near(found, expected, tolerance=1e-9):

@@ -23,11 +23,11 @@ from raytrace.bench.measure import (
 from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.media.glass import MIRROR, constant
-from raytrace.optics.trace import trace_lens, trace_surfaces
+from raytrace.io import read_lens
+from raytrace.materials.glass import MIRROR, constant
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("same_threads")
 

@@ -10,13 +10,12 @@ from raytrace.bench import measure as timing
 from raytrace.bench.less_work import cases, double_gauss, measure, with_spheres_for_planes
 from raytrace.bench.measure import with_leaf, with_sensor_leaf
 from raytrace.bench.speed import Sizes
-from raytrace.fused import prepare, tracing
-from raytrace.kernels import MODELS, fourier, psf
 from raytrace.maths.pupil import sobol
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.scene import scene, symmetry
+from raytrace.psf_models import MODELS, fourier, psf
 from raytrace.system.lens import with_object_distance
+from raytrace.tracing.compiled import prepare, trace_engine
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.scene import Memo, scene, symmetry, trace_bundle
 
 TINY = Sizes(less=64, distances=2)
 ROUNDING = 1e-10  # of sums of kernels and gradients; a kernel 1e-12 degrees off the axis moves by 3e-11 of itself
@@ -31,7 +30,7 @@ def bound(what):
 
 @pytest.mark.parametrize("case", cases(TINY), ids=lambda case: f"{case.engine} {case.what}")
 def test_less_work_gives_the_same_result(case):
-    with tracing(case.engine):
+    with trace_engine(case.engine):
         for _ in range(2):  # a Memo is filled by the first call
             less, full = case.less(), case.full()
             assert less.shape == full.shape
@@ -47,7 +46,7 @@ def test_rows_say_what_was_compared(monkeypatch):
     rows = measure(TINY, repeats=1, progress=words.append)
     assert torch.get_num_threads() == before
     assert words == [row.what for row in rows] == [case.what for case in few]
-    assert {row.engine for row in rows} == {"eager"} | ({"fused"} if prepare() == "fused" else set())
+    assert {row.engine for row in rows} == {"eager"} | ({"compiled"} if prepare() == "compiled" else set())
     for row in rows:
         assert row.gain == row.seconds_without / row.seconds
         assert 0 <= row.error < ROUNDING
@@ -108,7 +107,7 @@ def test_a_range_of_distances_is_remembered_behind_surfaces_that_do_not_bend():
     colours = torch.tensor([0.48, 0.64], dtype=torch.float64)[:, None]
     bundle = lens, torch.zeros(2, 1, 1, 1, dtype=torch.float64), colours, sobol(8)[0]
     memo = Memo(object_distances=(10e3, 50e3))
-    with tracing("eager"):
+    with trace_engine("eager"):
         kept, traced = trace_bundle(bundle, memo), trace_bundle(bundle)
     assert [(one.found.count, one.found.smooth) for one in memo._kept] == [(1, True)]
     assert float((kept.position - traced.position).detach().abs().max()) < 1e-8  # mm

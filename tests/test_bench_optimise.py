@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.optics.paraxial import first_order
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.tracing.paraxial import first_order
 
 peers = pytest.importorskip("raytrace.bench.peers_optimise", reason="needs the extra [bench]", exc_type=ImportError)
 
@@ -26,8 +26,8 @@ def test_both_programs_find_the_same_merit(name, moved):
         assert float(posed.sum_squared()) == pytest.approx(here, rel=1e-9)
     rows = Evaluation(Model(problem.lens, problem.variables), problem.rows)
     assert rows(rows.model.start).merit ** 2 == pytest.approx(here, rel=1e-9)
-    assert problem.lens.intent.merit == problem.rows
-    assert problem.lens.intent.variables == problem.variables
+    assert problem.lens.optimization_data.merit == problem.rows
+    assert problem.lens.optimization_data.variables == problem.variables
     assert sum(row.weight for row in problem.rows) == pytest.approx(1 + math.pi)
 
 

@@ -19,10 +19,10 @@ from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
 from raytrace.bench.psf_report import judged, lines, targets
 from raytrace.bench.report import Measured
 from raytrace.cli import main
-from raytrace.formats import read_lens
-from raytrace.kernels import MODELS, diffraction, raymap
-from raytrace.kernels.gaussian import kernels as gaussian_kernels
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
+from raytrace.psf_models import MODELS, drt, wave
+from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture
 
 pytestmark = pytest.mark.usefixtures("threads")
@@ -60,7 +60,7 @@ def test_direct_sum_is_the_wave_models_limit():
     lens = problems.double_gauss(aperture=("entrance_pupil_diameter", 8.0))
     s = scene_of(lens, 7.0, 25e3)
     window = grid(0.01, 3, moments(s, 16, 64).centroid)
-    found = diffraction.kernels(s, window, order=1)
+    found = wave.kernels(s, window, order=1)
     rings, arms, nodes = bench.wave_sampling(s, window)
     kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
     assert kernel.sum() > 0.3
@@ -100,7 +100,7 @@ def test_random_histogram_is_one_histogram_however_it_is_cut():
     whole = random_histogram(case.scene, window, 3000, piece=3000)
     cut = random_histogram(case.scene, window, 3000, piece=1000)
     assert (whole.kernel - cut.kernel).abs().max() < 1e-12
-    reference = raymap.reference(case.scene, window, lines=512)[0, 0, 0]
+    reference = drt.reference(case.scene, window, lines=512)[0, 0, 0]
     assert 0.1 < bench.relative_l1(whole.kernel[0, 0, 0], reference) < 0.4  # 0.8 Σ√p/√3000
 
 
@@ -192,7 +192,7 @@ def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
     monkeypatch.setattr(bench, "_PILOT", 4000)
     case = cases([("double_gauss", read_lens("double_gauss"))])[0]
     window = case.window(vector(0.0, 0.0))
-    kernels = {"rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0]}
+    kernels = {"rays": drt.reference(case.scene, window, lines=512)[0, 0, 0]}
     truth = bench.Truth(case, kernels, {"rays": window}, vector(0.0, 0.0), moments(case.scene, 6, 24).variance.sqrt())
     found = random_rows(truth, torch.float64, 1)
     assert 0.08 < found[-1].l1_error < 0.12
@@ -268,8 +268,8 @@ def test_peer_sees_the_same_kernels():
     case = cases([("double_gauss", read_lens("double_gauss"))])[1]
     window = case.window(moments(case.scene, 8, 32).centroid)
     kernels = {
-        "rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0],
-        "wave": diffraction.kernels(case.scene, window).kernel[0, 0, 0].detach(),
+        "rays": drt.reference(case.scene, window, lines=512)[0, 0, 0],
+        "wave": wave.kernels(case.scene, window).kernel[0, 0, 0].detach(),
     }
     truth = bench.Truth(case, kernels, dict.fromkeys(kernels, window), window.centre, vector(0.02, 0.02))
     found = {}

@@ -29,13 +29,13 @@ from raytrace.bench.report import KEPT, Measured
 from raytrace.bench.speed import Bench, Row, Sizes, measure, stages, three_aspheres
 from raytrace.bench.speed_report import document, lines, targets
 from raytrace.cli import main
-from raytrace.formats import read_lens
-from raytrace.fused import NoCompiler, tracing
+from raytrace.io import read_lens
 from raytrace.maths.value import to
-from raytrace.optics.focus import spot_parabola
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.system.rays import Rays
+from raytrace.tracing.compiled import NoCompiler, trace_engine
+from raytrace.tracing.focus import spot_parabola
+from raytrace.tracing.scene import Memo, trace_bundle
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("same_threads")
 
@@ -72,7 +72,7 @@ def built():
 def compared(limit, lens, rays):
     """Largest distance of position and direction, where both come through; and that the same rays do."""
     lens, rays = to(lens, dtype=limit.dtype), to(rays, dtype=limit.dtype)
-    with torch.no_grad(), tracing("eager"):
+    with torch.no_grad(), trace_engine("eager"):
         expected = trace_lens(lens, rays, lens.primary)
     found = limit.trace(rays)
     assert torch.equal(found.valid, expected.valid)
@@ -120,7 +120,7 @@ def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
     found = limit.trace(rays)
     assert bool(torch.isfinite(found.position).all())
     assert 0.05 < float(found.valid.double().mean()) < 0.6
-    with torch.no_grad(), tracing("eager"):
+    with torch.no_grad(), trace_engine("eager"):
         expected = trace_lens(lens, rays, lens.wavelengths[0])
     differ = int((found.valid ^ expected.valid).sum())
     assert differ == 0 if dtype == torch.float64 else differ < 5

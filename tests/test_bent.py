@@ -10,10 +10,10 @@ from bends import pose, real
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
-from raytrace.optics.axis import Bent
-from raytrace.optics.focus import along_normal, focus_of_rms
-from raytrace.optics.scene import symmetry
-from raytrace.optics.wavefront import rms, wavefront_of
+from raytrace.tracing.aiming import Bent
+from raytrace.tracing.focus import along_normal, focus_of_rms
+from raytrace.tracing.scene import symmetry
+from raytrace.tracing.wavefront import rms, wavefront_of
 
 FIELDS = [0.0, 7.0, 14.0]
 

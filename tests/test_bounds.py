@@ -7,9 +7,9 @@ import pytest
 import raytrace as rt
 from raytrace.budget import OverBudget
 from raytrace.cli import main
-from raytrace.formats.ray_table import RayTableError
-from raytrace.merit.default import BadMerit, rows_of
-from raytrace.system.naming import BadVariables, counted
+from raytrace.io.ray_tables import RayTableError
+from raytrace.optimization.default_merit import BadMerit, rows_of
+from raytrace.system.parameter_paths import BadVariables, counted
 
 SINGLET = rt.read_lens("singlet")
 

@@ -19,10 +19,10 @@ from raytrace.budget import OverBudget, TakesLong, afford, free_bytes, in_words,
 from raytrace.cli import build_parser, main
 from raytrace.cli.commands import COMMANDS
 from raytrace.files import shipped
-from raytrace.kernels import psf
-from raytrace.kernels.dft import rings_to_grid, to_grid, to_grid_mirrored
-from raytrace.optics.focus import image_rays
+from raytrace.psf_models import psf
+from raytrace.psf_models.dft import rings_to_grid, to_grid, to_grid_mirrored
 from raytrace.system.lens import SystemAperture
+from raytrace.tracing.spot import image_rays
 
 LENS = shipped("lenses") / "double_gauss.zmx"
 

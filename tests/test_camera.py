@@ -11,26 +11,18 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.image import blur
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import Run, Share
-from raytrace.camera.variables import BadVariables, Variables
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.kernels import psf
-from raytrace.maths.grid import grid
-from raytrace.optics.focus import NoImage, best_focus
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
-from raytrace.studies.codesign.closed_form import (
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.closed_form import (
     camera_error,
+    distance_in_focus,
     even_distances,
     optimise_closed_form,
     out_of_focus,
     power_spectrum,
+    sensor_range,
 )
-from raytrace.studies.codesign.conjugates import distance_in_focus, sensor_range
-from raytrace.studies.codesign.experiment import (
+from raytrace.imaging.codesign import (
     Batches,
     Outcome,
     absolute_error,
@@ -42,12 +34,21 @@ from raytrace.studies.codesign.experiment import (
     run_model,
     write_outcome,
 )
-from raytrace.studies.codesign.settings import Settings
-from raytrace.studies.pictures import dead_leaves, split
+from raytrace.imaging.image import blur
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.pictures import dead_leaves, split
+from raytrace.imaging.training import Run, Share
+from raytrace.imaging.variables import BadVariables, Variables
+from raytrace.io import read_lens
+from raytrace.maths.grid import grid
+from raytrace.psf_models import psf
+from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
+from raytrace.tracing.focus import NoImage, best_focus
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
-SMALL = Settings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
+SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
 MICROMETRE = 1e-3
 
 
@@ -131,30 +132,30 @@ def test_a_lens_user_learns_lens_and_network_in_a_few_lines():
 
 def test_experiment_starts_where_it_is_told():
     lens, wavelength = read_lens(LENS), number(0.53)
-    by_start = {s: lens_at_start(lens, Settings(start=s)) for s in ("paraxial", "rms", "58.1")}
+    by_start = {s: lens_at_start(lens, CodesignSettings(start=s)) for s in ("paraxial", "rms", "58.1")}
     places = {s: float(one.surfaces[-2].thickness) for s, one in by_start.items()}
     assert places["paraxial"] == pytest.approx(57.8817685, abs=1e-7)
     assert places["rms"] == pytest.approx(57.662, abs=5e-4)
     assert places["58.1"] == 58.1
     assert by_start["rms"].wavelengths.tolist() == [float(wavelength)]
-    slow = lens_at_start(lens, Settings(f_number=5.0))
+    slow = lens_at_start(lens, CodesignSettings(f_number=5.0))
     assert slow.aperture.kind == "image_f_number"
     with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms, spectral, gaussian or a "):
-        lens_at_start(lens, Settings(start="middle"))
+        lens_at_start(lens, CodesignSettings(start="middle"))
 
 
 def test_distance_in_focus_is_the_inverse_of_focusing():
     """25 m in paraxial focus; by least RMS spot that sensor is focused elsewhere: 17 to 21 m at F/3."""
-    lens = lens_at_start(read_lens(LENS), Settings())
+    lens = lens_at_start(read_lens(LENS), CodesignSettings())
     paraxial = distance_in_focus(lens, lambda one: paraxial_image_distance(one, one.surfaces[0].thickness))
     assert paraxial == pytest.approx(25e3, rel=1e-6)
     rms = distance_in_focus(lens, best_focus)
     sharp = float(best_focus(with_object_distance(lens, rms)))
     assert sharp == pytest.approx(float(lens.surfaces[-2].thickness), abs=1e-8)
     assert 10e3 < rms < 25e3
-    assert distance_in_focus(lens_at_start(read_lens(LENS), Settings(start="57.0")), best_focus) == math.inf
+    assert distance_in_focus(lens_at_start(read_lens(LENS), CodesignSettings(start="57.0")), best_focus) == math.inf
     with pytest.raises(ValueError, match="in focus nearer than 500 mm"):
-        distance_in_focus(lens_at_start(read_lens(LENS), Settings(start="150")), best_focus)
+        distance_in_focus(lens_at_start(read_lens(LENS), CodesignSettings(start="150")), best_focus)
 
 
 def test_samples_are_keyed_by_their_number():
@@ -367,8 +368,8 @@ def test_a_telescope_too_near_its_object_has_no_image_to_be_learned():
     """10 to 50 m lie within a focal length of 57.6 m."""
     lens = read_lens(shipped("lenses") / "hubble.zmx")
     with pytest.raises(NoImage, match=r"no real image of an object at 10000 mm: it lies within the focal length"):
-        lens_at_start(lens, Settings())
-    far = dataclasses.replace(Settings(), near=1e8, far=1e9, focus_distance=2e8)
+        lens_at_start(lens, CodesignSettings())
+    far = dataclasses.replace(CodesignSettings(), near=1e8, far=1e9, focus_distance=2e8)
     assert float(lens_at_start(lens, far).surfaces[-2].thickness) > 6406
 
 
@@ -448,7 +449,7 @@ def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
 
 def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
     """A kernel at 14° against central differences: the chief ray moves by 0.25 mm per mm of the sensor."""
-    own = camera(read_lens(LENS), Settings(model="gaussian", fields=(0.0, 14.0), start="57.66"))
+    own = camera(read_lens(LENS), CodesignSettings(model="gaussian", fields=(0.0, 14.0), start="57.66"))
     distances = number([1.2e4, 2e4, 4e4])
     sensor, pattern = own.variables.get_parameter("sensor"), torch.cos(torch.arange(441.0, dtype=torch.float64))
 
@@ -465,6 +466,6 @@ def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
 
 
 def test_models_without_distortion_are_centred_on_their_own_image():
-    own = camera(read_lens(LENS), Settings(model="paraxial", fields=(0.0, 14.0)))
+    own = camera(read_lens(LENS), CodesignSettings(model="paraxial", fields=(0.0, 14.0)))
     distances = number([1.2e4, 2e4, 4e4])
     torch.testing.assert_close(own.kernels(distances, 1), own.kernels(distances, 0))

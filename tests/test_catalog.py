@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import raytrace as rt
-from raytrace.media import catalog as catalogs
-from raytrace.media.agf import format_agf, parse_agf
-from raytrace.media.catalog import (
+from raytrace.materials import catalogs
+from raytrace.materials.agf import format_agf, parse_agf
+from raytrace.materials.catalogs import (
     SHIPPED,
     AmbiguousGlass,
     Catalog,
@@ -32,8 +32,8 @@ from raytrace.media.catalog import (
     shipped_folder,
     write_agf,
 )
-from raytrace.media.formulas import BY_NUMBER
-from raytrace.media.glass import constant, index, listing_error, refractive_index
+from raytrace.materials.formulas import BY_NUMBER
+from raytrace.materials.glass import constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.
@@ -248,7 +248,7 @@ def test_a_changed_user_catalog_is_read_again(small):
 def test_one_catalog_is_parsed_for_a_glass_it_holds():
     """`raytrace info` on a lens of one maker must not wait for twenty catalogs."""
     script = (
-        "from raytrace.media import catalog, agf\n"
+        "from raytrace.materials import catalogs as catalog, agf\n"
         "found = []; read = catalog.read_agf\n"
         "catalog.read_agf = lambda path: found.append(path.stem) or read(path)\n"
         "catalog.find_glass('SK16', catalogs=['SCHOTT', 'OHARA']); print(found)"
@@ -368,7 +368,7 @@ BAD = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.media.catalog.CatalogWarning")
+@pytest.mark.filterwarnings("ignore::raytrace.materials.catalogs.CatalogWarning")
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
 def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
     path = tmp_path / "bad.agf"

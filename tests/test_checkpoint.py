@@ -15,14 +15,12 @@ import torch
 from test_stores import STRANGE, put
 
 import raytrace as rt
-from raytrace.formats import read_lens
-from raytrace.media.catalog import find_glass
+from raytrace.io import read_lens
+from raytrace.materials.catalogs import find_glass
 from raytrace.optimization import bfgs, checkpoint, least_squares
 from raytrace.optimization.bfgs import lowest
-from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.least_squares import State
-from raytrace.optimization.paths import best_of_paths
-from raytrace.optimization.step import Sides
+from raytrace.optimization.checkpoint import BadCheckpoint, best_of_paths
+from raytrace.optimization.least_squares import Sides, State
 
 TRIPLET = read_lens("cooke_triplet")
 SPOT = {"merit": "spot", "vary": "curvature sensor", "cycles": 8}

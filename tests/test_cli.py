@@ -232,7 +232,7 @@ def test_reader_that_leaves_early_is_no_error(tmp_path):
 
 
 def test_interrupt_is_one_line(run, monkeypatch):
-    from raytrace.optics import views
+    from raytrace.tracing import lens_report as views
 
     def interrupted(lens):
         raise KeyboardInterrupt
@@ -311,7 +311,7 @@ BAD_LENSES = {
     "nan.zmx": (TEXT.replace("DISZ 8.74664", "DISZ nan"), r"nan\.zmx:42, surface 1: .*nan"),
     "words.zmx": (TEXT.replace("DISZ 8.74664", "DISZ abc"), r"words\.zmx:42, surface 1: .*'abc'"),
     "aperture.zmx": (TEXT.replace("ENPD 33.33", "ENPD 0"), r"aperture\.zmx:13: .*'0'"),
-    "wavelength.zmx": (TEXT.replace("WAVM 1 0.53 1.0", "WAVM 1 0.0 1.0"), r"wavelength\.zmx:31: wavelength"),
+    "wavelength.zmx": (TEXT.replace("WAVM 1 0.53 1.0", "WAVM 1 0.0 1.0"), r"wavelength\.zmx:31: WAVM: wavelength"),
     "field.zmx": (TEXT.replace("10.0 14.0", "10.0 95.0"), r"field\.zmx: .*90 degrees"),
     "no_suffix": (TEXT, r"no_suffix: .*suffix.*\.zmx"),
     "suffix.foo": (TEXT, r"suffix\.foo: .*'\.foo'.*\.zmx"),
@@ -705,10 +705,10 @@ BAD_RAYS = {
     "no unit": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,1e200\n", "wavelengths are in µm"),
     "misspelt": (
         "x,y,z,l,m,n,wavelenght\n0,0,0,0,0,1,0.5\n",
-        "bad.csv:1: column 'wavelenght' is not known; is 'wavelength'",
+        "bad.csv:1: column 'wavelenght' is not known; did you mean 'wavelength'",
     ),
     "in nm": ("x,y,z,l,m,n,wavelength_nm\n0,0,0,0,0,1,500\n", "bad.csv:1: column 'wavelength_nm' is not known"),
-    "twice": ("x,X,y,z,l,m,n\n0,0,0,0,0,0,1\n", "bad.csv:1: column 'x' stands twice"),
+    "twice": ("x,X,y,z,l,m,n\n0,0,0,0,0,0,1\n", "bad.csv:1: column 'x' occurs twice"),
     "no wavelength": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,\n", "bad.csv:2: column wavelength"),
     "binary": ("\x00\xff\x17" * 300, "bad.csv"),
 }

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from raytrace.camera.deconvolve import blind_filter, errors, errors_knowing
-from raytrace.camera.image import transfer_functions
-from raytrace.studies.codesign.closed_form import power_spectrum
-from raytrace.studies.pictures import dead_leaves
+from raytrace.imaging.closed_form import power_spectrum
+from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, errors_knowing
 
 SIZE = 24
 
@@ -32,7 +32,7 @@ def test_error_is_that_of_drawn_pictures_and_noise(knows):
     noise = sigma * torch.fft.fft2(white[1])
     expected = errors_knowing(H, S, sigma) if knows else errors(H, S, sigma)
     for z in range(2):
-        G = blind_filter(H[z : z + 1] if knows else H, S, sigma)
+        G = depth_invariant_wiener(H[z : z + 1] if knows else H, S, sigma)
         left = torch.fft.ifft2(G * (H[z] * picture + noise) - picture).real
         assert float(left.square().mean()) == pytest.approx(float(expected[z]), rel=0.01)
 
@@ -40,7 +40,7 @@ def test_error_is_that_of_drawn_pictures_and_noise(knows):
 def test_no_other_filter_does_better():
     """The mean error is stationary at the filter, and rises in every direction by what is added, quadratically."""
     S, sigma, H = falling_spectrum(), 0.2, transfer_functions(gaussians(0.6, 1.2, 2.0), SIZE)
-    best, G = errors(H, S, sigma).mean(), blind_filter(H, S, sigma)
+    best, G = errors(H, S, sigma).mean(), depth_invariant_wiener(H, S, sigma)
     generator = torch.Generator().manual_seed(1)
     for _ in range(3):
         change = torch.view_as_complex(torch.randn(SIZE, SIZE, 2, generator=generator, dtype=torch.float64))

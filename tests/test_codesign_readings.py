@@ -8,23 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.training import OtherSettings, Run
-from raytrace.kernels import psf
-from raytrace.studies.codesign.closed_form import (
-    even_distances,
-    scan,
-    spectrum_rows,
-)
-from raytrace.studies.codesign.conjugates import vignetted
-from raytrace.studies.codesign.experiment import batch, camera, lens_at_start, optimise, usual
-from raytrace.studies.codesign.optima import closed_form
-from raytrace.studies.codesign.plain_rays import points
-from raytrace.studies.codesign.settings import Settings
-from raytrace.studies.pictures import dead_leaves, resized
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.closed_form import even_distances, scan
+from raytrace.imaging.codesign import batch, camera, closed_form, lens_at_start, optimise, usual
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.plain_rays import points
+from raytrace.imaging.training import OtherSettings, Run
+from raytrace.psf_models import psf
+from raytrace.settings import CodesignSettings
 
-SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=2, batch=4, crops=2)
-FAST = Settings(f_number=1.76)
+SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=2, batch=4, crops=2)
+FAST = CodesignSettings(f_number=1.76)
 
 
 def spectrum_of_rows(rows, size):
@@ -61,7 +55,7 @@ def test_the_papers_focus_distances_appear_at_f_1_76(lens, textures, model, conj
 
 @pytest.mark.parametrize(("f_number", "metres"), [(1.74, 25.1), (1.80, 33.6)])
 def test_that_aperture_is_a_sharp_one_for_gaussian_drt(lens, textures, f_number, metres):
-    found = closed_form(lens, Settings(model="gaussian", f_number=f_number), textures)
+    found = closed_form(lens, CodesignSettings(model="gaussian", f_number=f_number), textures)
     assert found.focus_paraxial_m == pytest.approx(metres, abs=0.1)
 
 
@@ -79,28 +73,6 @@ def test_the_closed_form_finds_the_least_of_them(lens, textures):
     found = closed_form(lens, dataclasses.replace(FAST, model="drt"), textures)
     assert found.sensor_mm == pytest.approx(57.593, abs=2e-3)
     assert found.downhill_mm == pytest.approx(57.882, abs=2e-3)
-
-
-def test_what_the_files_semi_diameters_cut_off(lens):
-    """They let a beam of F/2.1 pass whole; at F/1.76 five surfaces are too small, least at F/3 none."""
-    assert vignetted(lens_at_start(lens, Settings(f_number=3.0))) == []
-    assert vignetted(lens_at_start(lens, Settings(f_number=2.2))) == []
-    cut = {one.surface: one for one in vignetted(lens_at_start(lens, FAST))}
-    assert list(cut) == [3, 4, 5, 7, 8]
-    assert cut[5].height == pytest.approx(17.50, abs=0.01)
-    assert cut[5].semi_diameter == 14.919
-
-
-def test_a_spectrum_is_what_its_table_says():
-    """Even in both frequencies and in their exchange it comes back; any other as the mean over these."""
-    one = torch.rand(12, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    again = spectrum_of_rows(spectrum_rows(one), 12)
-    torch.testing.assert_close(spectrum_of_rows(spectrum_rows(again), 12), again)
-    assert float(again.mean()) == pytest.approx(float(one.mean()))
-    assert float(again[0, 0]) == float(one[0, 0])
-    assert again[1, 2] == again[2, 1] == again[-1, 2] == again[1, -2] == again[-2, -1]
-    expected = [one[i, j] for i in (1, -1) for j in (2, -2)] + [one[i, j] for i in (2, -2) for j in (1, -1)]
-    assert float(again[1, 2]) == pytest.approx(float(sum(expected) / 8))
 
 
 # ---------------------------------------------------------------- a few plain rays
@@ -240,12 +212,3 @@ def test_a_folder_begun_before_there_was_a_setting_has_its_default(tmp_path):
         Run(tmp_path, {**given, "decay": "cosine"}, usual=usual(SMALL))
     with pytest.raises(OtherSettings, match="decay was None"):
         Run(tmp_path, given)
-
-
-def test_larger_pictures_are_smoother():
-    pictures = dead_leaves(2, size=64)
-    larger = resized(pictures, 2)
-    assert [one.shape for one in larger.samples] == [(128, 128)] * 2
-    rough = [abs(one[:, 1:].astype(float) - one[:, :-1]).mean() for one in (pictures.samples[0], larger.samples[0])]
-    assert rough[1] < 0.7 * rough[0]
-    assert resized(pictures, 1) is pictures

@@ -12,11 +12,11 @@ from problems import MICROMETRE, NANOMETRE
 
 from raytrace import analysis, read_lens
 from raytrace.cli import main
-from raytrace.kernels import NotConverged, psf
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.focus import image_rays
+from raytrace.psf_models import NotConverged, psf
 from raytrace.system.lens import with_object_distance
+from raytrace.tracing.spot import image_rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ROWS = ("DRT", "Gaussian DRT", "paraxial", "Fourier", "wave")

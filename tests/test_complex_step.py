@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
+from raytrace.tracing.trace import trace_surfaces
 
 STEP = 1e-30
 RAYS = 12
@@ -84,7 +84,7 @@ def by_torch(of, position, direction, weights, engine):
     ]
     rays = start(torch.tensor(position), torch.tensor(direction), zero)
     indices = [*leaves["index"].unbind(), leaves["index"][-1]]
-    with rt.tracing(engine):
+    with rt.trace_engine(engine):
         end = trace_surfaces([*surfaces, Surface(thickness=zero)], rays, indices=indices)
     assert end.valid.all()
     total = (torch.tensor(weights) * end.position[:2]).sum()
@@ -107,12 +107,12 @@ def compare(seed: int, engine: str) -> int:
     return sum(len(of[name]) for name in NUMBERS)
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_random_systems_are_those_of_complex_steps(engine):
     assert sum(compare(seed, engine) for seed in range(12)) > 300
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_many_random_systems_are_those_of_complex_steps(engine):
     assert sum(compare(seed, engine) for seed in range(12, 400)) > 10_000

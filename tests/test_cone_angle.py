@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.formats import write_lens
-from raytrace.system.intent import Intent, Row, Vary
+from raytrace.io import write_lens
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
 
 
 def ellipse(cone: float) -> rt.Lens:
@@ -17,9 +17,9 @@ def ellipse(cone: float) -> rt.Lens:
     lens = rt.lens([mirror], stop=1, entrance_pupil_diameter=10.0, object_distance=100.0, wavelengths=[0.55])
     number = torch.tensor(cone, dtype=torch.float64)
     rows = tuple(Row("TRAR", (0, 1), (0.0, 0.0, 0.0, r), weight=1.0) for r in (0.3, 0.6, 0.9))
-    intent = Intent((Vary(1, "curvature"), Vary(1, "conic")), (), rows)
+    optimization_data = OptimizationData((Vary(1, "curvature"), Vary(1, "conic")), (), rows)
     aperture = dataclasses.replace(lens.aperture, kind="object_cone_angle", value=number)
-    return dataclasses.replace(lens, aperture=aperture, intent=intent)
+    return dataclasses.replace(lens, aperture=aperture, optimization_data=optimization_data)
 
 
 @pytest.mark.parametrize("cone", [20.0, 160.0])

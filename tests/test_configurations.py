@@ -12,8 +12,8 @@ from test_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, write_lens
-from raytrace.plot.layout import layout as layout_figure
+from raytrace.io import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.plotting.layout import layout as layout_figure
 from raytrace.system.configurations import differences, part
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -142,7 +142,7 @@ def test_every_configuration_is_the_file_as_it_would_be_saved_in_it(name, unit, 
     saved = text.replace(before, after)
     saved = saved.replace("SURF 2\n  STOP", "SURF 2") if name == "stop" else saved
     lens, report = read(text)
-    assert [warning for warning in report.warnings if "stands again" not in warning] == []
+    assert [warning for warning in report.warnings if "occurs again" not in warning] == []
     assert any("configuration 1 of 2 read, as stored" in note for note in report.notes)
     assert lens.current_configuration == 1
     assert len(lens.configurations) == 2
@@ -165,7 +165,7 @@ def test_a_scanning_mirror_turns_the_light_by_twice_its_angle_and_its_pickup_tur
     assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
     (operand,) = lens.operands
     assert (operand.name, operand.number, operand.parameter) == ("PRAM", 3, 3)
-    assert [(place.path[1], place.factor) for place in operand.places] == [(3, 1.0), (5, -1.0)]
+    assert [(place.path[1], place.factor) for place in operand.paths] == [(3, 1.0), (5, -1.0)]
     for angle, one in zip(ANGLES, lens.configurations, strict=True):
         end = rt.trace(one, rt.rays(one, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
         height = 80 * torch.tan(torch.deg2rad(torch.tensor(2 * angle, dtype=torch.float64)))
@@ -251,9 +251,9 @@ def test_what_is_not_followed_is_told_and_the_configuration_refused(line, said):
 
 def test_an_operand_of_an_aperture_that_is_not_stored_is_told_and_its_configuration_refused():
     lens, report = read(file(tail=operands("APMX 1 1 5 0 0", "APMX 1 2 3 0 0")))
-    assert any("APMX" in warning and "nothing there" in warning for warning in report.warnings)
+    assert any("APMX" in warning and "no such part" in warning for warning in report.warnings)
     assert lens.surfaces[1].apertures == ()
-    with pytest.raises(ValueError, match=r"configuration 2: .*nothing there"):
+    with pytest.raises(ValueError, match=r"configuration 2: .*no such part"):
         lens.configuration(2)
 
 

@@ -16,7 +16,7 @@ ROWS = [
     {"radius": 204.52, "thickness": 5.9, "glass": "SK4"},
     {"radius": -37.05, "thickness": 77.405},
 ]
-pytestmark = pytest.mark.filterwarnings("ignore::raytrace.media.catalog.AmbiguousGlass")
+pytestmark = pytest.mark.filterwarnings("ignore::raytrace.materials.catalogs.AmbiguousGlass")
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, surface, vector, vignetting_aperture
 
-from raytrace.media.glass import MIRROR, refractive_index, sellmeier
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, steps, trace_lens
+from raytrace.materials.glass import MIRROR, refractive_index, sellmeier
 from raytrace.system.lens import check
 from raytrace.system.rays import start
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import media, steps, trace_lens
 
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 

@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.formats import UnsupportedSurface, read_lens
-from raytrace.formats.zemax_types import types
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import constant, refractive_index
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import steps
+from raytrace.io import UnsupportedSurface, read_lens
+from raytrace.io.zemax.surfaces import types
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import constant, refractive_index
 from raytrace.system.lens import Lens
 from raytrace.system.rays import start
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import steps
 
 CORPUS = Path(__file__).parents[2] / "shared" / "corpus"
 RIGHT, REFUSED, WRONG = "loaded and right", "refused by name", "wrong"

@@ -22,15 +22,15 @@ from problems import number as real
 from test_corpus import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison
 from zemax_by_definition import surfaces, trace
 
-from raytrace.formats import UnsupportedSurface, read_lens
-from raytrace.formats.source import Place, decode
-from raytrace.formats.zemax_types import types
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import refractive_index
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import axial_path, media, steps
+from raytrace.io import UnsupportedSurface, read_lens
+from raytrace.io.source import Place, decode
+from raytrace.io.zemax.surfaces import types
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import Lens
 from raytrace.system.rays import start
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import axial_path, media, steps
 
 CORPUS = Path(__file__).parents[2] / "shared" / "tier2"
 FILES = json.loads((CORPUS / "oracle_dev.json").read_text())["files"] if (CORPUS / "oracle_dev.json").exists() else {}

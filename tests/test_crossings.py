@@ -4,12 +4,13 @@ import pytest
 import torch
 from problems import both_engines, scalar, vector
 
-from raytrace.fused.choice import tracing
-from raytrace.optics.trace import trace_surfaces
-from raytrace.system.polynomials import PolynomialSag
+from raytrace.system.intersection import normal
 from raytrace.system.rays import Rays, start
+from raytrace.system.sag_terms import PolynomialSag
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface, normal, sag_at
+from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.compiled.library import trace_engine
+from raytrace.tracing.trace import trace_surfaces
 
 ROUNDING = 1e-12  # mm, of the coordinates of a hit; on a slope it moves the sag by slope × rounding
 ON_SURFACE = 1e-9  # mm along the axis, above rounding on a slope
@@ -36,7 +37,7 @@ def random_surface(kind: str, random: torch.Generator) -> Surface:
     elif kind == "biconic":
         others["coefficients"] = vector(uniform(-0.05, 0.05), uniform(-3, 2))
     else:
-        others["departure"] = PolynomialSag(vector(*(uniform(-0.1, 0.1) for _ in range(9))), scalar(20.0))
+        others["sag_terms"] = PolynomialSag(vector(*(uniform(-0.1, 0.1) for _ in range(9))), scalar(20.0))
     return Surface(
         scalar(5.0), c, None if k is None else scalar(k), kind=kind if kind in KINDS else "even asphere", **others
     )
@@ -51,7 +52,7 @@ def wide_rays(count: int, random: torch.Generator) -> Rays:
 
 
 def hits(surface: Surface, rays: Rays, engine: str) -> Rays:
-    with tracing(engine):
+    with trace_engine(engine):
         return trace_surfaces([surface], rays, indices=[scalar(1.0)] * 2)
 
 
@@ -69,7 +70,7 @@ def compare(kind: str, count: int, rays: int, seed: int) -> dict[str, int]:
     sums = dict.fromkeys(("hits", "eager off", "compiled off", "by one engine"), 0)
     for _ in range(count):
         surface, bundle = random_surface(kind, random), wide_rays(rays, random)
-        eager, compiled = (hits(surface, bundle, engine) for engine in ("eager", "fused"))
+        eager, compiled = (hits(surface, bundle, engine) for engine in ("eager", "compiled"))
         sums["hits"] += int(eager.valid.sum())
         sums["eager off"] += int(is_off(surface, eager).sum())
         sums["compiled off"] += int(is_off(surface, compiled).sum())

@@ -7,9 +7,11 @@ import pytest
 import torch
 from problems import covariance, draws
 
-from raytrace.camera.deconvolve import (
-    blind_error,
-    blind_filter,
+from raytrace.imaging.image import blur, transfer_functions
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.restoration import (
+    depth_invariant_error,
+    depth_invariant_wiener,
     errors,
     errors_knowing,
     kernel_error,
@@ -23,8 +25,6 @@ from raytrace.camera.deconvolve import (
     wiener,
     within,
 )
-from raytrace.camera.image import blur, transfer_functions
-from raytrace.studies.pictures import dead_leaves
 
 
 def gaussians(*widths: float, size: int = 11) -> torch.Tensor:
@@ -114,7 +114,7 @@ def test_zeros_of_the_transfer_function():
     H = transfer_functions(pillbox(3.2, 9), (24, 20))
     S = power_law((24, 20))
     for sigma in (0.0, 1e-3):
-        assert bool(torch.isfinite(blind_filter(H[None], S, sigma).abs()).all())
+        assert bool(torch.isfinite(depth_invariant_wiener(H[None], S, sigma).abs()).all())
         assert bool(torch.isfinite(errors(H[None], S, sigma)).all())
 
 
@@ -132,7 +132,9 @@ def test_gamma_and_kernel_have_derivatives():
 
 def test_gamma_may_depend_on_frequency_or_colour():
     H, S, sigma = transfer_functions(gaussians(0.8, 1.5), 16), power_law(16), 0.05
-    torch.testing.assert_close(wiener(H[:1], sigma**2 / S)[0], blind_filter(H[:1], S, sigma), rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(
+        wiener(H[:1], sigma**2 / S)[0], depth_invariant_wiener(H[:1], S, sigma), rtol=1e-12, atol=1e-15
+    )
     gammas = torch.tensor([0.1, 0.4], dtype=torch.float64)[:, None, None]
     for G, one, gamma in zip(wiener(H, gammas), H, (0.1, 0.4), strict=True):
         torch.testing.assert_close(G, wiener(one, gamma))
@@ -141,7 +143,7 @@ def test_gamma_may_depend_on_frequency_or_colour():
 # --- many kernels
 
 
-def test_blind_filter_is_the_dense_best_linear_estimate():
+def test_depth_invariant_wiener_is_the_dense_best_linear_estimate():
     """8 × 6 pixels, three kernels: C⟨A⟩ᵀ(⟨A C Aᵀ⟩ + σ²)⁻¹, and the error of every kernel as the trace of its matrix."""
     size, sigma, S = (8, 6), 0.2, power_law((8, 6))
     kernels = draws(3, 4, 3, seed=1) / 12
@@ -150,12 +152,12 @@ def test_blind_filter_is_the_dense_best_linear_estimate():
     white = sigma**2 * torch.eye(48, dtype=torch.float64)
     best = C @ A.mean(0).T @ torch.linalg.inv((A @ C @ A.mT).mean(0) + white)
     image = draws(*size, seed=2)
-    G = blind_filter(H, S, sigma)
+    G = depth_invariant_wiener(H, S, sigma)
     torch.testing.assert_close(restore(image, G).flatten(), best @ image.flatten(), atol=1e-11, rtol=0)
     left = best @ A - torch.eye(48, dtype=torch.float64)
     expected = torch.stack([(one @ C @ one.T + best @ white @ best.T).trace() / 48 for one in left])
     torch.testing.assert_close(errors(H, S, sigma), expected, rtol=1e-11, atol=0)
-    torch.testing.assert_close(blind_error(H, S, sigma), expected.mean(), rtol=1e-11, atol=0)
+    torch.testing.assert_close(depth_invariant_error(H, S, sigma), expected.mean(), rtol=1e-11, atol=0)
 
 
 @pytest.mark.parametrize("name", ["blind", "wiener", "measurement"])
@@ -168,7 +170,7 @@ def test_closed_form_is_the_error_of_drawn_noise(name):
     H = transfer_functions(torch.stack([gaussians(*line) for line in widths]), size)
     known = H[1]
     G = {
-        "blind": blind_filter(H, S, sigma),
+        "blind": depth_invariant_wiener(H, S, sigma),
         "wiener": wiener(known, 0.02),
         "measurement": towards_measurement(known, 0.1),
     }[name]
@@ -181,9 +183,9 @@ def test_closed_form_is_the_error_of_drawn_noise(name):
 def test_no_other_filter_does_better_over_colours():
     S, sigma = power_law(16), torch.tensor([0.1, 0.2], dtype=torch.float64)[:, None, None]
     H = transfer_functions(torch.stack([gaussians(0.6, 1.0), gaussians(2.0, 1.4)]), 16)
-    best, G = errors(H, S, sigma), blind_filter(H, S, sigma)
+    best, G = errors(H, S, sigma), depth_invariant_wiener(H, S, sigma)
     assert best.shape == (2, 2)
-    torch.testing.assert_close(blind_error(H, S, sigma), best.mean(0), rtol=1e-12, atol=0)
+    torch.testing.assert_close(depth_invariant_error(H, S, sigma), best.mean(0), rtol=1e-12, atol=0)
     for colour in range(2):
         alone = errors(H[:, colour], S, sigma[colour])
         torch.testing.assert_close(best[:, colour], alone, rtol=1e-12, atol=0)
@@ -197,22 +199,22 @@ def test_small_errors_keep_their_digits():
     S, sigma = power_law(32).to(torch.float32), 1e-5
     H = transfer_functions(gaussians(0.4).to(torch.float32), 32)
     expected = (S * sigma**2 / (S * H.abs() ** 2 + sigma**2)).mean()
-    assert float(blind_error(H, S, sigma)) == pytest.approx(float(expected), rel=1e-5)
-    assert blind_error(H, S, sigma).dtype == torch.float32
+    assert float(depth_invariant_error(H, S, sigma)) == pytest.approx(float(expected), rel=1e-5)
+    assert depth_invariant_error(H, S, sigma).dtype == torch.float32
 
 
-def test_blind_error_without_light_or_noise():
+def test_depth_invariant_error_without_light_or_noise():
     S, dark = power_law(8), torch.zeros(2, 8, 8, dtype=torch.complex128)
-    assert float(blind_error(dark, S, 0.0)) == pytest.approx(float(S.mean()))
+    assert float(depth_invariant_error(dark, S, 0.0)) == pytest.approx(float(S.mean()))
     torch.testing.assert_close(errors(dark, S, 0.0), S.mean().expand(2))
-    assert float(blind_error(torch.ones_like(dark), S, 0.0)) == 0.0
+    assert float(depth_invariant_error(torch.ones_like(dark), S, 0.0)) == 0.0
 
 
 @pytest.mark.parametrize("size", [(12, 12), (11, 14), (14, 11), (9, 9)])
 def test_half_the_frequencies_tell_all(size):
-    """Even and odd, colours, derivatives too: `blind_error` of the transfer functions."""
+    """Even and odd, colours, derivatives too: `depth_invariant_error` of the transfer functions."""
     kernels, S, sigma = draws(3, 2, 6, 5, seed=1).requires_grad_(), power_law(size), 0.3
-    half, full = kernel_error(kernels, S, sigma), blind_error(transfer_functions(kernels, size), S, sigma)
+    half, full = kernel_error(kernels, S, sigma), depth_invariant_error(transfer_functions(kernels, size), S, sigma)
     torch.testing.assert_close(half, full, rtol=1e-12, atol=0)
     slopes = [torch.autograd.grad(error.sum(), kernels)[0] for error in (half, full)]
     torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-12)
@@ -223,7 +225,11 @@ def test_derivatives_of_the_closed_form():
 
     def closed_form(kernels, sigma):
         H = transfer_functions(kernels, 8)
-        return blind_error(H, S, sigma), errors(H, S, sigma), errors(H, S, sigma, filter=towards_measurement(H[0], 0.3))
+        return (
+            depth_invariant_error(H, S, sigma),
+            errors(H, S, sigma),
+            errors(H, S, sigma, filter=towards_measurement(H[0], 0.3)),
+        )
 
     inputs = gaussians(0.8, 1.5, size=3), torch.tensor(0.1, dtype=torch.float64)
     assert torch.autograd.gradcheck(closed_form, [x.requires_grad_() for x in inputs])
@@ -244,7 +250,7 @@ def test_taper_keeps_borders_from_ringing():
     endless = blur(pictures, kernel, boundary="circular") + noise
 
     def best(size: int) -> torch.Tensor:
-        return blind_filter(transfer_functions(kernel, size)[None], power_law(size), sigma)
+        return depth_invariant_wiener(transfer_functions(kernel, size)[None], power_law(size), sigma)
 
     def error(restored: torch.Tensor) -> float:
         return float(mean_square_error(restored, within(pictures, 12), margin=7).mean())
@@ -313,8 +319,8 @@ def test_single_precision_stays_single():
     kernel, image = gaussians(1.0, size=5).to(torch.float32), draws(12, 9, dtype=torch.float32)
     S = power_law((12, 9))
     H = transfer_functions(kernel, (12, 9))
-    found = restore(image, blind_filter(H, S.to(torch.float32), 0.1))
+    found = restore(image, depth_invariant_wiener(H, S.to(torch.float32), 0.1))
     exact = transfer_functions(kernel.to(torch.float64), (12, 9))
-    expected = restore(image.to(torch.float64), blind_filter(exact, S, 0.1))
+    expected = restore(image.to(torch.float64), depth_invariant_wiener(exact, S, 0.1))
     assert found.dtype == torch.float32
     torch.testing.assert_close(found.to(torch.float64), expected, atol=1e-5, rtol=0)

@@ -18,10 +18,10 @@ from raytrace.cli import main
 from raytrace.cli import run as runner
 from raytrace.cli.commands import COMMANDS
 from raytrace.maths.result import Result
-from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import field_points
+from raytrace.tracing.launch import launch
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import trace_lens
 
 ROWS = [
     {"radius": 61.47, "thickness": 6.0, "glass": "N-BK7"},
@@ -281,7 +281,7 @@ def test_a_lens_shows_itself():
 
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own; those of studies and of bench are none.
+#: Commands that are a verb, each in a file of its own; those of bench, codesign and wave are none.
 VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and runner._verb(one.run) in rt.PUBLIC]
 OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
 
@@ -363,7 +363,7 @@ def test_a_picture_is_blurred_and_restored():
     picture = torch.rand(32, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     kernel = rt.psf(rt.read_lens("double_gauss"), "gaussian", fields=torch.zeros(2, 1), normalise="window").kernel[0, 0]
     blurred = rt.blur(picture, kernel, boundary="circular")
-    transfer = importlib.import_module("raytrace.camera.image").transfer_functions(kernel, 32)
+    transfer = importlib.import_module("raytrace.imaging.image").transfer_functions(kernel, 32)
     restored = rt.restore(blurred, rt.wiener(transfer, 1e-6))
     errors = [rt.psnr(((estimate - picture) ** 2).mean()) for estimate in (restored, blurred)]
     assert float(errors[0] - errors[1]) > 5  # dB, of white noise, most of which the lens does not show

@@ -6,20 +6,16 @@ import math
 import numpy as np
 import pytest
 import torch
+from scripts import script
 
-from raytrace.camera.deconvolve import blind_filter, errors, psnr, wiener
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.training import OtherSettings
 from raytrace.cli.door import CommandError
-from raytrace.maths.zernike import polynomials
-from raytrace.media.glass import index
-from raytrace.studies.edof import table as edof_table
-from raytrace.studies.edof.report import learn
-from raytrace.studies.edof.settings import Settings
-from raytrace.studies.edof.table import STRENGTHS, Content, elements_of, records, table_of
-from raytrace.studies.edof.training import begin, learn_element, radial_powers, scheduled
-from raytrace.studies.edof.world import (
-    World,
+from raytrace.cli.wave_design_run import learn
+from raytrace.imaging.pictures import dead_leaves, digest
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener
+from raytrace.imaging.training import OtherSettings
+from raytrace.imaging.variables import PhaseVariables
+from raytrace.imaging.wave_camera import (
+    WaveCameraConfig,
     best_gamma,
     best_of_starts,
     expected_error,
@@ -31,22 +27,28 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
-from raytrace.studies.pictures import dead_leaves, digest
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, EvenPowers, height
-from raytrace.wave.psf import psf
+from raytrace.imaging.wave_design import begin, learn_element, radial_powers, scheduled
+from raytrace.materials.glass import index
+from raytrace.maths.zernike import polynomials
+from raytrace.settings import DesignSettings
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, EvenPowers, height
 
+edof_table = script("wave_edof")
+STRENGTHS, Content, elements_of = edof_table.STRENGTHS, edof_table.Content, edof_table.elements_of
+records, table_of = edof_table.records, edof_table.table_of
 #: One colour, three depths, a window of 0.47 mm: a step takes milliseconds.
-SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
+SMALL = WaveCameraConfig(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 LEAVES = dead_leaves(8, size=64, seed=5, smallest=2.5)
 PICTURES = periodic(LEAVES, 128)
 S, OF_LEAVES = spectrum(PICTURES), digest(LEAVES.samples)
-QUICK = Settings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
+QUICK = DesignSettings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
 
 
 def test_light_beyond_the_window_comes_back_as_haze():
     """A picture of one shade keeps it; without haze it would darken by what misses the window."""
-    H = transfer(psf(scene(baseline("fresnel", aim()), World(depths=(1000.0,), size=31))), 64)
+    H = transfer(psf(scene(baseline("fresnel", aim()), WaveCameraConfig(depths=(1000.0,), size=31))), 64)
     assert torch.allclose(H[..., 0, 0].real, torch.ones(1, 3, dtype=torch.float64), atol=1e-12)
     flat = torch.full((1, 64, 64), 0.3, dtype=torch.float64)
     seen, _ = restored(H[0], torch.ones_like(H[0]), flat, torch.zeros(1, 3, 64, 64, dtype=torch.float64))
@@ -69,7 +71,7 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
     random = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(24, 1, 128, 128, generator=random, dtype=torch.float64)
     many = PICTURES.repeat(3, 1, 1)
-    for G in (blind_filter(H, S, SMALL.noise), wiener(H[1], 0.01)):
+    for G in (depth_invariant_wiener(H, S, SMALL.noise), wiener(H[1], 0.01)):
         expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
         found = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
         torch.testing.assert_close(torch.stack(found), expected, rtol=0.01, atol=0)
@@ -273,11 +275,11 @@ def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
 @pytest.mark.slow
 def test_the_order_that_was_published(tmp_path):
     """Fresnel < multifocal < cubic < hybrid, achromat < learned, in three colours (facts: only those two may swap)."""
-    world = World(size=127, pixel=0.00738)
+    world = WaveCameraConfig(size=127, pixel=0.00738)
     pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)
     content = Content("leaves", pictures[:8], pictures[8:])
     spectrum_ = spectrum(content.train)
-    settings = Settings(steps=60, starts=2)
+    settings = DesignSettings(steps=60, starts=2)
     camera, run = begin(settings, world, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
     for _ in learn_element(camera, LEAVES, settings, run):
         pass

@@ -8,33 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scripts import script
 
-from raytrace.camera.deconvolve import blind_density, blind_error, blind_filter, psnr
-from raytrace.camera.training import OtherSettings
-from raytrace.cli import main
-from raytrace.studies.edof import free_report, noise_report, report
-from raytrace.studies.edof.noise import (
-    Bank,
-    Gains,
-    Interval,
-    Unit,
-    best_strengths,
-    cases,
-    drawn,
-    errors_of,
-    gain,
-    mean_psnr,
-    pooled_psnr,
-    units,
-)
-from raytrace.studies.edof.noise_command import Settings
-from raytrace.studies.edof.noise_report import Kept, OverNoise, Score, judge_files, scores
-from raytrace.studies.edof.octant import Octant, fits
-from raytrace.studies.edof.table import Content
-from raytrace.studies.edof.world import (
+from raytrace.cli import wave_design_run
+from raytrace.cli.door import CommandError
+from raytrace.imaging.octant import Octant, fits
+from raytrace.imaging.pictures import Pictures, dead_leaves
+from raytrace.imaging.restoration import depth_invariant_density, depth_invariant_error, depth_invariant_wiener, psnr
+from raytrace.imaging.training import OtherSettings
+from raytrace.imaging.wave_camera import (
     FILTERS,
     ClosedForm,
-    World,
+    WaveCameraConfig,
     expected_error,
     periodic,
     quality,
@@ -43,15 +28,21 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
-from raytrace.studies.pictures import Pictures, dead_leaves
-from raytrace.studies.quantise import process_report
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, Zernike, as_rings
-from raytrace.wave.element_file import write_element
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, Zernike, as_rings
+from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.plan import plan
 
-SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
+edof, noise = script("wave_edof"), script("wave_noise")
+Content = edof.Content
+Bank, Gains, Interval, Unit, Settings = noise.Bank, noise.Gains, noise.Interval, noise.Unit, noise.Settings
+best_strengths, baselines, drawn, errors_of, gain = (
+    *(noise.best_strengths, noise.baselines, noise.drawn, noise.errors_of, noise.gain),
+)
+mean_psnr, pooled_psnr, units, scores = noise.mean_psnr, noise.pooled_psnr, noise.units, noise.scores
+Kept, OverNoise, Score, judge_files = noise.Kept, noise.OverNoise, noise.Score, noise.judge_files
+SMALL = WaveCameraConfig(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)
 S = spectrum(PICTURES)
 LEARNED = str(Path(__file__).parents[1] / "docs/wave/elements/learned-0.01.npy")
@@ -95,7 +86,7 @@ def test_pictures_that_are_not_their_mirror_images_have_no_octant():
 
 def test_density_adds_up_to_the_error():
     H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
-    torch.testing.assert_close(blind_density(H, S, 0.01).mean((-2, -1)), blind_error(H, S, 0.01))
+    torch.testing.assert_close(depth_invariant_density(H, S, 0.01).mean((-2, -1)), depth_invariant_error(H, S, 0.01))
 
 
 def test_errors_of_pictures_are_those_of_pictures_restored():
@@ -106,7 +97,7 @@ def test_errors_of_pictures_are_those_of_pictures_restored():
     found = errors_of(H, SMALL, bank)
     generator = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(3, 2, 128, 128, generator=generator, dtype=torch.float64)
-    G = blind_filter(H, bank.spectrum, SMALL.noise)
+    G = depth_invariant_wiener(H, bank.spectrum, SMALL.noise)
     left = [(restored(H_z, G, PICTURES[5:], noise)[1] - PICTURES[5:, None]).square().mean((-2, -1)) for H_z in H]
     torch.testing.assert_close(found["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
     table = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])
@@ -170,7 +161,7 @@ def test_every_noise_and_row_once_before_any_a_second_time():
 
 def test_cubic_plates_have_the_strength_of_their_noise():
     strengths = {0.001: 20.0, 0.01: 10.0, 0.02: 10.0}
-    found = [(row, noises) for row, _, noises in cases(["fresnel", "cubic-refractive"], list(strengths), strengths)]
+    found = [(row, noises) for row, _, noises in baselines(["fresnel", "cubic-refractive"], list(strengths), strengths)]
     assert found == [
         ("fresnel", [0.001, 0.01, 0.02]),
         ("cubic-refractive", [0.01, 0.02]),
@@ -216,19 +207,14 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
             Kept(tmp_path, [Bank.of("leaves", train, test)])
 
 
-@pytest.mark.parametrize(
-    "words", [("noise", "--rows", "learned"), ("etch",), ("free", "--from", LEARNED)], ids=lambda words: words[0]
-)
-def test_other_pictures_are_refused_before_anything_is_learned(words, capsys, monkeypatch, tmp_path):
-    """What was judged of some pictures stands in the folder: with others nothing is learned on, nothing written."""
+def test_other_pictures_are_refused_before_anything_is_learned(monkeypatch, tmp_path):
+    """The folder stores errors of some pictures: with others nothing is designed, nothing written."""
     contents = [Content("leaves", PICTURES[:4], PICTURES[4:])], dead_leaves(4, size=256)
-    for module in (noise_report, process_report, free_report):
-        monkeypatch.setattr(module, "contents_of", lambda arguments: contents)
-    for module, name in ((noise_report, "learn_unit"), (process_report, "etched"), (free_report, "learn_free")):
-        monkeypatch.setattr(module, name, lambda *given, **how: pytest.fail("learned"))
+    monkeypatch.setattr(noise, "contents_of", lambda arguments: contents)
+    monkeypatch.setattr(noise, "learn_unit", lambda *given, **how: pytest.fail("learned"))
     Kept(tmp_path / "judged", [Bank.of("leaves", PICTURES[:5], PICTURES[5:])])
-    assert main(["wave", *words, "-o", str(tmp_path)]) == 1
-    assert "judged holds another run: pictures was" in capsys.readouterr().err
+    with pytest.raises(OtherSettings, match="judged holds another run: pictures was"):
+        noise.main(["--rows", "learned", "-o", str(tmp_path)])
     assert [path.name for path in tmp_path.iterdir()] == ["judged"]
 
 
@@ -236,7 +222,9 @@ def test_files_are_judged_by_all_that_bends_light(monkeypatch, tmp_path):
     """Kept errors are those of the glass, pitch, radius and kind; of an element met before nothing is made anew."""
     kept, made = Kept(tmp_path, [Bank.of("leaves", PICTURES[:5], PICTURES[5:])]), []
     flat = torch.ones(1, 1, 128, 128, dtype=torch.complex128)
-    monkeypatch.setattr(noise_report, "World", lambda: dataclasses.replace(SMALL, depths=(1000.0,), wavelengths=(0.5,)))
+    monkeypatch.setattr(
+        noise, "WaveCameraConfig", lambda: dataclasses.replace(SMALL, depths=(1000.0,), wavelengths=(0.5,))
+    )
     monkeypatch.setattr(kept, "transfer", lambda elements: made.append(elements) or flat)
     (one,) = baseline("singlet", aim())
     rings = as_rings(one, 0.01)
@@ -262,22 +250,21 @@ def rings_of_silica() -> Element:
     return element
 
 
-@pytest.mark.parametrize("command", ["noise", "network"])
-def test_files_of_one_name_are_refused(command, capsys, tmp_path):
-    """Two of one stem, and one of the name of a row: nothing would tell them apart in a table."""
+def test_files_of_one_name_are_refused(tmp_path):
+    """Two of one stem, and one with the name of a row: a table could not distinguish them."""
     write_element(rings_of_silica(), tmp_path / "fresnel.npy", design_wavelength=0.55)
-    words = ["wave", command, "-o", str(tmp_path / "run"), "--elements"]
-    assert main([*words, LEARNED, f"{tmp_path}/learned-0.01.json"]) == 1
-    assert f"--elements {LEARNED} {tmp_path}/learned-0.01.json: both would be learned-0.01" in capsys.readouterr().err
-    assert main([*words, str(tmp_path / "fresnel.npy")]) == 1
-    assert "fresnel is the row 'Fresnel lens'; give the file another name" in capsys.readouterr().err
+    words = ["-o", str(tmp_path / "run"), "--elements"]
+    with pytest.raises(CommandError, match=r"both would be learned-0\.01"):
+        noise.main([*words, LEARNED, f"{tmp_path}/learned-0.01.json"])
+    with pytest.raises(CommandError, match="fresnel is the row 'Fresnel lens'; give the file another name"):
+        noise.main([*words, str(tmp_path / "fresnel.npy")])
 
 
 def test_the_figure_over_noise_draws_files_by_their_names():
     own = Interval(1.0, 0.9, 1.1)
     gains = Gains(20.0, own, 20.5, own)
     rows = [Score("sharp leaves", filter, 0.01, row, gains) for filter in FILTERS for row in ("fresnel", "own-0.01")]
-    figure = OverNoise(rows, {"sharp leaves": 8}).plot()
+    figure = noise.noise_figure(OverNoise(rows, {"sharp leaves": 8}))
     assert "own-0.01" in [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
@@ -290,10 +277,10 @@ def test_strengths_fall_with_the_noise():
 @pytest.mark.slow
 def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     """One row, one noise, two starts; the second time everything is kept, and the figures are the same."""
-    monkeypatch.setattr(report, "_LEAVES", 4)
-    words = ["wave", "noise", "--rows", "learned-smooth", "--noises", "0.01", "--starts", "2", "--steps", "1"]
+    monkeypatch.setattr(wave_design_run, "LEAF_COUNT", 4)
+    words = ["--rows", "learned-smooth", "--noises", "0.01", "--starts", "2", "--steps", "1"]
     words += ["-o", str(tmp_path / "run"), "--docs", str(tmp_path / "docs"), "--json"]
-    assert main(words) == 0
+    assert not noise.main(words)
     first = json.loads(capsys.readouterr().out)
     rows = {(row["content"], row["filter"], row["row"]): row for row in first["rows"]}
     base, own = (rows["sharp leaves", "blind", name] for name in ("fresnel", "learned-smooth"))
@@ -305,19 +292,19 @@ def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     wiener = rows["sharp leaves", "wiener", "learned-smooth"]
     assert f"{wiener['gain']:+.2f} ({wiener['gain_low']:+.2f} … {wiener['gain_high']:+.2f})" in page
     assert (tmp_path / "docs/wave/noise.png").stat().st_size > 10_000
-    assert main(words) == 0
+    assert not noise.main(words)
     assert json.loads(capsys.readouterr().out) == first
 
 
 @pytest.mark.slow
 def test_a_file_of_heights_is_judged_as_the_element_it_was_written_from(capsys, monkeypatch, tmp_path):
     """Few leaves, two steps: the same figures by the file and by the run, behind both filters."""
-    monkeypatch.setattr(report, "_LEAVES", 4)
-    words = ["wave", "noise", "--noises", "0.01", "--starts", "1", "--steps", "2", "--json", "--rows"]
-    assert main([*words, "learned", "-o", str(tmp_path / "run"), "--docs", str(tmp_path)]) == 0
+    monkeypatch.setattr(wave_design_run, "LEAF_COUNT", 4)
+    words = ["--noises", "0.01", "--starts", "1", "--steps", "2", "--json", "--rows"]
+    assert not noise.main([*words, "learned", "-o", str(tmp_path / "run"), "--docs", str(tmp_path)])
     run = json.loads(capsys.readouterr().out)["rows"]
     file = tmp_path / "wave/elements/learned-0.01.npy"
-    assert main([*words, "fresnel", "--elements", str(file)]) == 0
+    assert not noise.main([*words, "fresnel", "--elements", str(file)])
     again = json.loads(capsys.readouterr().out)["rows"]
     own, other = ([row for row in rows if row["row"].startswith("learned")] for rows in (run, again))
     assert [row["row"] for row in other] == ["learned-0.01"] * 4

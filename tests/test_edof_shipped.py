@@ -5,14 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import script
 
-from raytrace.studies.edof.noise import Bank, errors_of, mean_psnr, pooled_psnr
-from raytrace.studies.edof.noise_report import Kept
-from raytrace.studies.edof.report import LEAVES
-from raytrace.studies.edof.world import World, periodic
-from raytrace.studies.pictures import dead_leaves, split
-from raytrace.wave.element_file import read_element, read_label
+from raytrace.cli.wave_design_run import LEAVES
+from raytrace.imaging.pictures import dead_leaves, split
+from raytrace.imaging.wave_camera import WaveCameraConfig, periodic
+from raytrace.wave_optics.element_files import read_element, read_label
 
+noise = script("wave_noise")
+Bank, Kept, errors_of = noise.Bank, noise.Kept, noise.errors_of
+mean_psnr, pooled_psnr = noise.mean_psnr, noise.pooled_psnr
 DOCS = Path(__file__).parents[1] / "docs/wave"
 FILES = sorted((DOCS / "elements").glob("*.npy"))
 SMOOTH = sorted(file for file in (DOCS / "elements").glob("*.json") if not file.stem.endswith(".npy"))
@@ -48,7 +50,7 @@ def test_learned_elements_are_judged_as_the_page_has_them(name, tmp_path):
     leaves = dead_leaves(40, size=256, smallest=LEAVES["sharp leaves"])
     bank = Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
     element = read_element(DOCS / "elements" / name, aperture=5.0)
-    found = errors_of(Kept(tmp_path, [bank]).transfer((element,)), World(), bank)
+    found = errors_of(Kept(tmp_path, [bank]).transfer((element,)), WaveCameraConfig(), bank)
     with (DOCS / "noise.csv").open(newline="") as file:
         wanted = {
             row["filter"]: (float(row["psnr"]), float(row["mean_psnr"]))

@@ -10,16 +10,15 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 import raytrace as rt
-from raytrace.formats import read_lens_with_report
-from raytrace.media.agf import parse_agf
-from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
-from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
-from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.sequence import media
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
+from raytrace.io import read_lens_with_report
+from raytrace.materials.agf import parse_agf
+from raytrace.materials.catalogs import SHIPPED, find_glass, shipped_catalog
+from raytrace.materials.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
+from raytrace.materials.glass import AIR, constant, from_table, model_glass, refractive_index
 from raytrace.system.lens import index_behind
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import media, trace_lens
 
 float64 = partial(torch.tensor, dtype=torch.float64)
 
@@ -203,7 +202,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     lens = rt.read_lens("double_gauss")
     before = media(lens, lens.wavelengths)
     monkeypatch.setattr("raytrace.system.lens.index_in", None)
-    monkeypatch.setattr("raytrace.optics.sequence._media_in_environment", None)
+    monkeypatch.setattr("raytrace.tracing.trace._media_in_environment", None)
     assert all(torch.equal(a, b) for a, b in zip(before, media(lens, lens.wavelengths), strict=True))
     assert lens.environment is None
     assert lens.at(f_number=4).environment is None
@@ -232,7 +231,7 @@ def test_mirrors_keep_the_medium_before_them():
     assert [n.item() for n in media(lens.at(temperature=-30, pressure=0.3), lens.wavelengths[0])] == [1.0] * 4
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
     lens = rt.read_lens("double_gauss")
 
@@ -242,12 +241,12 @@ def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
         traced = trace_lens(found, rays, found.wavelengths[:, None])
         return spot_of(traced, rt.gauss_rings(4)[1]).mean_square_radius
 
-    with rt.tracing(engine):
+    with rt.trace_engine(engine):
         given = (float64(35.0, requires_grad=True), float64(0.6, requires_grad=True))
         # 1e-6 a degree: steps of a hundredth of a degree and of an atmosphere are far above rounding.
         assert gradcheck(spread, given, eps=1e-2, atol=1e-9, rtol=1e-4)
         found = torch.autograd.grad(spread(*given).sum(), given)
-    with rt.tracing("eager"):
+    with rt.trace_engine("eager"):
         expected = torch.autograd.grad(spread(*given).sum(), given)
     assert torch.allclose(torch.stack(found), torch.stack(expected), rtol=1e-9)
 
@@ -296,8 +295,8 @@ def test_a_glass_whose_change_is_not_known_is_told_once_with_its_surface():
         lens.at(temperature=40)
     told = [str(warning.message) for warning in caught]
     assert len(told) == 2
-    assert told[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it has the index of 20 °C")
-    assert told[1].startswith("surface 2: the medium of index 1.6 is told by numbers")
+    assert told[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it keeps its index")
+    assert told[1].startswith("surface 2: the medium of index 1.6 is not of a catalog")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens.at(temperature=20, pressure=1)

@@ -11,12 +11,10 @@ from test_launch import fisheye
 import raytrace as rt
 from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
-from raytrace.formats import FORMATS
-from raytrace.formats.source import Place, decode
-from raytrace.optics.aiming import at_stop
-from raytrace.optics.axis import aiming_of
-from raytrace.optics.filling import TOLERANCE, UnfilledStop, filling, warn_of_filling
-from raytrace.optics.launch import launch
+from raytrace.io import FORMATS
+from raytrace.io.source import Place, decode
+from raytrace.tracing.aiming import aiming_of, at_stop
+from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 

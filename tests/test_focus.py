@@ -7,21 +7,20 @@ import pytest
 import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
+from raytrace.materials.glass import MIRROR
 from raytrace.maths import pupil
-from raytrace.media.glass import MIRROR
-from raytrace.optics.focus import (
+from raytrace.system.lens import with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
+from raytrace.tracing.focus import (
     focus_moments,
     focus_of_mean_radius,
     focus_of_rms,
-    image_rays,
     mean_rms_radius,
     spot_parabola,
     through_focus,
 )
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.spot import EmptySpot, spot_of
-from raytrace.system.lens import with_object_distance, with_sensor_distance
-from raytrace.system.surface import Aperture
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import EmptySpot, image_rays, spot_of
 
 POINTS, WEIGHTS = pupil.gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)

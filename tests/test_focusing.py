@@ -4,22 +4,15 @@ import math
 
 import pytest
 import torch
+from scripts import script
 
-from raytrace.studies.focusing.experiment import (
-    Setting,
-    _behind,
-    best_kernel,
-    draw,
-    ideal_heights,
-    learn_to_focus,
-    plate,
-    residual_phase,
-    sampled,
-    scene_of,
-)
-from raytrace.studies.pictures import dead_leaves
-from raytrace.wave.psf import psf
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.wave_optics.compute import psf
 
+focusing = script("focusing")
+Setting, _behind, best_kernel, draw = focusing.Setting, focusing._behind, focusing.best_kernel, focusing.draw
+ideal_heights, learn_to_focus, plate = focusing.ideal_heights, focusing.learn_to_focus, focusing.plate
+residual_phase, sampled, scene_of = focusing.residual_phase, focusing.sampled, focusing.scene_of
 AIRY = 1.2197 * 0.55e-3 * 25
 
 
@@ -90,3 +83,11 @@ def test_the_same_seed_is_the_same_course():
 def test_an_even_window_is_refused():
     with pytest.raises(ValueError, match="no pixel at its middle: expected an odd size"):
         learn_to_focus(Setting(size=64))
+
+
+def test_the_script_writes_heights_and_a_figure(capsys, tmp_path):
+    words = ["--samples", "32", "--size", "17", "--steps", "2", "--json"]
+    assert not focusing.main([*words, "-o", str(tmp_path / "lens.npy"), "--plot", str(tmp_path / "lens.png")])
+    assert '"steps": 2' in capsys.readouterr().out
+    assert (tmp_path / "lens.npy").exists()
+    assert (tmp_path / "lens.png").stat().st_size > 10_000

@@ -17,23 +17,19 @@ from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
 from raytrace.cli.paths import PICTURES, picture_file
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.maths.pupil import hexapolar
-from raytrace.optics.arrivals import arrivals
-from raytrace.optics.losses import LOST, STATUS, losses
-from raytrace.plot.analysis import distortion_curves
+from raytrace.plotting.analysis import distortion_curves
+from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
+from raytrace.tracing.spot import arrivals
 from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
-    "--start": "compare chooses from two places, wave free several, codesign takes a distance, too",
+    "--start": "compare chooses from two places, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
-    "--levels": "quantise compares several",
-    "--tolerance": "quantise compares several",
-    "--steps": "quantise may take none",
-    "--starts": "superres may take none",
     "--configuration": "layout draws all of them in one figure",
     "--log": "optimize writes one; elsewhere the scale of a figure",
     "--resume": "codesign finds its own runs",
@@ -77,9 +73,8 @@ def test_data_pixels_and_figures_have_their_own_options(name):
     if "-o" in known:
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
-        if name != "wave focus":
-            with pytest.raises(argparse.ArgumentTypeError, match="is a picture: figures are saved by --plot"):
-                known["-o"].type("x.png")
+        with pytest.raises(argparse.ArgumentTypeError, match="is a picture: figures are saved by --plot"):
+            known["-o"].type("x.png")
     if "--size" in known:
         assert known["--size"].help.startswith("pixels across")
     if "--plot" in known:
@@ -146,7 +141,7 @@ def test_fates_of_a_ray_table_are_those_that_rays_are_counted_by():
     lens = read_lens(find_lens("cooke_triplet"))
     field = torch.tensor([[0.0, 0.0], [80.0, 25.0]], dtype=torch.float64)
     points, weights = hexapolar(4)
-    found, lost = arrivals(lens, points, weights, fields=field), losses(lens, points, fields=field)
+    found, lost = arrivals(lens, points, weights, fields=field), ray_failures(lens, points, fields=field)
     for place, name in enumerate(LOST):
         counted = (found.status == STATUS.index(name)).sum(-1)
         assert counted.tolist() == lost.lost[place].sum(0).tolist(), name
@@ -200,8 +195,6 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
         ("wave psf --element cubc", 1, "did you mean cubic?"),
-        ("wave table --rows frsnel", 1, "did you mean fresnel?"),
-        ("wave quantise --element frsnel", 1, "did you mean fresnel?"),
         ("codesign compar double_gauss", 1, "did you mean compare?"),
         ("codesign double_gauss --field 5,5 --loss spectral", 1, "co-design takes field points along y"),
         ("psf double_gauss -o psf.png", 2, "'psf.png' is a picture: figures are saved by --plot"),

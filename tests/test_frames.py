@@ -8,9 +8,9 @@ import torch
 
 import raytrace as rt
 from raytrace.maths.pupil import fan
-from raytrace.optics.frames import frames
-from raytrace.plot import outline
+from raytrace.plotting import outline
 from raytrace.system.surface import sag_at
+from raytrace.tracing.geometry import frames
 
 
 def folded(tilt_y: float = 0.0) -> rt.Lens:

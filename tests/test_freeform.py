@@ -12,12 +12,12 @@ from torch.testing import assert_close
 from raytrace.maths import zernike
 from raytrace.maths.bivariate import powers
 from raytrace.maths.value import to
-from raytrace.optics.trace import trace_surfaces
-from raytrace.system.departure import FringeSag
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag, as_polynomial
+from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial
 from raytrace.system.shapes import KINDS, relief
-from raytrace.system.surface import Surface, intersect, normal, sag_at, vertex_curvature, vertex_curvatures
+from raytrace.system.surface import Surface, sag_at, vertex_curvature, vertex_curvatures
+from raytrace.tracing.trace import trace_surfaces
 
 
 def close(found, true, *, rtol: float = 0.0, atol: float = 0.0):
@@ -29,9 +29,9 @@ def freeform(kind: str, curvature, conic, *coefficients: float, **others) -> Sur
     return Surface(scalar(5.0), c, k, vector(*coefficients), kind=kind, **others)
 
 
-def departing(departure, curvature=1 / 30, conic=-0.6) -> Surface:
+def departing(sag_terms, curvature=1 / 30, conic=-0.6) -> Surface:
     c, k = (None if number is None else scalar(number) for number in (curvature, conic))
-    return Surface(scalar(5.0), c, k, departure=departure)
+    return Surface(scalar(5.0), c, k, sag_terms=sag_terms)
 
 
 def fringes(count: int = 37) -> FringeSag:
@@ -55,7 +55,7 @@ ALL = {
     "polynomial": departing(polynomial()),
     "irregular": departing(IRREGULAR),
     "tilted plane": departing(TiltSag(scalar(0.3), scalar(-0.2)), None, None),
-    "polynomial on a toroid": dataclasses.replace(freeform("toroidal", 1 / 40, None, 1 / 60), departure=polynomial(9)),
+    "polynomial on a toroid": dataclasses.replace(freeform("toroidal", 1 / 40, None, 1 / 60), sag_terms=polynomial(9)),
 }
 each = pytest.mark.parametrize("name", ALL)
 
@@ -87,7 +87,7 @@ def test_derivatives_of_the_sag_are_written_out_right(name):
     x, y = points(200, 5.0, 1).requires_grad_().unbind()
     a = surface.coefficients
     if a is None:
-        found = relief(surface.departure).sag(x, y)
+        found = relief(surface.sag_terms).sag(x, y)
     else:
         c, k = (scalar(0.0) if number is None else number for number in (surface.curvature, surface.conic))
         found = KINDS[surface.kind].form.sag(c, k, a, x, y, 2)
@@ -132,12 +132,12 @@ def test_sections_and_curvatures_at_the_vertex():
 
 def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
     x, y = points(100, 4.0, 1)
-    departure = fringes()
+    sag_terms = fringes()
     u, v = (x - 0.5) / 8, (y + 0.4) / 8
     orders = [zernike.fringe(j) for j in range(1, 38)]
     rim = torch.tensor([zernike.norm(*order) for order in orders], dtype=torch.float64)
     basis = zernike.polynomials(orders, u, v) / rim[:, None]
-    close(relief(departure).sag(x, y).z, departure.coefficients @ basis, atol=1e-16)
+    close(relief(sag_terms).sag(x, y).z, sag_terms.coefficients @ basis, atol=1e-16)
     assert orders[36] == (12, 0)
     # A few by their formula: tilt x, tilt y, focus, astigmatism, coma.
     for j, true in ((2, u), (3, v), (4, 2 * (u * u + v * v) - 1), (6, 2 * u * v), (7, (3 * (u * u + v * v) - 2) * u)):
@@ -147,9 +147,9 @@ def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
 def test_polynomial_terms_stand_in_their_order():
     assert powers(9) == [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
     x, y = points(50, 5.0, 1)
-    departure = polynomial()
-    direct = sum(c * (x / 8) ** i * (y / 8) ** j for (i, j), c in zip(powers(27), departure.coefficients, strict=True))
-    close(relief(departure).sag(x, y).z, direct, atol=1e-16)
+    sag_terms = polynomial()
+    direct = sum(c * (x / 8) ** i * (y / 8) ** j for (i, j), c in zip(powers(27), sag_terms.coefficients, strict=True))
+    close(relief(sag_terms).sag(x, y).z, direct, atol=1e-16)
 
 
 def test_irregularity_and_tilt_are_their_formulas():
@@ -171,7 +171,7 @@ def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
     position = vector(0.3, 2.0, -1.5, 900.0, 0.4, -1.0, 2.2, 900.0, -9.0, -8.0, -9.0, -7.0).reshape(3, 4)
     direction = vector(0.1, -0.2, 0.05, 0.0, -0.1, 0.1, 0.2, 0.0, 1.0, 1.0, 1.0, 1.0).reshape(3, 4)
     direction = direction / torch.linalg.vector_norm(direction, dim=0)
-    fields = [f for f in ("curvature", "conic", "coefficients", "departure") if getattr(surface, f) is not None]
+    fields = [f for f in ("curvature", "conic", "coefficients", "sag_terms") if getattr(surface, f) is not None]
     tensors, spec = torch.utils._pytree.tree_flatten([getattr(surface, f) for f in fields])
 
     def hits(*numbers):

@@ -8,11 +8,11 @@ from problems import fields, lens, scalar, surface
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.media.glass import MIRROR, model_glass
-from raytrace.optics.geometry import Unbuildable, defects
-from raytrace.system.intent import Intent
-from raytrace.system.pose import Pose
+from raytrace.materials.glass import MIRROR, model_glass
+from raytrace.system.optimization_data import OptimizationData
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
+from raytrace.tracing.geometry import Unbuildable, defects
 
 GLASS = model_glass(1.6, 50.0)
 
@@ -98,8 +98,8 @@ def test_what_can_be_made_is_not_warned_of(case):
 def test_semi_diameters_that_follow_the_light_are_those_of_the_light():
     """A stored one of 10 mm is out of date where it is automatic and the beam is 4 mm wide."""
     steep = CASES["reach"][0]()
-    assert defects(dataclasses.replace(steep, intent=Intent(semi_diameters=(1, 2))))
-    assert not defects(dataclasses.replace(steep, intent=Intent()))
+    assert defects(dataclasses.replace(steep, optimization_data=OptimizationData(semi_diameters=(1, 2))))
+    assert not defects(dataclasses.replace(steep, optimization_data=OptimizationData()))
 
 
 def test_shipped_lenses_can_be_made():

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.media.formulas import BY_NUMBER, FORMULAS
-from raytrace.media.glass import (
+from raytrace.materials.formulas import BY_NUMBER, FORMULAS
+from raytrace.materials.glass import (
     AIR,
     LINES,
     MIRROR,

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import from_table, index
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import from_table, index
 
 LINES = torch.tensor([0.4358, 0.4861, 0.5461, 0.5876, 0.6563, 0.7065, 0.8521], dtype=torch.float64)
 

@@ -13,12 +13,12 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt
+from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR
-from raytrace.optics.trace import axial_path, trace_surfaces
-from raytrace.system.pose import Pose
+from raytrace.system.poses import Pose
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
+from raytrace.tracing.trace import axial_path, trace_surfaces
 
 ONE, WAVELENGTH = real(1.0), real(0.5)
 IMAGE = surface()

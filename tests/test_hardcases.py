@@ -18,8 +18,8 @@ import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import both_engines
 
-from raytrace.media.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
-from raytrace.optics.wavefront import path_to_reference_sphere
+from raytrace.materials.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
+from raytrace.tracing.wavefront import path_to_reference_sphere
 
 getcontext().prec = 60
 
@@ -169,7 +169,7 @@ def opd_errors(case, result, scene, dtype) -> list[float]:
     opd = case["opd"]
     centre = torch.tensor(opd["center"], dtype=dtype)[:, None]
     radius = torch.tensor(opd["radius"], dtype=dtype)
-    W = path_to_reference_sphere(result["last"], centre, radius, scene.indices[-1])
+    W = path_to_reference_sphere(result["last"], centre, 1 / radius, scene.indices[-1])
     W = (W - W[opd["chief"]]) / opd["wavelength_mm"]
     return [error(W[i].item(), expected) for i, expected in enumerate(opd["W_waves"]) if expected is not None]
 

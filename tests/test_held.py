@@ -6,19 +6,18 @@ import pytest
 import torch
 from problems import focal_length
 
-from raytrace.camera.training import Run
-from raytrace.camera.variables import BadVariables, Variables, parse_bounds
-from raytrace.formats import read_lens
-from raytrace.optics.sequence import media
-from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
-from raytrace.studies.codesign.experiment import camera, optimise
-from raytrace.studies.codesign.optima import closed_form
-from raytrace.studies.codesign.settings import Settings
-from raytrace.studies.pictures import dead_leaves
+from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
+from raytrace.imaging.codesign import camera, closed_form, optimise
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.training import Run
+from raytrace.imaging.variables import BadVariables, Variables, parse_bounds
+from raytrace.io import read_lens
+from raytrace.settings import CodesignSettings
+from raytrace.tracing.trace import media
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"
-SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2, vary=SPACES, hold="efl")
+SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2, vary=SPACES, hold="efl")
 
 
 def moved(variables, **by):

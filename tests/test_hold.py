@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.merit.hold import WORDS, BadHold, conditions_of
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.operands import OPERANDS
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import trace_lens
+from raytrace.optimization.constraints import WORDS, BadHold, conditions_of
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import trace_lens
 
 
 def value(lens, hold):

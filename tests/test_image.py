@@ -6,7 +6,7 @@ import pytest
 import torch
 from problems import draws, gaussian, generator
 
-from raytrace.camera.image import (
+from raytrace.imaging.image import (
     BOUNDARIES,
     COMPOSITIONS,
     EXTENSIONS,
@@ -18,7 +18,7 @@ from raytrace.camera.image import (
     transfer_functions,
     visible,
 )
-from raytrace.camera.noise import add_noise, add_shot_noise, count_electrons, digitise
+from raytrace.imaging.sensor import add_noise, add_shot_noise, count_electrons, digitise
 
 #: Rounding of an FFT of some hundred pixels of order one.
 ROUNDING = 1e-13

@@ -9,13 +9,13 @@ from test_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, seq_read, write_lens
-from raytrace.formats.seq_glass import _fictitious_error
-from raytrace.formats.substitutes import substitutes_of
-from raytrace.media.catalog import UnknownGlass, find_glass, shipped_catalog
-from raytrace.media.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
-from raytrace.system.intent import Intent, Row
+from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.io.codev.glass import _fictitious_error
+from raytrace.io.report import BadSubstitute, substitutes_of
+from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
+from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
 from raytrace.system.lens import check_media
+from raytrace.system.optimization_data import OptimizationData, Row
 
 #: A pickup of a medium with figures that are left from before.
 PICKUP = "GLAS {name} 2 0 1.5 40 0 0 0 0 0 0"
@@ -32,11 +32,11 @@ def test_a_medium_that_is_picked_up_is_that_of_its_surface(glass, name, index, t
     lens, report = read(text)
     glass = lens.surfaces[2].glass
     assert (glass.name, glass.coefficients.tolist()) == (name, [index])
-    assert [(one.surface, one.source) for one in lens.intent.solves] == [(2, 0)]
+    assert [(one.surface, one.source) for one in lens.optimization_data.solves] == [(2, 0)]
     assert not report.warnings
     write_lens(lens, tmp_path / "again.zmx")
     again = read_lens(tmp_path / "again.zmx")
-    assert again.intent == lens.intent
+    assert again.optimization_data == lens.optimization_data
     assert again.surfaces[2].glass.coefficients.equal(glass.coefficients)
 
 
@@ -74,7 +74,7 @@ def test_fields_beyond_twelve_stand_in_lines_of_their_own(tmp_path):
     assert lens.fields.vignetting[3].tolist() == [0.0] * 12 + [0.25, 0.0]
     for unit, scale in (("MM", 1.0), ("CM", 10.0)):
         given = read(text.replace("UNIT MM", f"UNIT {unit}"))[0]
-        given = dataclasses.replace(given, intent=Intent(unit=scale, merit=(Row("EFFL"),)))
+        given = dataclasses.replace(given, optimization_data=OptimizationData(unit=scale, merit=(Row("EFFL"),)))
         write_lens(given, tmp_path / "again.zmx")
         assert "FENF 14 14\nFEFD 1.0 12.0 0.5 0.0 0.0 0.0 0.25 0.0" in (tmp_path / "again.zmx").read_text()
         again = read_lens(tmp_path / "again.zmx").fields
@@ -127,7 +127,7 @@ def test_a_substitute_is_taken_where_it_is_asked_for_and_reported(suffix, tmp_pa
         read_lens(path)
     wanted = find_glass("N-BK7").coefficients
     for asked in ({"XK99": "N-BK7"}, "xk99=N-BK7", ["XK99=N-BK7"]):
-        with pytest.warns(LensFileWarning, match=r"N-BK7 \(SCHOTT\) is taken for the glass XK99, as asked for"):
+        with pytest.warns(LensFileWarning, match=r"N-BK7 \(SCHOTT\) is taken for the glass XK99, as requested"):
             lens = read_lens(path, substitute=asked)
         assert any(surface.glass.coefficients.equal(wanted) for surface in lens.surfaces)
     assert "N-BK7 (SCHOTT) is taken" in str(rt.check(path, substitute="XK99=N-BK7"))
@@ -146,12 +146,10 @@ def test_a_substitute_is_taken_where_it_is_asked_for_and_reported(suffix, tmp_pa
 def test_substitutes_that_mean_nothing_are_refused_or_reported(tmp_path):
     path = tmp_path / "lens.zmx"
     path.write_text(file())
-    with pytest.warns(
-        LensFileWarning, match="a substitute for the glass SF5 was asked for, which the file does not name"
-    ):
+    with pytest.warns(LensFileWarning, match="a substitute for the glass SF5 was requested, which is not in the file"):
         read_lens(path, substitute="SF5=F2")
     for wrong in ("SF5", "=F2", {"SF5": ""}, {"SF5": 3}):
-        with pytest.raises(rt.formats.BadSubstitute, match="expected GLASS=OTHER, nearest or formula"):
+        with pytest.raises(BadSubstitute, match="expected GLASS=OTHER, nearest or formula"):
             read_lens(path, substitute=wrong)
     path.write_text(UNKNOWN[".zmx"].replace("1.5168 64.17", "1.5 40"))
     with pytest.raises(UnknownGlass, match="the file has no nd and Vd"):
@@ -165,7 +163,7 @@ def test_a_substitute_is_taken_in_every_configuration():
     tail = 'MNUM 2 1\nGLSS   1   1 "N-BK7" 0 0 0 1 1 0 0\nGLSS   1   2 "XK99" 0 0 0 1 1 0 0'
     lens, report = read(file(tail=tail), substitutes=substitutes_of("XK99=F2"))
     assert [one.surfaces[1].glass.name for one in lens.configurations] == ["N-BK7", "F2"]
-    assert not any("was asked for" in warning for warning in report.warnings)
+    assert not any("was requested" in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize("command", ["info {}", "check {}", "spot {}", "convert {} {}.csv", "focus {} -o {}.zmx"])
@@ -197,7 +195,7 @@ GO
 
 def sequence(waves: str, glass: str, private: str = "", **options):
     private = f"PRV\n{private}\nEND\n" if private else ""
-    return seq_read.read(SEQUENCE.format(waves=waves, glass=glass, private=private), "lens.seq", **options)
+    return FORMATS[".seq"].read(SEQUENCE.format(waves=waves, glass=glass, private=private), "lens.seq", **options)
 
 
 @pytest.mark.parametrize("name", ["755276", "1.7552:27.6", "755200.276000"])
@@ -240,7 +238,7 @@ def test_a_table_is_met_at_the_lines_of_the_lens_and_estimated_between_them():
     table = f"PWL {waves}\n'E48' {indices} 1.5334 1.5378 1.5428 1.5476"
     lens, report = sequence("587.6 486.1 650", "'E48'", table)
     assert not report.warnings
-    assert float(re.search(r"which it meets to (\S+)", report.notes[0])[1]) < 3e-4  # 6.6e-4 through six of them
+    assert float(re.search(r"indices, met to (\S+)", report.notes[0])[1]) < 3e-4  # 6.6e-4 through six of them
     found = index(lens.surfaces[1].glass, torch.tensor([0.5876, 0.4861, 0.65], dtype=torch.float64))
     assert (found - torch.tensor([1.5312, 1.5378, 1.5286], dtype=torch.float64)).abs().max() < 1e-13
     with pytest.raises(LensFileError, match=r"index of E48 at 633 nm is estimated by a formula, to about 2\.\de-04"):

@@ -12,15 +12,15 @@ from test_zemax import file, lens
 from test_zemax import read as read_text
 
 import raytrace as rt
-from raytrace.formats import read_lens_with_report, write_lens
-from raytrace.formats.source import LensFileError, LensFileWarning
-from raytrace.formats.zemax_merit import read_merit
-from raytrace.formats.zemax_units import in_file
-from raytrace.media.catalog import UnknownGlass
+from raytrace.io import check, read_lens_with_report, write_lens
+from raytrace.io.source import LensFileError, LensFileWarning
+from raytrace.io.zemax.optimization import read_merit
+from raytrace.io.zemax.write import in_file
+from raytrace.materials.catalogs import UnknownGlass
 from raytrace.system.dimensions import DIMENSION
-from raytrace.system.intent import Intent, Row, Solve, Vary
 from raytrace.system.lens import index_behind
-from raytrace.system.places import number_at, places
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.system.surface import sag
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -43,8 +43,8 @@ def test_the_intent_of_every_real_file_comes_back(path, tmp_path):
     except (LensFileError, UnknownGlass):
         pytest.skip("refused by name")
     found = again(original, tmp_path)
-    assert found.intent == original.intent
-    assert again(found, tmp_path).intent == original.intent
+    assert found.optimization_data == original.optimization_data
+    assert again(found, tmp_path).optimization_data == original.optimization_data
 
 
 def of_oracle(name: str, number: str, surface: rt.Surface) -> tuple[int, str]:
@@ -67,16 +67,16 @@ def test_variables_and_rows_are_those_of_an_independent_reader():
         told = [one.split(":") for one in case["variables"]]
         surfaces = [original.surfaces[int(number.split("/")[0])] for _, number in told]
         expected = [of_oracle(*one, surface) for one, surface in zip(told, surfaces, strict=True)]
-        assert [(one.surface, one.quantity) for one in original.intent.variables] == expected
+        assert [(one.surface, one.quantity) for one in original.optimization_data.variables] == expected
         in_mm = not any("converted to mm" in note for note in report.notes)
         for value, (surface, quantity) in zip(case.get("x_stored", ()) if in_mm else (), expected, strict=False):
             held = original.surfaces[surface]
-            number = held.thickness if quantity == "thickness" else number_at(held, places(held)[quantity])
+            number = held.thickness if quantity == "thickness" else number_at(held, parameter_paths(held)[quantity])
             assert float(number) == pytest.approx(value, rel=1e-15, abs=0)
-        counts = Counter(row.operand for row in original.intent.merit)
+        counts = Counter(row.operand for row in original.optimization_data.merit)
         assert all(counts[name] == count for name, count in case.get("operand_counts", {}).items())
         for one in case.get("values", ()):
-            row = original.intent.merit[one["row"] - 1]
+            row = original.optimization_data.merit[one["row"] - 1]
             assert row.operand == one["op"]
             assert row.weight == pytest.approx(one["weight"], rel=1e-15)
         met += 1
@@ -115,25 +115,35 @@ def test_lengths_of_rules_are_in_mm_and_rows_stay_as_written_and_come_back(unit,
     mm = UNITS[unit]
     rules = {"surface": RULES, "stop": "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1", "tail": MERIT_LINES}
     original = lens(UNIT=f"UNIT {unit} X W X CM MR CPMM\nSDMA 5 1 0.25", **rules)
-    intent = original.intent
+    optimization_data = original.optimization_data
     names = ["curvature", "thickness", "conic", "a4", "a6"]
-    assert [(one.surface, one.quantity) for one in intent.variables] == [(1, name) for name in names]
-    assert intent.solves == (
+    assert [(one.surface, one.quantity) for one in optimization_data.variables] == [(1, name) for name in names]
+    assert optimization_data.solves == (
         Solve(2, "thickness", "marginal_height", (0.125 * mm, 0.7)),
         Solve(2, "thickness", "pickup", source=1, scale=-1.0, offset=0.5 * mm),
     )
-    assert intent.kept == ()
-    assert intent.semi_diameter_margin == (5, 0.25 * mm)
-    assert intent.semi_diameters == ()
-    assert intent.unit == mm
-    assert [row.target for row in intent.merit[3:]] == [2.5, 0.05, 1.5, 1, 1, 0.4, 0.125, 1e-5, 7]  # as they stand
-    assert intent.merit[1].text == "A text,  with blanks."
-    assert intent.merit[2] == Row("TRAC", (0, 1), (0, 0.7, 0.335, 0), 0, 0.727e-1, further=(0, 0))
-    assert intent.merit[11] == Row("QQQQ", (1, 2), (3, 4, 5, 6), 7, 8, "AUTO", (9, 10))
-    assert intent.tolerances[1:] == ("TOL TTHI   1   2 -0.25 0.5   0 0 0", "TCMM A comment.")
+    assert optimization_data.kept == ()
+    assert optimization_data.semi_diameter_margin == (5, 0.25 * mm)
+    assert optimization_data.semi_diameters == ()
+    assert optimization_data.unit == mm
+    assert [row.target for row in optimization_data.merit[3:]] == [
+        2.5,
+        0.05,
+        1.5,
+        1,
+        1,
+        0.4,
+        0.125,
+        1e-5,
+        7,
+    ]  # as they stand
+    assert optimization_data.merit[1].text == "A text,  with blanks."
+    assert optimization_data.merit[2] == Row("TRAC", (0, 1), (0, 0.7, 0.335, 0), 0, 0.727e-1, further=(0, 0))
+    assert optimization_data.merit[11] == Row("QQQQ", (1, 2), (3, 4, 5, 6), 7, 8, "AUTO", (9, 10))
+    assert optimization_data.tolerances[1:] == ("TOL TTHI   1   2 -0.25 0.5   0 0 0", "TCMM A comment.")
     found = again(original, tmp_path)
     assert f"UNIT {unit} " in (tmp_path / "again.zmx").read_text()
-    assert found.intent == intent
+    assert found.optimization_data == optimization_data
     assert leaves(found) == leaves(original)
 
 
@@ -158,7 +168,7 @@ def test_a_focal_length_comes_back_in_every_unit(tmp_path):
 
 def test_a_unit_that_no_file_has_is_refused_by_name(tmp_path):
     original = lens(tail="EFFL 0 2 0 0 0 0 50 1 0 0")
-    other = dataclasses.replace(original, intent=dataclasses.replace(original.intent, unit=3.0))
+    other = dataclasses.replace(original, optimization_data=dataclasses.replace(original.optimization_data, unit=3.0))
     with pytest.raises(LensFileError, match=r"a unit of 3\.0 mm, expected 1, 10, 25\.4 or 1000"):
         write_lens(other, tmp_path / "lens.zmx")
 
@@ -168,19 +178,19 @@ def test_what_varies_is_modelled_and_a_row_is_not_traced():
     first = found.surfaces[1]
     assert float(first.conic) == 0
     assert first.coefficients.tolist() == [0, 1e-5, 0]
-    plain = dataclasses.replace(found, intent=None)
+    plain = dataclasses.replace(found, optimization_data=None)
     assert len(torch.utils._pytree.tree_leaves(found)) == len(torch.utils._pytree.tree_leaves(plain))
 
 
 def test_a_lens_without_an_intent_is_written_as_before(tmp_path):
     given = lens(object_="DIAM 9 1 0 0 1").replace(1, thickness=4.5)
-    given = dataclasses.replace(given, intent=None)
+    given = dataclasses.replace(given, optimization_data=None)
     write_lens(given, tmp_path / "lens.zmx")
     text = (tmp_path / "lens.zmx").read_text()
     assert "SDMA 0 1 0\n" in text
     assert "DIAM 6.0 1 0 0 1" in text
     assert not [word for word in ("VDSZ", "VCON", "BLNK", "MAZH") if word in text]
-    assert again(given, tmp_path).intent is None
+    assert again(given, tmp_path).optimization_data is None
 
 
 @pytest.mark.parametrize(
@@ -213,9 +223,9 @@ def test_rules_that_are_not_followed_are_kept_named_and_come_back(tmp_path):
         "stop": "EDGE 0.5 3\nDIAM 5.5 2 1 0 1\nCURV -0.02 99 1 2 3",
     }
     original, report = read_text(file(**rules))
-    assert [one.kind for one in original.intent.solves] == ["power", "position", "edge_thickness"]
-    assert original.intent.solves[2].numbers == (0.5, 3)
-    kinds = [(one.surface, one.quantity, one.kind, one.numbers, one.source) for one in original.intent.kept]
+    assert [one.kind for one in original.optimization_data.solves] == ["power", "position", "edge_thickness"]
+    assert original.optimization_data.solves[2].numbers == (0.5, 3)
+    kinds = [(one.surface, one.quantity, one.kind, one.numbers, one.source) for one in original.optimization_data.kept]
     assert kinds == [
         (1, "PARM 2", "PPAR", (-1, 1, 0), 0),
         (1, "glass", "substitute", (), 0),
@@ -223,9 +233,9 @@ def test_rules_that_are_not_followed_are_kept_named_and_come_back(tmp_path):
         (2, "curvature", "code 99", (1, 2, 3), 0),
         (2, "semi_diameter", "pickup", (), 1),
     ]
-    for one in original.intent.kept:
+    for one in original.optimization_data.kept:
         assert any(note.endswith(f"not followed when the lens is optimised: {one}") for note in report.notes)
-    assert again(original, tmp_path).intent == original.intent
+    assert again(original, tmp_path).optimization_data == original.optimization_data
 
 
 CONFIGURED = """MNUM 2 1
@@ -241,51 +251,51 @@ PRAM   1   2 2E-5 0 2 0 1 1 1.0 0.0 0"""
 
 def test_numbers_of_configurations_vary_one_by_one_and_void_the_variable_of_the_surface(tmp_path):
     original = lens(surface=RULES, tail=CONFIGURED)
-    assert original.intent.variables == (
+    assert original.optimization_data.variables == (
         *(Vary(1, name) for name in ("curvature", "conic", "a6")),
         Vary(1, "thickness", 1, 0),
         Vary(1, "thickness", 2, 0),
         Vary(1, "a4", 1, 2),
     )
-    (rule,) = (one for one in original.intent.solves if one.operand is not None)
+    (rule,) = (one for one in original.optimization_data.solves if one.operand is not None)
     assert rule == Solve(2, "curvature", "pickup", (1.0,), 1, 2.0, configuration=2, operand=1)
     found = again(original, tmp_path)
-    assert found.intent == original.intent
+    assert found.optimization_data == original.optimization_data
     assert [one.values() for one in found.operands] == [one.values() for one in original.operands]
 
 
 def test_the_intent_stays_with_the_lens_under_other_conditions():
     original = lens(surface=RULES, tail=f"{MERIT_LINES.rpartition('MNUM')[0]}{CONFIGURED}")
     for other in (original.at(f_number=8), original.replace(1, thickness=3), original.configuration(2)):
-        assert other.intent is original.intent
-    assert rt.to(original, dtype=torch.float32).intent is original.intent
+        assert other.optimization_data is original.optimization_data
+    assert rt.to(original, dtype=torch.float32).optimization_data is original.optimization_data
 
 
 def test_one_number_of_the_file_that_is_two_of_the_lens_varies_both(tmp_path):
     original = lens(surface="TYPE PARAXIAL\nCURV 0\nPARM 1 50\nVPAR 1\nPARM 2 1").replace(1, glass=rt.AIR)
-    assert original.intent.variables == (Vary(1, "power_x"),)
-    assert original.intent.solves == (Solve(1, "power_y", "pickup", source=1, quantity_of_source="power_x"),)
-    assert again(original, tmp_path).intent == original.intent
+    assert original.optimization_data.variables == (Vary(1, "power_x"),)
+    assert original.optimization_data.solves == (Solve(1, "power_y", "pickup", source=1, quantity_of_source="power_x"),)
+    assert again(original, tmp_path).optimization_data == original.optimization_data
 
 
 def test_bounds_of_a_thickness_are_kept_and_those_of_the_program_are_none(tmp_path):
     original = lens(surface="VDSZ 1 2.5", stop="VDSZ -1.E+10 1.0E+10", UNIT="UNIT CM")
-    assert original.intent.variables == (Vary(1, "thickness", bounds=(10.0, 25.0)), Vary(2, "thickness"))
-    assert again(original, tmp_path).intent == original.intent
+    assert original.optimization_data.variables == (Vary(1, "thickness", bounds=(10.0, 25.0)), Vary(2, "thickness"))
+    assert again(original, tmp_path).optimization_data == original.optimization_data
 
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_bounds_on_one_side_are_kept_and_those_of_other_numbers_are_said_to_be_lost(unit, tmp_path):
     original = lens(surface=RULES, stop="VDSZ 0 0", UNIT=f"UNIT {unit} X", tail="EFFL 0 2 0 0 0 0 50 1 0 0")
-    curvature, thickness, *others, last = original.intent.variables
+    curvature, thickness, *others, last = original.optimization_data.variables
     inf = float("inf")
     bound = (dataclasses.replace(thickness, bounds=(1.5, inf)), *others, dataclasses.replace(last, bounds=(-inf, 30.0)))
-    told = dataclasses.replace(original.intent, variables=(curvature, *bound))
-    assert again(dataclasses.replace(original, intent=told), tmp_path).intent == told
+    told = dataclasses.replace(original.optimization_data, variables=(curvature, *bound))
+    assert again(dataclasses.replace(original, optimization_data=told), tmp_path).optimization_data == told
     steep = dataclasses.replace(told, variables=(dataclasses.replace(curvature, bounds=(0.0, 0.1)), *bound))
-    with pytest.warns(LensFileWarning, match=r"bounds of variables.*thicknesses alone \('curvature of surface 1'\)"):
-        write_lens(dataclasses.replace(original, intent=steep), tmp_path / "again.zmx")
-    assert read_lens_with_report(tmp_path / "again.zmx")[0].intent == told
+    with pytest.warns(LensFileWarning, match=r"other than thicknesses \('curvature of surface 1'\)"):
+        write_lens(dataclasses.replace(original, optimization_data=steep), tmp_path / "again.zmx")
+    assert read_lens_with_report(tmp_path / "again.zmx")[0].optimization_data == told
 
 
 def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
@@ -301,11 +311,11 @@ def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
 
 
 def test_an_intent_says_what_it_holds():
-    shown = str(lens(surface=RULES, stop="PZUP 1 -1 0.5 0", tail=MERIT_LINES).intent)
+    shown = str(lens(surface=RULES, stop="PZUP 1 -1 0.5 0", tail=MERIT_LINES).optimization_data)
     assert "varies: a4 of surface 1" in shown
     assert "follows: thickness of surface 2 = -1 × thickness of surface 1 + 0.5" in shown
     assert "merit function of 12 lines: DMFS x1, BLNK x1, TRAC x1" in shown
-    assert str(Intent()) == "nothing varies, nothing follows, no merit function"
+    assert str(OptimizationData()) == "nothing varies, nothing follows, no merit function"
     assert {"TRAC", "MTFT", "CONF"} <= DIMENSION.keys()
 
 
@@ -317,7 +327,7 @@ def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
     assert status["TRAC"] == (1, 1, "evaluated")
     assert status["BLNK"] == (1, 0, "evaluated")
     assert status["QQQQ"] == (1, 1, "unknown")
-    assert {one.status for one in rt.formats.check(path, evaluated=["TRAC"]).operands if one.name == "EFFL"} == {
+    assert {one.status for one in check(path, evaluated=["TRAC"]).operands if one.name == "EFFL"} == {
         "known, not evaluated"
     }
     document = found.document()
@@ -333,7 +343,7 @@ def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
 
 
 def test_a_table_says_that_it_does_not_hold_what_is_to_be_optimised(tmp_path):
-    with pytest.warns(LensFileWarning, match=r"what is to be optimised \('12 rows of a merit function'\)"):
+    with pytest.warns(LensFileWarning, match=r"the optimisation data \('12 rows of a merit function'\)"):
         write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")
 
 
@@ -350,7 +360,7 @@ def test_rules_give_back_what_the_program_stored():
             found = read_lens_with_report(path)[0]
         except (LensFileError, UnknownGlass):
             continue
-        for one in (*found.intent.solves, *found.intent.kept) if found.intent else ():
+        for one in (*found.optimization_data.solves, *found.optimization_data.kept) if found.optimization_data else ():
             surfaces, k = found.surfaces, one.surface
             if one.kind == "position":
                 run = range(one.source, k + 1) if one.source <= k else range(k, one.source)
@@ -376,5 +386,5 @@ def test_offsets_of_rules_that_are_kept_come_back_in_every_unit(tmp_path):
         original = lens(
             UNIT=f"UNIT {unit} X", surface=f"{RULES}\nPPAR 2 -1 1 0.3", stop="PZUP 2 1 0.7 0", tail="EFFL 0 2"
         )
-        assert {one.kind for one in original.intent.kept} == {"PPAR", "PZUP"}
-        assert again(original, tmp_path).intent == original.intent
+        assert {one.kind for one in original.optimization_data.kept} == {"PPAR", "PZUP"}
+        assert again(original, tmp_path).optimization_data == original.optimization_data

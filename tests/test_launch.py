@@ -9,7 +9,8 @@ from problems import double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.maths import pupil
 from raytrace.maths.value import to
-from raytrace.optics.launch import (
+from raytrace.system.lens import with_object_distance
+from raytrace.tracing.launch import (
     MarginalRayLost,
     launch,
     rays_from_infinity,
@@ -17,9 +18,8 @@ from raytrace.optics.launch import (
     rays_of_field,
     stop_radius,
 )
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, trace_lens, trace_surfaces
-from raytrace.system.lens import with_object_distance
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import media, trace_lens, trace_surfaces
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

@@ -9,9 +9,9 @@ import torch
 from problems import lens, surface, vector
 
 from raytrace import distortion
-from raytrace.formats import LensFileError, read_lens, write_lens
-from raytrace.media.glass import MIRROR, ImplausibleWavelength, InvalidIndex, OutOfRange, check_unit
-from raytrace.media.glass import constant as medium
+from raytrace.io import LensFileError, read_lens, write_lens
+from raytrace.materials.glass import MIRROR, ImplausibleWavelength, InvalidIndex, OutOfRange, check_unit
+from raytrace.materials.glass import constant as medium
 from raytrace.system.lens import check, check_media, with_wavelengths
 
 LENSES = Path(__file__).parents[1] / "lenses"

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.formats import read_lens
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, steps, trace_lens
+from raytrace.io import read_lens
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import media, steps, trace_lens
 
 LENSES = Path(__file__).parents[1] / "lenses"
 FILES = sorted(LENSES.glob("*.zmx"))

@@ -10,14 +10,14 @@ from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 from problems import fields
 
 import raytrace as rt
+from raytrace.analysis.seidel import OF_WAVEFRONT
 from raytrace.files import shipped
-from raytrace.merit.aberrations import OF_WAVEFRONT
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import BadRow
-from raytrace.merit.readings import Readings
-from raytrace.optics.paraxial import first_order
-from raytrace.system.intent import Row
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.conventions import Conventions
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.system.optimization_data import Row
+from raytrace.tracing.paraxial import first_order
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -31,7 +31,7 @@ def test_seidel_sums_are_those_of_the_verb(name):
     lens = lens_of(name)
     found = rt.seidel(lens, kind="waves").contributions[:5, 0].numpy()
     last = len(lens.surfaces) - 2
-    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT, strict=True)):
+    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT[:5], strict=True)):
         told = values_of(name, [Row(operand, (k, 0)) for k in range(1, last + 1)])
         size = np.abs(found).max()
         assert told / share == pytest.approx(found[which], rel=1e-10, abs=1e-12 * size), operand
@@ -140,13 +140,13 @@ def test_other_readings():
     """Each by its own definition from the first choice."""
     lens = lens_of("colours").at(fields=[0.0, 20.0])
     rows = [Row("AXCL"), Row("LACL"), *(Row(operand) for operand in SUMS), Row("DIST", (2, 0))]
-    readings = Readings(colour="second", seidel="wavefront", f_theta="axis included")
-    first, other = told_of(lens, rows), Evaluation(Model(lens), rows, readings=readings)(np.zeros(0)).values
-    assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT], rel=1e-12)
+    conventions = Conventions(colour="second", seidel="wavefront", f_theta="axis included")
+    first, other = told_of(lens, rows), Evaluation(Model(lens), rows, conventions=conventions)(np.zeros(0)).values
+    assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT[:5]], rel=1e-12)
     theta = np.deg2rad(20.0) * np.arange(1, 30) / 29
     y = told_of(lens, [Row("REAY", (8, 2), (0.0, k / 29, 0.0, 0.0)) for k in range(1, 30)])
     off = 100 * np.abs(y / (theta * (y @ theta) / (theta @ theta)) - 1).max()
-    told = Evaluation(Model(lens), [Row("DISC", (0, 2))], readings=readings)(np.zeros(0)).values
+    told = Evaluation(Model(lens), [Row("DISC", (0, 2))], conventions=conventions)(np.zeros(0)).values
     assert told == pytest.approx([off], rel=1e-10)
 
 

@@ -7,11 +7,11 @@ import pytest
 from merit_cases import check_derivatives, model_of, values_of
 
 import raytrace as rt
-from raytrace.merit.arithmetic import ARITHMETIC, Circle
-from raytrace.merit.merit import Evaluation, UnknownOperand
-from raytrace.merit.model import Model
-from raytrace.merit.plan import BadRow
-from raytrace.system.intent import Row, Vary
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation, UnknownOperand
+from raytrace.optimization.operands.arithmetic import ARITHMETIC, Circle
+from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -15,23 +15,20 @@ import torch
 from problems import both_engines, fields, lens, scalar, surface, vector
 
 import raytrace as rt
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import MIRROR, abbe_number, model_glass, nd
-from raytrace.merit.boundaries import BOUNDARIES
-from raytrace.merit.bundle import Bundle
-from raytrace.merit.merit import LOST, Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import Now, planner_of
-from raytrace.merit.readings import Readings
-from raytrace.merit.semi_diameters import ENDS, SemiDiameters
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.sequence import media
-from raytrace.optics.trace import trace_surfaces
-from raytrace.optics.vignetting import vignette
-from raytrace.system.departure import ZernikeSag
-from raytrace.system.intent import Intent, Row, Vary
-from raytrace.system.pose import Pose
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
+from raytrace.optimization.context import EvaluationContext, planner_of
+from raytrace.optimization.conventions import Conventions
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import LOST, Evaluation
+from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
+from raytrace.optimization.ray_bundle import Bundle
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
+from raytrace.system.poses import Pose
+from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import media, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -41,11 +38,13 @@ MARGIN = (4.0, 0.25)
 
 
 def automatic(found, given=(), margin=MARGIN):
-    return dataclasses.replace(found, intent=Intent(semi_diameters=tuple(given), semi_diameter_margin=margin))
+    return dataclasses.replace(
+        found, optimization_data=OptimizationData(semi_diameters=tuple(given), semi_diameter_margin=margin)
+    )
 
 
 def unusual():
-    """A coordinate break, an odd asphere, a toroid, a Zernike departure, a mirror within glass, and the way back."""
+    """A coordinate break, an odd asphere, a toroid, a Zernike sag_terms, a mirror within glass, and the way back."""
     zernike = ZernikeSag(vector(0.0, 0.01, -0.02, 0.01, 0.02), scalar(20.0))
     tilt = Pose(*(scalar(x) for x in (0.0, 0.5, 0.0, 2.0, 0.0, 0.0)))
     return lens(
@@ -53,7 +52,7 @@ def unusual():
             surface(0.01, 4.0, model_glass(1.6, 40.0), coefficients=[0.001, 1e-5, 2e-7], kind="odd asphere"),
             surface(-0.01, 2.0, coefficients=[0.02], kind="toroidal"),
             Surface(scalar(3.0), before=tilt, is_break=True),
-            surface(0.005, 5.0, model_glass(1.5, 60.0), departure=zernike),
+            surface(0.005, 5.0, model_glass(1.5, 60.0), sag_terms=zernike),
             surface(-0.004, -6.0, MIRROR, conic=-0.5),
             surface(0.01, -9.0, conic=0.3, coefficients=[0.0, 1e-6]),
         ],
@@ -97,10 +96,10 @@ OF_ONE = [name for name in BOUNDARIES if name not in OF_RANGES]
 def semi_diameters(found) -> list[float]:
     """By torch's trace, surface by surface."""
     points = torch.tensor(ENDS, dtype=torch.float64).T
-    percent, length = found.intent.semi_diameter_margin
+    percent, length = found.optimization_data.semi_diameter_margin
     sizes = [0.0 if found.surfaces[0].semi_diameter is None else found.surfaces[0].semi_diameter]
     for k in range(1, len(found.surfaces)):
-        if k in found.intent.semi_diameters:
+        if k in found.optimization_data.semi_diameters:
             sizes.append(found.surfaces[k].semi_diameter)
             continue
         heights = [torch.zeros(())]
@@ -125,7 +124,7 @@ def closing(surface, size) -> float:
 def past_edge(surface, size) -> float:
     """What the root of a conic that closes within its semi-diameter adds to a sag whose root is held at 0."""
     left = 1 - closing(surface, size)
-    if surface.kind != "even asphere" or surface.departure is not None or not left < 1e-4:
+    if surface.kind != "even asphere" or surface.sag_terms is not None or not left < 1e-4:
         return 0.0
     t = 1 - left / 1e-4
     root = np.sqrt(1e-4 / (1 + t + t * t))
@@ -283,7 +282,7 @@ def test_rows_of_real_files_are_those_of_an_independent_program(name):
     files = json.loads((MERIT / "oracle.json").read_text())["files"]
     oracle = {one["row"]: one for one in next(one for one in files if one["file"] == path.name)["values"]}
     found = rt.read_lens(path)
-    rows = found.intent.merit
+    rows = found.optimization_data.merit
     told = Evaluation(Model(found), rows, skip_unknown=True)(np.zeros(0)).values
     mine = [number for number, row in enumerate(rows, 1) if row.operand in BOUNDARIES and number in oracle]
     assert len(mine) >= 2
@@ -332,10 +331,10 @@ def test_semi_diameters_are_those_that_opticstudio_stored():
         except UnknownGlass:
             continue
         model, current = Model(found), found.current_configuration
-        planner = planner_of(model, current, found.primary_wavelength - 1, Readings())
+        planner = planner_of(model, current, found.primary_wavelength - 1, Conventions())
         own = planner.shared(SemiDiameters)
         own.ask(range(1, len(found.surfaces)))
-        told = own.at(Now(planner, model.views[current - 1].moment(model.start), {}))
+        told = own.at(EvaluationContext(planner, model.views[current - 1].state(model.start), {}))
         follow = [
             k for k, (size, given) in sizes.items() if k and size and not given and not found.surfaces[k].is_break
         ]
@@ -364,13 +363,13 @@ def test_other_readings_take_the_largest_lack_and_signed_thicknesses():
     thick = automatic(lens([surface(None, 3.0, 1.5), surface(None, 1.0, 1.6), surface(None, 20.0)]))
     model = Model(thick, (Vary(1, "thickness"), Vary(2, "thickness")))
     rows = [Row("MNCG", (1, 3), target=4.0, weight=1.0), Row("MXCG", (1, 3), target=0.5, weight=1.0)]
-    told = Evaluation(model, rows, readings=Readings(boundary="largest"))(model.start, derivatives=True)
+    told = Evaluation(model, rows, conventions=Conventions(boundary="largest"))(model.start, derivatives=True)
     assert told.values == pytest.approx([1.0, 3.0])
     assert told.jacobian == pytest.approx(np.sqrt(0.5) * np.array([[0.0, 1.0], [1.0, 0.0]]))
     back = automatic(lens([surface(None, 5.0, MIRROR), surface(None, -7.0)]))
     told = [
-        Evaluation(Model(back), [Row("MNCA", (1, 1), target=1.0)], readings=reading)(np.zeros(0)).values[0]
-        for reading in (Readings(), Readings(behind_mirrors="signed"))
+        Evaluation(Model(back), [Row("MNCA", (1, 1), target=1.0)], conventions=convention)(np.zeros(0)).values[0]
+        for convention in (Conventions(), Conventions(behind_mirrors="signed"))
     ]
     assert told == [-5.0, 1.0]
 
@@ -412,7 +411,7 @@ def test_rays_are_traced_only_where_a_row_needs_an_automatic_semi_diameter(monke
     assert np.isfinite(Evaluation(model, rows)(model.start).values).all()
     edge = [Row("MNEG", (3, 3), target=1.0, weight=1.0)]
     assert np.isfinite(Evaluation(model, edge)(model.start).values).all()
-    whole = dataclasses.replace(found, intent=None)
+    whole = dataclasses.replace(found, optimization_data=None)
     assert whole.surfaces[1].semi_diameter
     assert np.isfinite(Evaluation(Model(whole), [Row("MNEG", (1, 9), weight=1.0)])(np.zeros(0)).values).all()
 

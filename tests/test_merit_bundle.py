@@ -1,4 +1,4 @@
-"""Bundles: the rays of `optics.launch`, traced with the derivatives that finite differences have."""
+"""Bundles: the rays of `tracing.launch`, traced with the derivatives that finite differences have."""
 
 import dataclasses
 
@@ -8,14 +8,14 @@ import torch
 
 import raytrace as rt
 from raytrace.files import shipped
+from raytrace.materials.glass import model_glass
 from raytrace.maths.dual import Dual
-from raytrace.media.glass import model_glass
-from raytrace.merit.bundle import Bundle
-from raytrace.merit.model import Model
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import trace_lens
-from raytrace.system.intent import Solve, Vary
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.ray_bundle import Bundle
 from raytrace.system.lens import with_field_kind
+from raytrace.system.optimization_data import Solve, Vary
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import trace_lens
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -106,7 +106,7 @@ def test_rays_are_those_of_launch(cases, name):
         here, torch.tensor(PUPIL, dtype=torch.float64).T, fields=largest * torch.tensor(FIELDS, dtype=torch.float64).T
     )
     end = trace_lens(here, rays, here.wavelengths[:, None])
-    hits = bundle.hits(model.views[0].moment(model.start))
+    hits = bundle.hits(model.views[0].state(model.start))
     expected = torch.cat([end.position, end.direction, end.opl[None]]).reshape(7, -1).numpy()
     valid = hits.valid & end.valid.reshape(-1).numpy()
     assert valid.mean() >= 0.75
@@ -116,7 +116,7 @@ def test_rays_are_those_of_launch(cases, name):
 @pytest.mark.parametrize(
     ("name", "engine"),
     [
-        *(pytest.param(name, "fused", marks=pytest.mark.slow if name in SLOW else ()) for name in lenses()),
+        *(pytest.param(name, "compiled", marks=pytest.mark.slow if name in SLOW else ()) for name in lenses()),
         ("near", "eager"),
         ("aspheres", "eager"),
     ],
@@ -124,12 +124,12 @@ def test_rays_are_those_of_launch(cases, name):
 def test_derivatives_are_those_of_finite_differences(cases, name, engine):
     model, bundle = bundle_of(cases[name], name)
     x, count = model.start, len(model.start)
-    with rt.tracing(engine):
-        hits = bundle.hits(model.views[0].moment(Dual(x, np.eye(count))))
+    with rt.trace_engine(engine):
+        hits = bundle.hits(model.views[0].state(Dual(x, np.eye(count))))
         for k in range(count):
             step = 1e-6 * max(abs(x[k]), 1e-3)
             ahead, back = (
-                told(bundle.hits(model.views[0].moment(x + sign * step * np.eye(count)[k]))) for sign in (1, -1)
+                told(bundle.hits(model.views[0].state(x + sign * step * np.eye(count)[k]))) for sign in (1, -1)
             )
             slopes = np.stack([p.full()[k] for p in (*hits.position, *hits.direction, hits.opl)])
             difference = ((ahead - back) / (2 * step))[:, hits.valid]
@@ -141,8 +141,8 @@ def test_derivatives_are_those_of_finite_differences(cases, name, engine):
 @pytest.mark.parametrize("name", ["at infinity", "near", "image heights, near", "aimed", "aimed by the paraxial ray"])
 def test_the_launch_in_numpy_is_that_of_torch(cases, name):
     model, bundle = bundle_of(cases[name], name)
-    moment = model.views[0].moment(Dual(model.start, np.eye(len(model.start))))
-    own, by_torch = bundle.launched(moment), bundle._launched_by_torch(moment)
+    state = model.views[0].state(Dual(model.start, np.eye(len(model.start))))
+    own, by_torch = bundle.launched(state), bundle._launched_by_torch(state)
     for one, other in zip((*own[0], *own[1], own[2]), (*by_torch[0], *by_torch[1], by_torch[2]), strict=True):
         one = one if isinstance(one, Dual) else Dual(one, np.zeros_like(other.slope))
         assert np.allclose(one.value, other.value, rtol=1e-9, atol=1e-9)

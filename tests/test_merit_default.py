@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.merit.default import BadMerit, Boundaries, rows_of
+from raytrace.optimization.default_merit import BadMerit, Boundaries, rows_of
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 PRINTED = 1e-6  # the files hold six to twelve digits

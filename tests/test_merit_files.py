@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytrace.formats import read_lens
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
+from raytrace.io import read_lens
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
 
 FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 
@@ -30,8 +30,8 @@ def cases():
 @functools.cache
 def evaluation(name: str) -> Evaluation:
     lens = read_lens(FOLDER / name)
-    model = Model(lens, lens.intent.variables, lens.intent.solves)
-    return Evaluation(model, lens.intent.merit, unit=lens.intent.unit)
+    model = Model(lens, lens.optimization_data.variables, lens.optimization_data.solves)
+    return Evaluation(model, lens.optimization_data.merit, unit=lens.optimization_data.unit)
 
 
 @pytest.mark.skipif(not cases(), reason="the files are not here")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from merit_cases import LENSES, check_derivatives, is_near, lens_of, values_of
 
-from raytrace.merit.readings import Readings
-from raytrace.optics.f_number import working_f_number
-from raytrace.optics.paraxial import first_order
-from raytrace.system.intent import Row
+from raytrace.optimization.conventions import Conventions
+from raytrace.system.optimization_data import Row
+from raytrace.tracing.f_number import working_f_number
+from raytrace.tracing.paraxial import first_order
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -80,10 +80,12 @@ def test_lengths():
 
 def test_other_readings():
     """In air behind glass, and the sum of thicknesses of what folds."""
-    readings = Readings(focal_length="in air", total_track="sum")
+    conventions = Conventions(focal_length="in air", total_track="sum")
     inside = values_of("immersed image", [Row("EFFL")])[0]
-    assert values_of("immersed image", [Row("EFFL")], readings=readings)[0] == pytest.approx(inside / 1.5, rel=1e-12)
-    assert values_of("two aspheric mirrors", [Row("TOTR")], readings=readings)[0] == pytest.approx(110.0)
+    assert values_of("immersed image", [Row("EFFL")], conventions=conventions)[0] == pytest.approx(
+        inside / 1.5, rel=1e-12
+    )
+    assert values_of("two aspheric mirrors", [Row("TOTR")], conventions=conventions)[0] == pytest.approx(110.0)
 
 
 @pytest.mark.parametrize("name", ["near", "thick lens", "concave mirror", "immersed image"])

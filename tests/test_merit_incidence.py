@@ -8,9 +8,9 @@ from merit_cases import LENSES, check_derivatives, values_of
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.system.intent import Row, Vary
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

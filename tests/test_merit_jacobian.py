@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.formats import read_lens
-from raytrace.merit.default import rows_of
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model, with_numbers_of
-from raytrace.merit.vary import freedom
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import trace_lens
-from raytrace.optics.vignetting import vignette
+from raytrace.io import read_lens
+from raytrace.optimization.default_merit import rows_of
+from raytrace.optimization.lens_model import Model, with_numbers_of
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.variables import freedom
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import trace_lens
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -13,18 +13,17 @@ from problems import lens as lens_of
 from problems import surface, values, vector
 
 import raytrace as rt
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.path import Fit
-from raytrace.merit.plan import BadRow
-from raytrace.merit.readings import Readings
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import scene
-from raytrace.optics.trace import lens_steps, media, trace_lens
-from raytrace.optics.vignetting import vignette
-from raytrace.optics.wavefront import path_to_reference_sphere, wavefront_of
-from raytrace.system.intent import Row, Vary
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.conventions import Conventions
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.wavefront import Fit
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import scene
+from raytrace.tracing.trace import lens_steps, media, trace_lens
+from raytrace.tracing.wavefront import path_to_reference_sphere, wavefront_of
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 WAVES = 1e-7  # what the oracle is held to
@@ -55,11 +54,11 @@ def opd_by_definition(lens: rt.Lens, w: int, field, points, about: int | None = 
     pupil = torch.stack([0 * centre[0], 0 * centre[0], first_order(lens).exit_pupil_position.reshape(1)])
     radius = torch.linalg.vector_norm(centre - pupil, dim=0)
     radius = radius * torch.sign(((centre - pupil) * rays.direction[:, :1]).sum(0))
-    path = path_to_reference_sphere(rays, centre, radius, index)
+    path = path_to_reference_sphere(rays, centre, 1 / radius, index)
     return ((path[1:] - path[0]) / (1e-3 * wavelength)).numpy()
 
 
-# -- the wavefront -----------------------------------------------------------------------------------------------------
+# -- the wavefront ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["double_gauss_28deg", "cooke_triplet", "hubble", "telephoto"])
@@ -98,7 +97,7 @@ def test_a_telecentric_lens_has_a_plane_for_a_sphere():
     assert float(pupil) > 1e12
     asked = rows("OPDC", wavelengths=(1,), fields=[(0.0, 0.0)])
     rays, index, wavelength = beam(telecentric, 0, (0.0, 0.0), [(0.0, 0.0), *POINTS])
-    path = path_to_reference_sphere(rays, rays.position[:, :1], torch.tensor(torch.inf).double(), index)
+    path = path_to_reference_sphere(rays, rays.position[:, :1], torch.tensor(0.0).double(), index)
     found = values(telecentric, asked)
     assert np.abs(found - ((path[1:] - path[0]) / (1e-3 * wavelength)).numpy()).max() < WAVES
     assert np.abs(found).max() > 1.0
@@ -181,7 +180,7 @@ def test_a_fit_leaves_out_what_is_not_there():
     assert np.abs(found[there] - expected).max() < 1e-13
 
 
-# -- open readings -----------------------------------------------------------------------------------------------------
+# -- open conventions --------------------------------------------------------------------------------------------------
 
 
 def test_a_common_tilt_is_one_of_the_path():
@@ -190,18 +189,18 @@ def test_a_common_tilt_is_one_of_the_path():
     asked = rows("OPDX", fields=[(0.0, 0.7)])
     weights, y = np.array([row.weight for row in asked]), np.array([row.numbers[3] for row in asked])
     waves = lens.wavelengths.numpy()[[row.integers[1] - 1 for row in asked]]
-    each, common = values(lens, asked), values(lens, asked, readings=Readings(opd_tilt="common"))
+    each, common = values(lens, asked), values(lens, asked, conventions=Conventions(opd_tilt="common"))
     assert weights @ common**2 > (1 + 1e-6) * (weights @ each**2)
     assert abs((weights * common * y / waves).sum()) < 1e-9
     assert max(abs((weights[p] * common[p]).sum()) for p in groups(asked)) < 1e-9
     single = rows("OPDX", wavelengths=(2,))
-    assert np.abs(values(lens, single) - values(lens, single, readings=Readings(opd_tilt="common"))).max() < 1e-12
+    assert np.abs(values(lens, single) - values(lens, single, conventions=Conventions(opd_tilt="common"))).max() < 1e-12
 
 
 def test_the_sphere_of_the_primary_wavelength():
     lens = rt.read_lens("double_gauss_28deg")
     asked = rows("OPDC", fields=[(0.0, 0.7)])
-    found = values(lens, asked, readings=Readings(opd_chief="primary"))
+    found = values(lens, asked, conventions=Conventions(opd_chief="primary"))
     primary = lens.primary_wavelength - 1
     expected = np.concatenate([opd_by_definition(lens, w, (0.0, 0.7), POINTS, about=primary) for w in range(3)])
     assert np.abs(found - expected).max() < 1e-3 * WAVES
@@ -211,12 +210,12 @@ def test_the_sphere_of_the_primary_wavelength():
 def test_the_sign_of_a_longer_path():
     lens = rt.read_lens("cooke_triplet")
     asked = rows("OPDC")
-    assert np.array_equal(values(lens, asked), -values(lens, asked, readings=Readings(opd_sign="shorter")))
+    assert np.array_equal(values(lens, asked), -values(lens, asked, conventions=Conventions(opd_sign="shorter")))
 
 
 def test_a_reading_that_is_not_known_is_refused_by_name():
     with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': expected one of per wavelength, common"):
-        Readings(opd_tilt="mine")
+        Conventions(opd_tilt="mine")
 
 
 # -- paths -------------------------------------------------------------------------------------------------------------
@@ -287,16 +286,18 @@ VARIABLES = (Vary(1, "curvature"), Vary(4, "thickness"), Vary(6, "curvature"), V
 LOST = (0.0, 2.4)  # a pupil point whose ray misses a surface, and one whose field's chief ray arrives all the same
 
 
-@pytest.mark.parametrize("readings", [Readings(), Readings(opd_tilt="common", opd_chief="primary", opd_sign="shorter")])
+@pytest.mark.parametrize(
+    "conventions", [Conventions(), Conventions(opd_tilt="common", opd_chief="primary", opd_sign="shorter")]
+)
 @pytest.mark.parametrize("operand", ["OPDC", "OPDM", "OPDX", "OPTH", "PLEN"])
-def test_derivatives_with_lost_rays(operand, readings):
+def test_derivatives_with_lost_rays(operand, conventions):
     lens = rt.read_lens("cooke_triplet")
     last = len(lens.surfaces) - 1
     asked = rows(operand, fields=[(0.0, 0.7), (0.4, 0.6)], points=[*POINTS, LOST])
     integers = {"OPTH": lambda w: (last, w), "PLEN": lambda w: (2, last)}.get(operand, lambda w: (0, w))
     asked = [Row(operand, integers(row.integers[1]), row.numbers, weight=row.weight) for row in asked]
     model = Model(lens, VARIABLES)
-    evaluation = Evaluation(model, asked, readings=readings)
+    evaluation = Evaluation(model, asked, conventions=conventions)
     found = evaluation(model.start, derivatives=True)
     assert 0 < found.lost.sum() < len(asked) / 2
     expected = slopes_by_differences(evaluation, model.start) * evaluation.factors[:, None]
@@ -339,7 +340,7 @@ def test_stored_designs_agree_with_the_oracle(name):
     entries = {entry["file"]: entry for entry in json.loads((DEVELOPMENT / "oracle.json").read_text())["files"]}
     expected = np.array([abs(v["value"]) for v in entries[path.name]["values"] if v["op"].startswith("OPD")])
     lens = rt.read_lens(str(path))
-    asked = [row for row in lens.intent.merit if row.operand.startswith("OPD")]
+    asked = [row for row in lens.optimization_data.merit if row.operand.startswith("OPD")]
     found = np.abs(values(lens, asked))
     assert len(expected) == len(found) > 2
     assert np.abs(found - expected).max() < WAVES

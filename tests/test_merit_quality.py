@@ -9,17 +9,16 @@ from differences import slopes_by_differences
 from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
-from raytrace.formats import LensFileWarning
+from raytrace.io import LensFileWarning
 from raytrace.maths.pupil import gauss_rings, square
-from raytrace.merit.measure import Measure
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import BadRow
-from raytrace.optics.focus import image_rays
-from raytrace.optics.scene import scene
-from raytrace.optics.spot import spot_of, spot_of_points
-from raytrace.optics.wavefront import rms, wavefront_of, without
-from raytrace.system.intent import Row, Solve, Vary
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.custom import Measure
+from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.tracing.scene import scene
+from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
+from raytrace.tracing.wavefront import rms, wavefront_of, without
 
 FIELD = (0.0, 0.7)
 
@@ -337,7 +336,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     assert told["operand"] == "sharpness"
     assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
     assert "sharpness" in str(found)
-    with pytest.warns(LensFileWarning, match="what is to be optimised"):
+    with pytest.warns(LensFileWarning, match="the optimisation data"):
         rt.write_lens(found.lens, tmp_path / "found.zmx")
-    row = rt.read_lens(tmp_path / "found.zmx").intent.merit[0]
+    row = rt.read_lens(tmp_path / "found.zmx").optimization_data.merit[0]
     assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")

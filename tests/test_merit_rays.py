@@ -7,10 +7,10 @@ import pytest
 from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 
 import raytrace as rt
-from raytrace.merit.merit import LOST, Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.rays import RAYS
-from raytrace.system.intent import Row
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import LOST, Evaluation
+from raytrace.optimization.operands.rays import RAYS
+from raytrace.system.optimization_data import Row
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -9,11 +9,11 @@ from differences import slopes_by_differences
 from problems import values
 
 import raytrace as rt
-from raytrace.analysis.shear import Fit, layout_of, otf
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.moment import Moment
-from raytrace.system.intent import Row, Vary
+from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.system.optimization_data import Row, Vary
 
 
 def rows(lens: rt.Lens, *frequencies: float, sections: str = "TS", sampling: int = 1, fields=None) -> list[Row]:
@@ -38,7 +38,7 @@ def few(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a wave by torch")
 
-    monkeypatch.setattr(Moment, "through_torch", refuse)
+    monkeypatch.setattr(LensState, "through_torch", refuse)
 
 
 def vignetted() -> rt.Lens:

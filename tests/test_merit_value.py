@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.merit.merit import UnknownOperand
-from raytrace.merit.value import merit_for
-from raytrace.system.intent import Intent, Row
+from raytrace.optimization.merit import merit_for
+from raytrace.optimization.merit_rows import UnknownOperand
+from raytrace.system.optimization_data import OptimizationData, Row
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 
@@ -84,7 +84,7 @@ def test_configurations_are_told_apart(lens):
 
 
 def test_the_file_s_merit_function_is_meant_without_another(lens):
-    own = dataclasses.replace(lens, intent=Intent(merit=(FOCAL,), unit=25.4))
+    own = dataclasses.replace(lens, optimization_data=OptimizationData(merit=(FOCAL,), unit=25.4))
     found = rt.evaluate(own)
     assert (found.unit, len(found.row)) == (25.4, 1)
     assert rt.Merit.of(own).rows == (FOCAL,)
@@ -117,14 +117,14 @@ def test_a_function_of_a_lens_is_a_row_by_its_name(lens):
 
 def test_readings_are_chosen_by_words(lens):
     rows = [Row("SPHA", (0, 1), weight=1.0)]
-    usual, other = (float(rt.evaluate(lens, merit=rows, readings=r).values[0]) for r in (None, "seidel=wavefront"))
+    usual, other = (float(rt.evaluate(lens, merit=rows, conventions=r).values[0]) for r in (None, "seidel=wavefront"))
     assert other == pytest.approx(usual / 8, rel=1e-12)
-    spelled = rt.evaluate(lens, merit=rows, readings=["focal_length=in-air", "seidel=wavefront"])
+    spelled = rt.evaluate(lens, merit=rows, conventions=["focal_length=in-air", "seidel=wavefront"])
     assert float(spelled.values[0]) == other
     with pytest.raises(ValueError, match=r"did you mean seidel\?"):
-        rt.evaluate(lens, merit=rows, readings="seidl=wavefront")
+        rt.evaluate(lens, merit=rows, conventions="seidl=wavefront")
     with pytest.raises(ValueError, match="expected one of coefficients, wavefront"):
-        rt.evaluate(lens, merit=rows, readings="seidel=waves")
+        rt.evaluate(lens, merit=rows, conventions="seidel=waves")
 
 
 def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
@@ -137,7 +137,9 @@ def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
     value = float(rt.first_order(lens).effective_focal_length)
     both = [float(rt.evaluate(lens, merit=one).values[0]) for one in (joined, OWN + inches)]
     assert both == pytest.approx([value / 25.4, value], rel=1e-12)
-    edged = merit_for(dataclasses.replace(lens, intent=Intent(merit=inches.rows, unit=25.4)), edge=2.54)
+    edged = merit_for(
+        dataclasses.replace(lens, optimization_data=OptimizationData(merit=inches.rows, unit=25.4)), edge=2.54
+    )
     assert edged.rows[-1].target == pytest.approx(0.1)
 
 

@@ -7,11 +7,13 @@ import torch
 from matplotlib.text import Text
 
 import raytrace as rt
-from raytrace.analysis import aperture, mtf, smooth_pupil
+from raytrace.analysis import mtf
+from raytrace.analysis import pupil_autocorrelation as aperture
+from raytrace.analysis import pupil_autocorrelation as smooth_pupil
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import TakesLong
 from raytrace.cli import main
-from raytrace.plot.analysis import mtf_curves
+from raytrace.plotting.analysis import mtf_curves
 
 
 def defocused(by: float) -> rt.Lens:

@@ -24,18 +24,18 @@ from test_zemax import file
 from test_zemax_archive import archive
 from test_zemax_types import CASES, text
 
-from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
-from raytrace.formats import FORMATS, LensFileError, read_lens, read_lens_with_report
-from raytrace.formats.pictures import PictureError, read_grey
-from raytrace.formats.ray_table import RayTableError, read_rays
+from raytrace.imaging.training import DamagedRun, OtherSettings, Run, load_state, read_state
+from raytrace.io import FORMATS, LensFileError, read_lens, read_lens_with_report
+from raytrace.io.pictures import PictureError, read_grey
+from raytrace.io.ray_tables import RayTableError, read_rays
+from raytrace.materials.agf import CatalogError, read_agf
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import ImplausibleWavelength, InvalidIndex
 from raytrace.maths.arrays import ArrayError, read_npy, read_npz
-from raytrace.media.agf import CatalogError, read_agf
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import ImplausibleWavelength, InvalidIndex
 from raytrace.system.configurations import count
-from raytrace.wave.element import Pixels, Rings
-from raytrace.wave.exchange import FORMATS as HEIGHTS
-from raytrace.wave.exchange import HeightMapError, read_heights, write_heights
+from raytrace.wave_optics.element import Pixels, Rings
+from raytrace.wave_optics.height_maps import FORMATS as HEIGHTS
+from raytrace.wave_optics.height_maps import HeightMapError, read_heights, write_heights
 
 ROOT = Path(__file__).parents[1]
 

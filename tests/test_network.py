@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from raytrace.camera.network import PRESETS, RedNet, RedNetShape
+from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
 
 
 def parameters(network) -> int:

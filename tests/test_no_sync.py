@@ -8,15 +8,15 @@ import torch
 from problems import double_gauss, lens, surface, vector
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from raytrace.fused import tracing
+from raytrace.materials.glass import MIRROR
 from raytrace.maths import pupil
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, trace_surfaces
-from raytrace.system import search
+from raytrace.system import intersection as search
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import media, trace_surfaces
 
 #: Operators whose result, or the shape of it, the host has to read from the device.
 READS = {
@@ -147,7 +147,7 @@ def test_reads_are_counted():
 @pytest.mark.parametrize("make", SYSTEMS)
 def test_trace_reads_nothing_back(make):
     system, rays, indices = prepared(make())
-    with tracing("eager"), HostReads() as reads:
+    with trace_engine("eager"), HostReads() as reads:
         end = forward_and_backward(system, rays, indices)
     assert not reads.found
     assert bool(end.valid.any())
@@ -158,7 +158,7 @@ def test_trace_reads_nothing_back(make):
 @pytest.mark.parametrize("make", SYSTEMS)
 def test_trace_without_derivatives_reads_nothing_back(make):
     system, rays, indices = prepared(make())
-    with torch.no_grad(), tracing("eager"), HostReads() as reads:
+    with torch.no_grad(), trace_engine("eager"), HostReads() as reads:
         trace_surfaces(system.surfaces[1:], rays, indices=indices)
     assert not reads.found
 
@@ -168,7 +168,7 @@ def test_trace_needs_no_numbers_of_its_rays():
     _, rays, indices = prepared(clipped())
     there = trainable(to(clipped(), device="meta"))
     media_there = {id(n): n.to("meta") for n in indices}
-    with tracing("eager"):
+    with trace_engine("eager"):
         end = trace_surfaces(
             there.surfaces[1:],
             to(rays, device="meta"),
@@ -186,7 +186,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
         if not early:
             monkeypatch.setattr(search, "_reads_are_free", lambda tensor: False)
         system, rays, indices = prepared(strong_asphere())
-        with tracing("eager"), HostReads() as reads:
+        with trace_engine("eager"), HostReads() as reads:
             end = forward_and_backward(system, rays, indices)
         # That reads are found where they are shows that they would be.
         assert bool(reads.found) == early
@@ -200,7 +200,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}
     given = {name: torch.empty(shape, dtype=torch.float64, device="meta") for name, shape in shapes.items()}
-    t, met = search.search(**given, kind="even asphere", numbers=[], departure="", rim=9.0)
+    t, met = search.search(**given, kind="even asphere", numbers=[], sag_terms="", rim=9.0)
     assert t.shape == met.shape == (5,)
 
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.vary import bounds_of, freedom
-from raytrace.optimization.opening import opened
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import Problem
+from raytrace.optimization.variables import bounds_of, freedom
 
 #: Factors of the curvatures of the double Gauss, with which most of its rays are lost.
 BENT = (1.15, 0.58, 0.67, -0.95, 2.44, 1.0, 1.12, 1.41, 0.0, 0.16, 1.51)
@@ -20,7 +20,7 @@ BENT = (1.15, 0.58, 0.67, -0.95, 2.44, 1.0, 1.12, 1.41, 0.0, 0.16, 1.51)
 def bent():
     lens = rt.read_lens("double_gauss")
     lens = lens.at(entrance_pupil_diameter=float(rt.first_order(lens).entrance_pupil_diameter))
-    lens = dataclasses.replace(lens, intent=None)
+    lens = dataclasses.replace(lens, optimization_data=None)
     for k, factor in enumerate(BENT, 1):
         if lens.surfaces[k].curvature is not None:
             curvature = torch.tensor(factor * float(lens.surfaces[k].curvature), dtype=torch.float64)

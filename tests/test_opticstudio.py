@@ -11,7 +11,7 @@ import pytest
 import torch
 from opticstudio_answers import ANSWERS, CASES, ELSEWHERE, intensities, lens_of, share_of, tensor
 
-from raytrace.optics.paraxial import first_order
+from raytrace.tracing.paraxial import first_order
 
 #: Differs by what OpticStudio does: pattern of the case's id, why, and the largest difference in the case's unit.
 THEIRS = {

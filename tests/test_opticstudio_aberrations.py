@@ -12,9 +12,9 @@ import torch
 from problems import fields, lens, scalar, surface, vector
 
 from raytrace import distortion_grid, incidence, longitudinal_aberration, rms_over_field, seidel
-from raytrace.media.glass import Glass
-from raytrace.optics.f_number import working_f_number
-from raytrace.optics.paraxial import first_order
+from raytrace.materials.glass import Glass
+from raytrace.tracing.f_number import working_f_number
+from raytrace.tracing.paraxial import first_order
 
 WAVELENGTHS = 0.42, 0.44, 0.46
 

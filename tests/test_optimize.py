@@ -12,17 +12,15 @@ from scipy.optimize import minimize
 
 import raytrace as rt
 from raytrace.bench import optimise as bench
-from raytrace.merit.default import Boundaries, rows_of
-from raytrace.merit.model import Model
-from raytrace.merit.vary import freedom, name_of
-from raytrace.optimization import paths
-from raytrace.optimization.least_squares import Manner, State, least_squares
-from raytrace.optimization.lost import Recovery
-from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.step import Linear, NoStep, Sides
-from raytrace.plot.optimize import optimize_report
-from raytrace.system.intent import Intent, Row, Vary
-from raytrace.system.pose import Pose
+from raytrace.optimization import checkpoint as paths
+from raytrace.optimization.default_merit import Boundaries, rows_of
+from raytrace.optimization.least_squares import Linear, Manner, NoStep, Sides, State, least_squares
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
+from raytrace.optimization.variables import freedom, name_of
+from raytrace.plotting.optimize import optimize_report
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
 
 FAR = np.inf
@@ -179,7 +177,7 @@ def test_a_limit_is_kept_where_it_is_in_the_way_and_is_let_go_where_it_is_not(tr
 def test_both_engines_end_at_the_same_lens(triplet):
     ends = []
     for engine in ("eager", "auto"):
-        with rt.tracing(engine):
+        with rt.trace_engine(engine):
             found = rt.optimize(triplet, merit="spot", vary="curvature:1-3 sensor", rings=2)
             ends.append(found.variables_after)
     assert torch.allclose(*ends, rtol=1e-6, atol=1e-9)
@@ -197,7 +195,7 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
     variables = tuple(Vary(k, "curvature") for k in (1, 2, 3))
     ends = []
     for unit in (1.0, 25.4):
-        told = dataclasses.replace(triplet, intent=Intent(variables, (), rows, unit=unit))
+        told = dataclasses.replace(triplet, optimization_data=OptimizationData(variables, (), rows, unit=unit))
         ends.append(rt.optimize(told))
     assert ends[0].merit_after == pytest.approx(25.4 * ends[1].merit_after, rel=1e-9)
     assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-6)
@@ -252,11 +250,11 @@ def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet)
 
 
 def test_bounds_stay_with_the_lens(triplet, tmp_path):
-    lens = dataclasses.replace(triplet, intent=None)
+    lens = dataclasses.replace(triplet, optimization_data=None)
     found = rt.optimize(lens, merit="spot", vary="curvature:1 thickness:1,2", bounds="thickness_1:1..", cycles=1).lens
-    assert [one.bounds for one in found.intent.variables] == [(), (1.0, float("inf")), ()]
+    assert [one.bounds for one in found.optimization_data.variables] == [(), (1.0, float("inf")), ()]
     rt.write_lens(found, tmp_path / "lens.zmx")
-    assert rt.read_lens(tmp_path / "lens.zmx").intent.variables == found.intent.variables
+    assert rt.read_lens(tmp_path / "lens.zmx").optimization_data.variables == found.optimization_data.variables
 
 
 # -- lost rays ---------------------------------------------------------------------------------------------------------

@@ -11,20 +11,27 @@ from scipy.stats import spearmanr
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.fused import prepare
-from raytrace.media.catalog import shipped_catalog
-from raytrace.media.glass import abbe_number, nd, refractive_index
-from raytrace.merit.hold import conditions_of
-from raytrace.merit.value import merit_for
-from raytrace.merit.vary import freedom
+from raytrace.materials.catalogs import shipped_catalog
+from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.glass import Choice, Design, expansion
-from raytrace.optimization.glass_freedom import without_glass
-from raytrace.optimization.glass_pool import STATUSES, Pool, catalogs_of, hull, pool_of
-from raytrace.optimization.least_squares import State, least_squares
+from raytrace.optimization.constraints import conditions_of
+from raytrace.optimization.glass_choice import (
+    STATUSES,
+    Choice,
+    Design,
+    Pool,
+    catalogs_of,
+    expansion,
+    hull,
+    pool_of,
+    without_glass,
+)
+from raytrace.optimization.least_squares import Sides, State, least_squares
+from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.step import Sides
-from raytrace.system.intent import Intent, Solve, Vary
+from raytrace.optimization.variables import freedom
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
 BOUNDS = {"glass_thickness": (2.0, 20.0), "air_thickness": (0.3, 100.0), "edge": 1.0}
@@ -170,7 +177,9 @@ def test_which_glasses_vary(triplet):
     pickup = (Solve(6, "glass", "pickup", source=1),)
     for kept, expected in (((), (1, 3, 6)), (substitute, (1,)), (pickup, (1, 3))):
         lens = rt.read_lens("cooke_triplet")
-        lens = dataclasses.replace(lens, intent=Intent(variables=(Vary(1, "curvature"),), kept=kept))
+        lens = dataclasses.replace(
+            lens, optimization_data=OptimizationData(variables=(Vary(1, "curvature"),), kept=kept)
+        )
         free, surfaces = without_glass(freedom(lens, "glass"), "glass")
         assert surfaces == expected
         assert free.variables == (Vary(1, "curvature"),)
@@ -180,8 +189,8 @@ def test_which_glasses_vary(triplet):
 
 def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
-    intent = Intent(kept=(Solve(6, "glass", "pickup", source=1),))
-    lens = dataclasses.replace(triplet, intent=intent)
+    optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))
+    lens = dataclasses.replace(triplet, optimization_data=optimization_data)
     found = rt.optimize(lens, merit="spot", vary="curvature sensor glass", hold="efl=100", cycles=6, **BOUNDS)
     assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
     assert {step.surface for step in found.glasses} <= {0, 1, 3}

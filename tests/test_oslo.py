@@ -17,13 +17,13 @@ from problems import rotation
 import raytrace as rt
 from raytrace.analysis.seidel import seidel
 from raytrace.cli import main
-from raytrace.formats import LensFileError, UnsupportedSurface, convert, oslo_read, read_lens
-from raytrace.media.catalog import UnknownGlass, find_glass
-from raytrace.media.glass import refractive_index
-from raytrace.optics.frames import frames
-from raytrace.optics.scene import scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.io import FORMATS, LensFileError, UnsupportedSurface, convert, read_lens
+from raytrace.materials.catalogs import UnknownGlass, find_glass
+from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import check
+from raytrace.tracing.geometry import frames
+from raytrace.tracing.scene import scene
+from raytrace.tracing.wavefront import wavefront_of
 
 FAR = "TH 1e20"
 
@@ -35,7 +35,7 @@ def text(surfaces, *system, title="x", stated="", tail="", waves="WV 0.58756; WW
 
 
 def read(*arguments, strict=False, **options):
-    return oslo_read.read(text(*arguments, **options), "lens.len", strict=strict)
+    return FORMATS[".len"].read(text(*arguments, **options), "lens.len", strict=strict)
 
 
 def lens(*arguments, **options):
@@ -239,7 +239,7 @@ def double_gauss(waves: str) -> str:
 @pytest.mark.filterwarnings("ignore")
 def test_path_differences_in_waves_are_those_that_oslo_traces():
     """UNI 1 is a millimetre: paths are told in waves."""
-    found, _ = oslo_read.read(double_gauss("WV 0.58756; WW 1"), "lens.len")
+    found, _ = FORMATS[".len"].read(double_gauss("WV 0.58756; WW 1"), "lens.len")
     theirs = [-0.0166099413374108, -0.0719477735201281, -0.189106686954516]
     assert opd(found, 0.58756, [0.5, 0.75, 1.0]) == pytest.approx(theirs, abs=1e-7)
 
@@ -248,7 +248,7 @@ def test_path_differences_in_waves_are_those_that_oslo_traces():
 def test_the_first_wavelength_is_the_primary_one():
     """OSLO's chief ray of 14°, mm: of the F line where that stands first."""
     for waves, height in (("0.48613 0.58756 0.65627", 24.945679), ("0.58756 0.48613 0.65627", 24.9495)):
-        found = oslo_read.read(double_gauss(f"WV {waves}; WW 1 1 1"), "lens.len")[0].at(ray_aiming="real")
+        found = FORMATS[".len"].read(double_gauss(f"WV {waves}; WW 1 1 1"), "lens.len")[0].at(ray_aiming="real")
         rays = rt.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
         end = rt.trace(found, rays)
         digits = len(str(height).partition(".")[2])
@@ -444,7 +444,7 @@ def test_commands_stand_on_lines_or_between_semicolons_in_any_case():
     one = text(SINGLET, "EBR 5; ANG 7")
     lines = one.replace("; ", "\n").replace("RD", "rd").replace("GLA N-BK7", "gla  n-bk7  // a comment; NXT")
     assert "rd 50" in lines
-    first, second = (oslo_read.read(each, "lens.len")[0] for each in (one, lines))
+    first, second = (FORMATS[".len"].read(each, "lens.len")[0] for each in (one, lines))
     assert [float(s.thickness) for s in first.surfaces] == [float(s.thickness) for s in second.surfaces]
     assert focal_length(first) == focal_length(second)
 
@@ -564,10 +564,10 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
         (("TH 100", *SINGLET[1:]), "NAO 0.1; ANG 5", "ANG (a field angle) of a near object"),
         ((FAR, "RD 50; GLA N-BK7; TH 4", "PU -0.1; TH 40"), "FNO 4", "PU .* for a beam by EBR only"),
         ((FAR, "RD 50; GLA N-BK7; TH 4", "RD -50; PY 1"), "FNO 4", "PY 1 .* PY 0 for any"),
-        ((FAR, "RD 50; GLA N-BK7; TH 4", "RD -50; PY 0; TH 4"), "EBR 5", "tell the same number twice"),
-        ((FAR, "RD 50; GLA N-BK7; TH 4", "RD -50; PU -0.1; TH 4"), "EBR 5", "tell the same number twice"),
-        ((FAR, "TH 4", "PY 0"), "EBR 5", "never comes to that height"),
-        ((FAR, "TH 4", "PU -0.1; TH 5"), "EBR 5", "no curvature here bends"),
+        ((FAR, "RD 50; GLA N-BK7; TH 4", "RD -50; PY 0; TH 4"), "EBR 5", "give the same number twice"),
+        ((FAR, "RD 50; GLA N-BK7; TH 4", "RD -50; PU -0.1; TH 4"), "EBR 5", "give the same number twice"),
+        ((FAR, "TH 4", "PY 0"), "EBR 5", "never reaches that height"),
+        ((FAR, "TH 4", "PU -0.1; TH 5"), "EBR 5", "no curvature here refracts"),
         ((FAR, "RD 50; CV 0.02; TH 4", "TH 5"), "EBR 5", "CV, but RD in line"),
         ((FAR, "RD 50; TH 1e10", "TH 5"), "EBR 5", "only the object may be at infinity"),
         (("TH 1e20; RFL", "TH 5", "TH 5"), "EBR 5", "RFL (a mirror) of the object"),
@@ -578,7 +578,7 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
         (SINGLET, "EBR 5; UNI 0", "expected the millimetres"),
         (SINGLET, "EBR x", "EBR: size of the aperture is 'x'"),
         ((FAR, "RD 50; AST; TH 4", "AST; TH 5"), "EBR 5", "a second AST; surface 1"),
-        (("TH 1e20; AST", "TH 4", "TH 5"), "EBR 5", "AST on the object"),
+        (("TH 1e20; AST", "TH 4", "TH 5"), "EBR 5", "AST is surface 0"),
         ((FAR, "AP -1; TH 4", "TH 5"), "EBR 5", "AP is -1"),
         ((FAR, "GLA; TH 4", "TH 5"), "EBR 5", "without a name"),
         ((FAR, "WV 0.5; GLA 1.5 1.6 1.7 1.8; TH 4", "TH 5"), "EBR 5", "4 indices for 3 wavelengths"),
@@ -589,9 +589,9 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
         ((FAR, "RFL; TLA 5; TLB 5; BEN; TH -4", "TH 5"), "EBR 5", "by TLA or by TLB alone"),
         ((FAR, "RFL; TLA 5; DCY 1; BEN; TH -4", "TH 5"), "EBR 5", "by TLA or by TLB alone"),
         ((FAR, "RFL; TLA 5; RCO; BEN; TH -4", "TH 5"), "EBR 5", "without RCO"),
-        ((FAR, "RD 50; TH 4", "RD 5; PK CV -1"), "EBR 5", "RD in line 5 and PK CV -1 tell the same number twice"),
-        ((FAR, "RD 50; GLA N-BK7; TH 4", "PU -0.1; PK CV -1"), "EBR 5", "PK in line 5 and PU tell the same"),
-        ((FAR, "GLA N-BK7; TH 4", "PU -0.1; TH 3", "PK CV -1"), "EBR 5", "PK CV -1 of what is solved for"),
+        ((FAR, "RD 50; TH 4", "RD 5; PK CV -1"), "EBR 5", "RD in line 5 and PK CV -1 give the same number twice"),
+        ((FAR, "RD 50; GLA N-BK7; TH 4", "PU -0.1; PK CV -1"), "EBR 5", "PK in line 5 and PU give the same"),
+        ((FAR, "GLA N-BK7; TH 4", "PU -0.1; TH 3", "PK CV -1"), "EBR 5", "PK CV -1 of a number that is solved for"),
         ((FAR, "RFL; TH -4", "PK GLA -1"), "EBR 5", "picks up a mirror"),
     ],
 )
@@ -611,24 +611,24 @@ def test_what_cannot_be_read_is_refused_in_a_line(surfaces, system, message):
         ("RD 5\n", "expected LEN NEW"),
         ("LEN OLD\n", "expected LEN NEW"),
         (text(SINGLET, "EBR 5").replace("END 3", ""), "no END after 4 surfaces"),
-        (text(SINGLET, "EBR 5", end=7), "END tells that the image is surface 7, but it is 3"),
-        (text(SINGLET, "EBR 5", stated="50 2"), "LEN NEW tells that the image is surface 2, but it is 3"),
+        (text(SINGLET, "EBR 5", end=7), "END says that the image is surface 7, but it is 3"),
+        (text(SINGLET, "EBR 5", stated="50 2"), "LEN NEW says that the image is surface 2, but it is 3"),
         (text(SINGLET, "EBR 5", waves="TH 0.1; WV 0.5"), "focus shift"),
         (text(SINGLET, "EBR 5", waves="PY 0; WV 0.5"), "solve"),
         (text(SINGLET, "EBR 5", waves="WV 0.5; WW 1 2"), "WW has 2 values for 1 wavelengths"),
-        (text(SINGLET, "EBR 5", waves="WV 0.5; WV3 0.6"), "WV3, but 1 wavelengths stand before it"),
+        (text(SINGLET, "EBR 5", waves="WV 0.5; WV3 0.6"), "WV3, but 1 wavelengths precede it"),
         ("LEN NEW; EBR 1\n" + "NXT\n" * 1100 + "END\n", "more than 1000 surfaces"),
     ],
 )
 def test_a_file_that_is_no_lens_or_cut_off_is_refused(content, message):
     with pytest.raises(LensFileError, match=message):
-        oslo_read.read(content, "lens.len")
+        FORMATS[".len"].read(content, "lens.len")
 
 
 def test_a_command_that_stands_again_is_warned_of():
     _, report = read((FAR, "RD 50; RD 60; GLA N-BK7; TH 4", "TH 50"), "EBR 5; FNO 4; ANG 1; OBH -1e19")
     told = "\n".join(report.warnings)
-    assert "RD stands again (first in line 4); the last is used" in told
+    assert "RD occurs again (first in line 4); the last is used" in told
     assert "several system apertures (EBR in line 2 and FNO in line 2); the last is used" in told
     assert "several fields (ANG in line 2 and OBH in line 2); the last is used" in told
 

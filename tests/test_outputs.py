@@ -49,7 +49,6 @@ def lens(tmp_path):
         ("trace lens.zmx --rays rays.csv -o rays.csv", "rays.csv: is the file of --rays too"),
         ("search lens.zmx --merit spot --vary curvature -o lens.zmx", "lens.zmx: is a file; give the name of a folder"),
         ("wave psf --element e.json --aperture 1 --plot no/x.png", "no/x.png: cannot be written"),
-        ("wave focus -o no/x.npy", "no/x.npy: cannot be written"),
         ("bench trace --csv no/x.csv", "no/x.csv: cannot be written"),
         ("codesign lens.zmx -o lens.zmx", "lens.zmx: is the file of WORDS too"),
     ],
@@ -80,8 +79,8 @@ def test_a_result_that_cannot_be_saved_is_printed(lens, command_line, monkeypatc
     def full(path, write):
         raise OSError(28, "cannot be written: No space left on device", str(path))
 
-    monkeypatch.setattr("raytrace.formats.write_atomically", full)
-    monkeypatch.setattr("raytrace.plot.style.write_atomically", full)
+    monkeypatch.setattr("raytrace.io.write_atomically", full)
+    monkeypatch.setattr("raytrace.plotting.style.write_atomically", full)
     for words in (f"{OPTIMIZE} -o x.zmx", "focus lens.zmx -o x.zmx", "spot lens.zmx --plot x.png"):
         text, document = command_line(*words.split()), command_line(*words.split(), "--json")
         assert (text.code, document.code) == (1, 1)
@@ -95,7 +94,7 @@ def test_what_a_search_cannot_write_is_told_and_its_minima_are_printed(lens, com
     def full(*arguments):
         raise OSError(28, "No space left on device", "minimum_01.zmx")
 
-    monkeypatch.setattr("raytrace.optimization.searched.write_lens", full)
+    monkeypatch.setattr("raytrace.optimization.search_result.write_lens", full)
     words = "search lens.zmx --merit spot --vary sensor --starts 1 --rings 2 -o minima --bounds sensor:80..120"
     done = command_line(*words.split())
     assert done.code == 1

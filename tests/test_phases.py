@@ -9,11 +9,11 @@ from bends import real
 
 import raytrace as rt
 from raytrace.maths.bivariate import fringe, fringe_to_powers, polynomial_xy, powers
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import axial_path, trace_lens, trace_surfaces
 from raytrace.system.phases import added_path, power_of
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import axial_path, trace_lens, trace_surfaces
 
 WAVELENGTH = torch.tensor(0.55, dtype=torch.float64)
 
@@ -50,7 +50,7 @@ def test_the_path_at_the_vertex_is_the_constant_of_the_terms():
         assert abs(found - terms * 0.55e-3) < 1e-15, name
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
     """Zernike's first fringe term: λ times the order, along every ray, in both engines."""
 
@@ -59,7 +59,7 @@ def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
         surfaces = [Surface(real(5.0), phase=phase), Surface(real(0.0))]
         x = torch.linspace(-3, 3, 4096, dtype=torch.float64)
         rays = start(torch.stack([x, 0.1 * x, 0 * x]), torch.stack([0 * x, 0 * x, 1 + 0 * x]), 0 * x)
-        with rt.tracing(engine):
+        with rt.trace_engine(engine):
             return trace_surfaces(surfaces, rays, indices=[real(1.0)] * 3, wavelength=WAVELENGTH).opl
 
     piston = real(1.0).requires_grad_()
@@ -201,7 +201,7 @@ def test_facets_bend_as_the_surface_above_the_plane():
     assert end.valid.all()
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 @pytest.mark.parametrize("index", [(1.0, 1.5), (1.5, 1.0)])
 def test_beyond_the_edge_of_its_conic_a_fresnel_lens_loses_light_and_has_no_derivative(engine, index, monkeypatch):
     monkeypatch.setenv("RAYTRACE_TRACE", engine)
@@ -228,7 +228,7 @@ def rays_of(rays, count):
     return start(rays.position[:, :count].detach(), rays.direction[:, :count], real(0.0))
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_facets_of_a_mirror_reflect_as_the_mirror_above_the_plane(engine, monkeypatch):
     """A parabola in facets: light along the axis crosses it at half the radius, 20 mm, less what the plane is lower."""
     monkeypatch.setenv("RAYTRACE_TRACE", engine)
@@ -259,14 +259,14 @@ def test_derivatives_by_every_number_of_a_phase(name):
     assert torch.autograd.gradgradcheck(lambda *n: trace(*n)[0][:, 3], leaves, atol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_the_path_of_an_ideal_lens_is_smooth_in_both_powers(engine):
     """By one power alone, at equal ones, a derivative is that of differences: the path has no jump there."""
 
     def total(power_x, power_y):
         lens = lens_of(rt.IdealLens(power_x, power_y), object_distance=80.0, image=60.0, field=3.0)
         rays = launch(lens, points.expand(2, -1))
-        with rt.tracing(engine):
+        with rt.trace_engine(engine):
             return trace_lens(lens, rays, lens.wavelengths[:, None]).opl.sum()
 
     points = rt.gauss_rings(4, dtype=torch.float64)[0].repeat(1, 100)  # as many as the compiled trace is worth

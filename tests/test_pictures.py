@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytrace.studies import pictures
-from raytrace.studies.pictures import NoPictures, Pictures, crop, dead_leaves, digest, draws, files, order, read, split
+from raytrace.imaging import pictures
+from raytrace.imaging.pictures import NoPictures, Pictures, crop, dead_leaves, digest, draws, files, order, read, split
 
 
 @pytest.fixture

@@ -13,18 +13,18 @@ from matplotlib.patches import Circle
 from problems import number
 
 import raytrace as rt
-from raytrace import plot
-from raytrace.formats import read_lens
+from raytrace import plotting as plot
+from raytrace.io import read_lens
+from raytrace.materials.glass import constant
 from raytrace.maths.pupil import fan, gauss_rings
-from raytrace.media.glass import constant
-from raytrace.optics.focus import focus_of_rms, image_rays
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
-from raytrace.optics.spot import spot_of_points
-from raytrace.plot import outline, style
-from raytrace.plot.curve import focus_rays
-from raytrace.plot.spots import field_spots, shares_of
+from raytrace.plotting import outline, style
+from raytrace.plotting.curve import focus_rays
+from raytrace.plotting.spots import field_spots, shares_of
 from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture, Surface, sag
+from raytrace.tracing.focus import focus_of_rms
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.tracing.spot import image_rays, spot_of_points
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

@@ -12,14 +12,15 @@ from page import outside
 from problems import number
 
 import raytrace as rt
-from raytrace import plot, read_lens
+from raytrace import plotting as plot
+from raytrace import read_lens
 from raytrace.analysis.setting import NothingToShow
 from raytrace.cli import main
-from raytrace.optics.focus import image_rays
-from raytrace.plot import style
-from raytrace.plot.analysis import curvature_curves, illumination_curve
-from raytrace.plot.spots import even_hexapolar, field_spots
-from raytrace.plot.style import field_colours
+from raytrace.plotting import style
+from raytrace.plotting.analysis import curvature_curves, illumination_curve
+from raytrace.plotting.spots import even_hexapolar, field_spots
+from raytrace.plotting.style import field_colours
+from raytrace.tracing.spot import image_rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 LONG = "A lens whose name is so long that no figure of one panel is as wide as it, f = 57.6 m, F/24, of two mirrors"

@@ -10,12 +10,13 @@ import torch
 from page import outside
 from problems import number
 
-from raytrace import analysis, plot, read_lens
+from raytrace import analysis, read_lens
+from raytrace import plotting as plot
 from raytrace.cli import main
-from raytrace.kernels import close_up, psf
 from raytrace.maths.grid import grid
-from raytrace.plot.psf import DECADES
-from raytrace.plot.style import fill
+from raytrace.plotting.psf import DECADES
+from raytrace.plotting.style import fill
+from raytrace.psf_models import close_up, psf
 
 LENSES = Path(__file__).parents[1] / "lenses"
 

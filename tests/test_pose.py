@@ -6,11 +6,12 @@ from bends import pose, real
 from problems import rotation
 
 import raytrace as rt
-from raytrace.optics.trace import axial_path, bend_slopes, diffract, reflect, refract, trace_surfaces
 from raytrace.system.phases import Added
-from raytrace.system.pose import Pose, direction_in, direction_out, point_in, point_out
+from raytrace.system.poses import Pose, direction_in, direction_out, point_in, point_out
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
+from raytrace.tracing.refraction import bend_slopes, diffract, reflect, refract
+from raytrace.tracing.trace import axial_path, trace_surfaces
 
 SOME = {"x": 1.5, "y": -2.0, "z": 0.25, "tilt_x": 20.0, "tilt_y": -33.0, "tilt_z": 71.0}
 

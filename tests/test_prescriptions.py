@@ -7,11 +7,11 @@ import pytest
 import torch
 from problems import focal_length
 
-from raytrace.formats import LensFileError, table_read
-from raytrace.formats.source import Place, decode
-from raytrace.formats.table_columns import meaning
-from raytrace.media.glass import LINES, abbe_number, nd, refractive_index
-from raytrace.optics.paraxial import first_order
+from raytrace.io import FORMATS, LensFileError
+from raytrace.io.source import Place, decode
+from raytrace.io.table.columns import meaning
+from raytrace.materials.glass import LINES, abbe_number, nd, refractive_index
+from raytrace.tracing.paraxial import first_order
 
 SYSTEM = "# wavelengths: 0.5876\n# fields: angle 0\n# aperture: F/4\n"
 
@@ -67,7 +67,7 @@ stop       8.300     1      0      21.3
 
 
 def read(text: str, system: str = SYSTEM, **options):
-    return table_read.read(system + text, "lens.csv", **options)
+    return FORMATS[".csv"].read(system + text, "lens.csv", **options)
 
 
 def summilux(headings: str, order: str = "No R d n V") -> str:
@@ -148,9 +148,9 @@ def test_a_diameter_is_halved_and_a_semi_diameter_is_not():
         ("No,R,d,nd,νd,h", "column 'h' holds numbers"),
         ("No,R,d,nx,νd,φ", "column 'nx' holds numbers"),
         ("No,R,d,n(1064nm),νd,φ", r"column 'n\(1064nm\)' holds numbers"),
-        ("No,R,d,n,νe,φ", "column 'n' does not say its spectral line; write 'nd' or 'ne'"),
-        ("No,R,d,ne,ν,φ", "column 'ν' does not say its spectral line; write 'Vd' or 'Ve'"),
-        ("No,R,d,index,nd,φ", "column 'index' does not say its spectral line"),
+        ("No,R,d,n,νe,φ", "column 'n' does not name its spectral line; write 'nd' or 'ne'"),
+        ("No,R,d,ne,ν,φ", "column 'ν' does not name its spectral line; write 'Vd' or 'Ve'"),
+        ("No,R,d,index,nd,φ", "column 'index' does not name its spectral line"),
         ("No,R,d,nd,νd,κ", "column 'κ' holds numbers"),
         ("No,R,d,nd,νd,A", "column 'A' holds numbers"),
         ("No,R,d,nd,νd,φ (in)", "not in mm; write the header line '# units: in'"),

@@ -8,8 +8,8 @@ from test_layers import MODULES
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.formats import FORMATS, LensFileError
-from raytrace.formats.source import Place, decode
+from raytrace.io import FORMATS, LensFileError
+from raytrace.io.source import Place, decode
 
 WAVES = [0.5876, 0.4861, 0.6563]
 ROWS = [dict(radius=50, thickness=4, glass=1.5), dict(radius=-50, thickness=48)]

@@ -8,7 +8,7 @@ import pytest
 
 from raytrace.cli import progress as module
 from raytrace.cli.progress import Bar, Lines, clock, heartbeat, progress
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 
 
 class Terminal(io.StringIO):
@@ -71,7 +71,7 @@ def test_clock():
 def test_every_command_has_a_heartbeat(quick, monkeypatch, capsys):
     """Also while it does what counts nothing."""
     from raytrace.cli import main
-    from raytrace.optics import views
+    from raytrace.tracing import lens_report as views
 
     found = views.info(read_lens("double_gauss"))
     monkeypatch.setattr(views, "info", lambda lens: time.sleep(0.2) or found)

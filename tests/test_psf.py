@@ -10,13 +10,13 @@ import torch
 from problems import field, number, sharp_double_gauss
 
 import raytrace as rt
-from raytrace.kernels import EmptyPsf, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import trace_lens
+from raytrace.psf_models import EmptyPsf, NotConverged, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import trace_lens
 
 LENSES = Path(__file__).parents[1] / "lenses"
 TRACED = ("gaussian", "drt", "wave")

@@ -6,10 +6,10 @@ import pytest
 import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
-from raytrace.kernels.clear import between, clear_arms, rays_of_search
-from raytrace.kernels.rays import trace_clearances
-from raytrace.optics.scene import Scene, scene
+from raytrace.psf_models.drt import trace_clearances
+from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import Scene, scene
 
 RADIUS = 5.0  # of the entrance pupil, mm
 EDGE = 1e-10  # two Newton steps from an edge enclosed in 1/2048, the slope good to 1/2048 of the radius
@@ -124,7 +124,7 @@ def test_rays_of_the_search_are_counted(monkeypatch):
         traced.append(disc.shape[-1])
         return plain(found, disc)
 
-    monkeypatch.setattr("raytrace.kernels.clear.trace_apertures", counting)
+    monkeypatch.setattr("raytrace.psf_models.pupil_clearance.trace_apertures", counting)
     inner, _ = clear_arms(window(Aperture("circular", (0.0, 1.0), True, (0.0, 2.0))), arms(16))
     assert inner.shape[-1] == 32
     assert sum(traced) == rays_of_search(16, 32)

@@ -9,7 +9,7 @@ import pytest
 
 from raytrace import read_lens
 from raytrace.cli import main
-from raytrace.kernels import psf
+from raytrace.psf_models import psf
 
 LENS = str(Path(__file__).parents[1] / "lenses" / "double_gauss.zmx")
 FORM = ["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "30000", "--field", "0", "2"]

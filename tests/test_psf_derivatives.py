@@ -7,14 +7,14 @@ import pytest
 import torch
 from problems import double_gauss, scalar, vector
 
-from raytrace.kernels import gaussian, raymap
-from raytrace.kernels.models import MODELS
-from raytrace.kernels.rays import energy_of_fans
+from raytrace.materials.glass import model_glass
 from raytrace.maths.grid import Grid
-from raytrace.media.glass import model_glass
-from raytrace.optics.scene import Scene, scene, trace_scene
+from raytrace.psf_models import drt, gaussian
+from raytrace.psf_models.drt import energy_of_fans
+from raytrace.psf_models.models import MODELS
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import Scene, scene, trace_scene
 
 #: Kind of parameter -> what one unit of it is; a millionth of that moves light by nanometres.
 KINDS = {
@@ -126,7 +126,7 @@ def test_derivative_of_drt_comes_near_that_of_the_converged_kernel(kind):
 
     def converged(unit):
         of, _ = moved(kind, scalar(unit), where)
-        return energy_of_fans(where, raymap.fans_of_map(raymap.fit(of, 16), 512, 256))
+        return energy_of_fans(where, drt.fans_of_map(drt.fit(of, 16), 512, 256))
 
     with torch.no_grad():
         expected = (converged(1e-3) - converged(-1e-3)) / 2e-3

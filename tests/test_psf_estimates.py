@@ -13,17 +13,17 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.formats import read_lens
-from raytrace.kernels import NotConverged, diffraction, fourier, psf, raymap
-from raytrace.kernels.clear import between, clear_arms
-from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.result import Kernels, polychromatic
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.optics.launch import stop_radius
-from raytrace.optics.scene import Scene, beam_share, scene, trace_scene
+from raytrace.psf_models import NotConverged, drt, fourier, psf, wave
+from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.pupil_clearance import between, clear_arms
+from raytrace.psf_models.result import Kernels, polychromatic
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
+from raytrace.tracing.launch import stop_radius
+from raytrace.tracing.scene import Scene, beam_share, scene, trace_scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 INF = math.inf
@@ -136,9 +136,9 @@ def reference(model: str, lens: Lens, options: dict):
             found = dense_gaussian(batch, window)
         elif model == "drt":
             nothing = number([0.0]).expand(3, *batch.shape)
-            found = Kernels(raymap.reference(batch, window), window, nothing[:2], nothing, 0)
+            found = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
         else:
-            found = {"fourier": fourier, "wave": diffraction}[model].kernels(batch, window, order=9)
+            found = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
         return polychromatic(found, options["wavelength_weights"], model)
 
 

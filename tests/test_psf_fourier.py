@@ -7,13 +7,13 @@ import pytest
 import torch
 from problems import vector
 
-from raytrace.kernels import fourier
-from raytrace.kernels.dft import bessel_j0
 from raytrace.maths.grid import grid
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
-from raytrace.optics.scene import scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.psf_models import fourier
+from raytrace.psf_models.dft import bessel_j0
 from raytrace.system.lens import with_sensor_distance
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.tracing.scene import scene
+from raytrace.tracing.wavefront import wavefront_of
 
 WAVE = 0.53e-3  # mm
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 from problems import MICROMETRE, double_gauss, scalar, vector
 
-from raytrace.formats import read_lens
-from raytrace.kernels import gaussian
-from raytrace.kernels import pixels as rules
-from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.rays import trace_clearances
+from raytrace.io import read_lens
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings, sobol
-from raytrace.optics.scene import beam_share, scene, trace_scene
+from raytrace.psf_models import gaussian
+from raytrace.psf_models import pixels as rules
+from raytrace.psf_models.drt import trace_clearances
+from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import beam_share, scene, trace_scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ROUNDING = 2.0**-53

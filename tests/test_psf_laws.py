@@ -10,12 +10,12 @@ import pytest
 import torch
 from problems import number, vector
 
-from raytrace.formats import read_lens
-from raytrace.kernels import Memo, diffraction, psf
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
-from raytrace.optics.scene import scene
+from raytrace.psf_models import Memo, psf, wave
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 WAVELENGTH, FOCUS, DIAMETER = 0.55e-3, 50.0, 0.5  # mm
@@ -30,7 +30,7 @@ def perfect(defocus: float = 0.0):
 def along_radius(lens, radii: torch.Tensor) -> torch.Tensor:
     """Intensity per mm² of the wave model at radii (K,) mm."""
     own = scene(lens, vector(0.0, 0.0)[:, None], vector(math.inf), lens.wavelengths)
-    U = diffraction.amplitude(diffraction.waves(own, radii.max(), order=2), radii, vector(0.0))[0, 0, 0, 0]
+    U = wave.amplitude(wave.waves(own, radii.max(), order=2), radii, vector(0.0))[0, 0, 0, 0]
     return U.real**2 + U.imag**2
 
 
@@ -52,8 +52,8 @@ def test_defocus_on_the_axis_is_sinc_squared_of_the_wave_model():
         delta = u * WAVELENGTH / (2 * math.pi * na**2)
         lens = perfect(delta)
         own = scene(lens, vector(0.0, 0.0)[:, None], vector(math.inf), lens.wavelengths)
-        light = diffraction.waves(own, 0.0, order=2)
-        U = diffraction.amplitude(light, vector(0.0), vector(0.0)).flatten()
+        light = wave.waves(own, 0.0, order=2)
+        U = wave.amplitude(light, vector(0.0), vector(0.0)).flatten()
         found = (U.real**2 + U.imag**2) / (light.amplitude.sum() / WAVELENGTH) ** 2
         quarter = 0.25 * u * radius / (radius + delta)
         assert float(found) == pytest.approx((math.sin(quarter) / quarter) ** 2, abs=2e-4)

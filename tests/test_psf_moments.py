@@ -9,8 +9,8 @@ import torch
 from problems import number
 
 from raytrace import read_lens
-from raytrace.kernels import psf
 from raytrace.maths.grid import centres, grid
+from raytrace.psf_models import psf
 from raytrace.system.lens import with_sensor_distance
 
 LENSES = Path(__file__).parents[1] / "lenses"

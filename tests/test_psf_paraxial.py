@@ -7,11 +7,11 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.kernels import paraxial, psf
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.paraxial import paraxial_image_distance
-from raytrace.optics.scene import scene
+from raytrace.psf_models import paraxial, psf
 from raytrace.system.lens import with_sensor_distance
+from raytrace.tracing.paraxial import paraxial_image_distance
+from raytrace.tracing.scene import scene
 
 INF = math.inf
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.kernels.dft import integrate, sub_pixels
-from raytrace.kernels.radial import energy_of_rings, is_centred, radii_of_waves, unfold
 from raytrace.maths.grid import grid
+from raytrace.psf_models.dft import integrate, sub_pixels
+from raytrace.psf_models.radial import energy_of_rings, is_centred, radii_of_waves, unfold
 
 SIZES = [21, 20, (1, 49), (7, 4)]
 

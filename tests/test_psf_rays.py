@@ -7,14 +7,13 @@ import pytest
 import torch
 from problems import number, relative_l1, sharp_double_gauss
 
-from raytrace.formats import read_lens
-from raytrace.kernels.rays import kernels, trace_fans
-from raytrace.kernels.splat import below_edge, histogram, splat, splat_cells, splat_smooth
+from raytrace.io import read_lens
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.scene import beam_share, scene
+from raytrace.psf_models.drt import below_edge, histogram, kernels_of_rays, splat, splat_cells, splat_smooth, trace_fans
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import beam_share, scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 
@@ -26,7 +25,7 @@ def scene_of(lens: Lens, field: float, distance: float = 1e4):
 
 def window(of, pitch: float = 0.005, size: int = 21) -> Grid:
     """A grid at the centroid of a scene, off it by a part of a pixel."""
-    centre = kernels(of, grid(pitch, 3), order=2).centroid.detach()
+    centre = kernels_of_rays(of, grid(pitch, 3), order=2).centroid.detach()
     return Grid(number(pitch), size, size, centre + 0.0003)
 
 
@@ -85,8 +84,8 @@ def test_equals_brute_force_within_its_noise(field, times):
     of = scene_of(sharp_double_gauss(stop=11.5 if field else 9.5), field)
     where = window(of)
     with torch.no_grad():
-        counted = sum(kernels(of, where, rays=2**19, sampling=s, width=0).kernel for s in seeds(times)) / times
-        found = kernels(of, where, order=6)
+        counted = sum(kernels_of_rays(of, where, rays=2**19, sampling=s, width=0).kernel for s in seeds(times)) / times
+        found = kernels_of_rays(of, where, order=6)
     assert relative_l1(found.kernel, counted) < 0.01
     assert float(found.kernel.sum()) == pytest.approx(float(counted.sum()), abs=2e-3)
     assert float(counted.sum()) < 0.97  # some are vignetted
@@ -101,8 +100,8 @@ def test_error_falls_with_the_order_and_all_light_is_inside(field):
     of = scene_of(sharp_double_gauss(), field)
     where = window(of, size=61)
     with torch.no_grad():
-        best = kernels(of, where, order=8)
-        errors = [relative_l1(kernels(of, where, order=order).kernel, best.kernel) for order in (1, 3, 5)]
+        best = kernels_of_rays(of, where, order=8)
+        errors = [relative_l1(kernels_of_rays(of, where, order=order).kernel, best.kernel) for order in (1, 3, 5)]
     assert errors[2] < errors[1] < errors[0]
     assert errors[2] < 0.02
     assert float(best.kernel.sum()) == pytest.approx(1.0, abs=1e-6)
@@ -126,7 +125,7 @@ def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(name):
             pixels = Grid(where.pitch + 1e-3 * shift, 21, 21, where.centre)
         else:
             pixels = Grid(where.pitch, 21, 21, where.centre + 1e-2 * shift)
-        return (kernels(scene_of(changed, field), pixels, order=3).kernel * weight).sum()
+        return (kernels_of_rays(scene_of(changed, field), pixels, order=3).kernel * weight).sum()
 
     at = number(0.0).requires_grad_()
     (slope,) = torch.autograd.grad(merit(at), at)
@@ -142,7 +141,7 @@ def test_vignetting_edge_has_a_derivative():
     lens = sharp_double_gauss(stop=11.0)
     gap = lens.surfaces[4].thickness.clone().requires_grad_()
     of = scene_of(lens.replace(4, thickness=gap), 10.0)
-    energy = kernels(of, Grid(number(0.1), 61, 61, window(of).centre), order=4).kernel.sum()
+    energy = kernels_of_rays(of, Grid(number(0.1), 61, 61, window(of).centre), order=4).kernel.sum()
     (slope,) = torch.autograd.grad(energy, gap)
     assert 0.1 < float(energy.detach()) < 0.95
     assert abs(float(slope)) > 1e-4
@@ -153,7 +152,7 @@ def test_no_light_is_zero_energy_and_zero_gradient():
     sensor = number(57.0).requires_grad_()
     of = scene_of(with_sensor_distance(lens, sensor), 10.0)
     for options in ({"order": 1}, {"rays": 64}):
-        found = kernels(of, grid(0.005, 5), **options)
+        found = kernels_of_rays(of, grid(0.005, 5), **options)
         total = found.kernel.sum() + found.centroid.sum() + found.covariance.sum()
         (slope,) = torch.autograd.grad(total, sensor)
         assert float(found.kernel.detach().abs().sum()) == 0
@@ -161,7 +160,7 @@ def test_no_light_is_zero_energy_and_zero_gradient():
 
 
 def test_a_positive_field_moves_the_light_to_positive_y():
-    found = kernels(scene_of(sharp_double_gauss(), 10.0), grid(0.005, 3), order=2)
+    found = kernels_of_rays(scene_of(sharp_double_gauss(), 10.0), grid(0.005, 3), order=2)
     assert float(found.centroid[1]) > 10
     assert abs(float(found.centroid[0])) < 1e-9
 
@@ -169,7 +168,9 @@ def test_a_positive_field_moves_the_light_to_positive_y():
 def test_central_obscuration_takes_its_area():
     lens = read_lens(LENSES / "hubble.zmx")
     of = scene_of(lens, 0.05, float("inf"))
-    found = kernels(of, Grid(number(0.05), 21, 21, kernels(of, grid(0.05, 3), order=2).centroid), order=5)
+    found = kernels_of_rays(
+        of, Grid(number(0.05), 21, 21, kernels_of_rays(of, grid(0.05, 3), order=2).centroid), order=5
+    )
     assert float(found.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=2e-3)
 
 

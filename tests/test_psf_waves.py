@@ -8,20 +8,20 @@ import pytest
 import torch
 from problems import field, number, scene_of, vector
 
-from raytrace.kernels import NotConverged, diffraction, fourier, psf
-from raytrace.kernels.dft import huygens
+from raytrace.materials.glass import constant
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.media.glass import constant
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene, scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.psf_models import NotConverged, fourier, psf, wave
+from raytrace.psf_models.dft import huygens
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, scene
+from raytrace.tracing.wavefront import wavefront_of
 
 WAVES = ("fourier", "wave")
-MODULES = {"fourier": fourier, "wave": diffraction}
+MODULES = {"fourier": fourier, "wave": wave}
 
 
 def slow(stop: float | None = None, sensor: float = 57.8817685, beam: float = 8.0) -> Lens:
@@ -160,7 +160,7 @@ def test_single_precision_keeps_the_kernel(model, distance):
 def test_single_precision_keeps_the_strehl_ratio():
     s = scene_of(slow(sensor=57.6), 5.0, 25e3)
     rounded = to(s, dtype=torch.float32)
-    narrow, wide = diffraction.strehl(rounded), diffraction.strehl(to(rounded, dtype=torch.float64))
+    narrow, wide = wave.strehl(rounded), wave.strehl(to(rounded, dtype=torch.float64))
     assert narrow.dtype == torch.float32
     assert 0.1 < float(narrow) < 0.9
     assert abs(float(narrow) - float(wide)) < 1e-6
@@ -177,9 +177,9 @@ def test_a_parabolic_mirror_is_perfect(obstruction):
     hole = (Aperture("circular", (obstruction * radius, 5.0)),) if obstruction else ()
     mirror = problems.surface(-0.5 / focus, -focus, problems.MIRROR, conic=-1.0, apertures=hole)
     s = scene_of(problems.lens([mirror], aperture=("entrance_pupil_diameter", 2 * radius)), 0.0, math.inf)
-    assert float(diffraction.strehl(s)) == pytest.approx(1.0, abs=1e-6)
+    assert float(wave.strehl(s)) == pytest.approx(1.0, abs=1e-6)
     pixel = 1e-4
-    peak = float(diffraction.kernels(s, grid(pixel, 1)).kernel.sum()) / pixel**2
+    peak = float(wave.kernels(s, grid(pixel, 1)).kernel.sum()) / pixel**2
     a = radius / (0.55e-3 * focus)
     assert peak == pytest.approx(math.pi * a**2 * (1 - obstruction**2) ** 2, rel=3e-4)
 
@@ -193,9 +193,9 @@ def test_the_residual_is_what_debyes_integral_leaves_out(defocus):
     s = scene_of(lens, 0.0, math.inf)
     s = Scene(s.lens, s.fields + vector(0.01, 0.0)[:, None], s.wavelengths)  # no symmetry: every ray is there
     reach = 0.1 * defocus + 0.011
-    light = diffraction.waves(s, 1.1 * reach)
+    light = wave.waves(s, 1.1 * reach)
     offset = torch.linspace(-reach, reach, 41, dtype=torch.float64)
-    U = diffraction.amplitude(light, offset, vector(0.0))[0, 0, 0, 0]
+    U = wave.amplitude(light, offset, vector(0.0))[0, 0, 0, 0]
     front, points = light.wavefront, torch.stack([offset, 0 * offset, 0 * offset])
     radius, wavelength = front.radius[0, 0, 0], 1e-3 * front.wavelength[0]
     q = -radius * front.direction[:, 0, 0, 0]
@@ -204,7 +204,7 @@ def test_the_residual_is_what_debyes_integral_leaves_out(defocus):
     ours, exact = (a.real**2 + a.imag**2 for a in (U, direct))
     wrong = float((ours - exact).abs().sum() / exact.sum())
     window = Grid(number(2 * reach / 45), 45, 45, light_at("wave", s))
-    residual = float(diffraction.kernels(s, window, order=-2).residual)
+    residual = float(wave.kernels(s, window, order=-2).residual)
     assert wrong < residual < 10 * wrong
 
 

@@ -8,12 +8,12 @@ from problems import scalar, sharp_double_gauss, vector
 from test_psf_derivatives import moved
 
 import raytrace as rt
-from raytrace.kernels import psf
 from raytrace.maths.grid import grid
-from raytrace.optics.scene import chief_landing, scene
+from raytrace.psf_models import psf
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
-from raytrace.wave.bridge import hybrid_psf
+from raytrace.tracing.scene import chief_landing, scene
+from raytrace.wave_optics.hybrid import hybrid_psf
 
 #: Model, what is done, whether of a narrow beam (few waves). All beams are clipped but those of plain rays, whose rim
 #: has no derivative: a ray that crosses it within a step would be a jump of the difference.

@@ -9,12 +9,12 @@ from problems import fields, lens, surface
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.media.glass import model_glass
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
+from raytrace.materials.glass import model_glass
+from raytrace.optimization.attained import NotReached
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.reached import NotReached
-from raytrace.system.intent import Intent, Row, Vary
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
 
 REFUSED = {
     "two numbers for one": ("curvature", "", "efl=100 efl=50", "efl=100 (now 101.181), efl=50", "exclude one another"),
@@ -148,7 +148,7 @@ def concave(curvature, conic=None):
     )  # fmt: skip
     sized = [dataclasses.replace(one, semi_diameter=10.0) for one in made.surfaces[1:-1]]
     surfaces = (made.surfaces[0], *sized, made.surfaces[-1])
-    return dataclasses.replace(made, surfaces=surfaces, intent=Intent(semi_diameters=(1, 2, 3, 4)))
+    return dataclasses.replace(made, surfaces=surfaces, optimization_data=OptimizationData(semi_diameters=(1, 2, 3, 4)))
 
 
 EDGES = {

@@ -4,7 +4,7 @@ import pytest
 from test_zemax_types import CASES, read, text
 
 import raytrace as rt
-from raytrace.optics.remarks import entries, remarks
+from raytrace.tracing.lens_report import entries, remarks
 
 TOLD = {
     "standard": [],

@@ -7,12 +7,12 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.formats import read_lens
-from raytrace.kernels import psf
+from raytrace.io import read_lens
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.reuse import Memo, cross_bundle, trace_bundle
+from raytrace.psf_models import psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import Memo, cross_bundle, trace_bundle
 
 LENSES = Path(__file__).parents[1] / "lenses"
 PUPIL = gauss_rings(3, 8)[0]

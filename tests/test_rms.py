@@ -10,11 +10,10 @@ from problems import double_gauss, fields, lens, scalar, surface, vector
 from raytrace import rms_over_field, wavefront
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.maths import pupil
-from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import spot_of
 from raytrace.system.surface import Aperture
+from raytrace.tracing.spot import image_rays, spot_of
 
 TRIPLET = read_lens(shipped("lenses") / "cooke_triplet.zmx")
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report
-from raytrace.media.glass import refractive_index
+from raytrace.io import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report
+from raytrace.materials.glass import refractive_index
 
 
 def part(kind: str, module: str = "rayoptics.x", **attributes) -> dict:
@@ -145,7 +145,7 @@ def test_a_diffractive_surface_has_its_power(read):
         (model([part("ThinLens", _power=0.02), BACK], SINGLET[1]), UnsupportedSurface, "surface 1: .*a thin lens"),
         (model([surface(part("XToroid", cv=0.1)), BACK], SINGLET[1]), UnsupportedSurface, "a profile of class XToroid"),
         (model(*SINGLET, stop=None), UnsupportedSurface, "a stop that floats is not modelled"),
-        (model(*SINGLET, stop=3), LensFileError, "stop_surface is '3'"),
+        (model(*SINGLET, stop=3), LensFileError, "stop_surface is surface 3"),
         (model(*SINGLET, fields=("image", "angle")), LensFileError, "fields by image angle are not modelled"),
         (model(*SINGLET, pupil=("image", "epd", 3.0)), LensFileError, "a pupil by image epd is not modelled"),
         (model(*SINGLET, unit="furlong"), LensFileError, "dimensions are 'furlong'"),

@@ -15,12 +15,13 @@ from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import both_engines
 from torch.testing import assert_close
 
-from raytrace.fused import engine
-from raytrace.media.glass import AIR, constant
-from raytrace.optics.jacobian import hit_jacobian
-from raytrace.optics.trace import refract, trace_surfaces
+from raytrace.materials.glass import AIR, constant
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import engine
+from raytrace.tracing.jacobian import hit_jacobian
+from raytrace.tracing.refraction import refract
+from raytrace.tracing.trace import trace_surfaces
 
 LENGTHS = {"x", "y", "z", "opl"}
 ASPHERES = [case for case in CASES if case.get("family") == "asphere" and len(case["surfaces"]) < 5]

@@ -6,9 +6,9 @@ import pytest
 import torch
 from problems import double_gauss, vector
 
-from raytrace.optics.scene import Scene, beam_share, scene, symmetry, trace_scene
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import Scene, beam_share, scene, symmetry, trace_scene
 
 FIELDS = 0.0, 10.0, 14.0  # those of the lens
 

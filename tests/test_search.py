@@ -12,24 +12,23 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.media.glass import is_air
-from raytrace.merit.default import rows_of
-from raytrace.merit.hold import conditions_of
-from raytrace.merit.model import Model
-from raytrace.merit.readings import readings_of
-from raytrace.merit.vary import bounds_of, freedom
-from raytrace.optimization.asked import Asked
-from raytrace.optimization.insertion import Place
+from raytrace.materials.glass import is_air
+from raytrace.optimization.constraints import conditions_of
+from raytrace.optimization.conventions import conventions_of
+from raytrace.optimization.default_merit import rows_of
 from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner, least_squares
-from raytrace.optimization.meniscus import enlarged, saddle, thinned
-from raytrace.optimization.minima import Minima
-from raytrace.optimization.opening import opened
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
+from raytrace.optimization.search_result import Minima
+from raytrace.optimization.search_settings import Asked
 from raytrace.optimization.starts import length_of, space_of
+from raytrace.optimization.variables import bounds_of, freedom
 
 PLANE = float("inf")
-PLAIN = {"unit": 1.0, "skip_unknown": False, "readings": readings_of(None)}  # of a problem
+PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem
 HOW = {"merit": "spot", "vary": "curvature thickness", "glass_thickness": "2:8", "edge": 1.0, "rings": 2}
 
 

@@ -8,13 +8,13 @@ import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace import seidel
-from raytrace.formats import read_lens
-from raytrace.media.glass import MIRROR, model_glass
-from raytrace.optics.focus import image_rays
-from raytrace.optics.paraxial import first_order, marginal_ray, signed, system_matrix
-from raytrace.optics.trace import media
-from raytrace.system.departure import ZernikeSag
+from raytrace.io import read_lens
+from raytrace.materials.glass import MIRROR, model_glass
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.sag_terms import ZernikeSag
+from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_matrix
+from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import media
 
 INF = math.inf
 FIELD = fields("angle", (8.0,))
@@ -150,8 +150,8 @@ def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():
     assert bool((seidel(afocal).contributions == 0).all())
     with pytest.raises(ValueError, match="expected one of coefficients, waves"):
         seidel(afocal, kind="wave")
-    bumpy = surface(0.02, 5.0, 1.5, departure=ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3), scalar(5.0)))
-    with pytest.raises(ValueError, match="surface 1 has a departure"):
+    bumpy = surface(0.02, 5.0, 1.5, sag_terms=ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3), scalar(5.0)))
+    with pytest.raises(ValueError, match="surface 1 has added sag terms"):
         seidel(lens([bumpy, surface(None, 90.0)]))
 
 

@@ -13,17 +13,17 @@ from problems import NANOMETRE, number
 from test_formats import damaged, leaves, read_damaged
 
 import raytrace as rt
-from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
-from raytrace.formats.seq_keywords import FIELD_KINDS, POSE_WORDS, SURFACE_READ, SYSTEM_READ
-from raytrace.formats.source import Place, UnsupportedSurface, decode
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import constant, index, model_glass
-from raytrace.optics.trace import trace_lens
-from raytrace.system.aperture import Aperture
+from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.io.codev.keywords import FIELD_KINDS, POSE_WORDS, SURFACE_READ, SYSTEM_READ
+from raytrace.io.source import Place, UnsupportedSurface, decode
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import constant, index, model_glass
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.phases import RadialPhase
-from raytrace.system.pose import Pose, undone
+from raytrace.system.poses import Pose, undone
 from raytrace.system.rays import Rays
+from raytrace.tracing.trace import trace_lens
 
 MICROMETRE = 1e-3
 
@@ -168,7 +168,7 @@ def test_a_stored_distance_that_is_not_the_paraxial_one_is_solved_and_told():
     wrong = ACHROMAT.replace("95.95194415183156", "0")
     lens, report = of(wrong)
     assert float(lens.surfaces[-2].thickness) == pytest.approx(95.95194415183156, rel=1e-12)
-    assert "PIM puts the image to 95.9519442 mm, where 0 mm is stored" in report.warnings[0]
+    assert "PIM puts the image at 95.9519442 mm, where 0 mm is stored" in report.warnings[0]
     with pytest.raises(LensFileError, match="PIM"):
         of(wrong, strict=True)
 
@@ -446,7 +446,7 @@ def test_a_catalog_beside_the_file_is_found_by_its_name(tmp_path):
     path.write_text(SINGLET.replace("NBK7_SCHOTT", "MY1_MINE"))
     lens, report = read_lens_with_report(path)
     assert (lens.surfaces[1].glass.name, float(index(lens.surfaces[1].glass, 0.5))) == ("MY-1", 1.6)
-    assert any("Mine.agf beside the lens" in note for note in report.notes)
+    assert any("Mine.agf in the folder of the lens" in note for note in report.notes)
     write_lens(lens, tmp_path / "again.seq")
     assert leaves(read_lens(tmp_path / "again.seq")) == leaves(lens)
     with pytest.raises(UnknownGlass, match="MY1_MINE"):
@@ -543,7 +543,7 @@ REFUSED = {
     "RET S1": "RET (return to an earlier surface)",
     "GLB S1": "GLB (global coordinates)",
     "NSS": "NSS (non-sequential surfaces)",
-    "XOD 1": "XOD (centre of a tilt beside the vertex)",
+    "XOD 1": "XOD (centre of a tilt off the vertex)",
     "IN other.seq": "IN (another file)",
     "AUT": "AUT (optimisation)",
     "NA 0.25": "NA (numerical aperture in image space)",

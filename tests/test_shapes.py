@@ -14,30 +14,30 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt
-from raytrace.camera.variables import Variables
-from raytrace.formats import read_lens, write_lens
-from raytrace.formats.source import LensFileError
-from raytrace.fused import tracing
-from raytrace.fused.structure import is_expressible
-from raytrace.kernels import psf
+from raytrace.imaging.variables import Variables
+from raytrace.io import read_lens, write_lens
+from raytrace.io.source import LensFileError
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.scene import symmetry
-from raytrace.optics.spot import spot_of
-from raytrace.optics.streaming import stream_spot
-from raytrace.optics.trace import trace_lens, trace_surfaces
-from raytrace.plot.outline import depth
+from raytrace.plotting.outline import depth
+from raytrace.psf_models import psf
 from raytrace.system import shapes
-from raytrace.system.aperture import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
-from raytrace.system.build import lens as lens_of_rows
-from raytrace.system.departure import Sag
-from raytrace.system.places import number_at, places, with_number
+from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
+from raytrace.system.intersection import intersect, normal
+from raytrace.system.parameter_paths import number_at, parameter_paths, with_number
+from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
-from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.system.sag_terms import Sag
+from raytrace.system.surface import sag, sag_at
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Memo, symmetry, trace_bundle
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.streaming import stream_spot
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 SHARED = Path(__file__).parents[2] / "shared"
 TIER2, CORPUS = SHARED / "tier2", SHARED / "corpus"
@@ -215,7 +215,7 @@ def test_units_and_too_many_terms(tmp_path):
 
 @value
 class Ripple:
-    """A departure made up here: depth (R,) mm of ripples exp(-(x² + 2 y²)/width²), one number and several."""
+    """sag terms made up here: depth (R,) mm of ripples exp(-(x² + 2 y²)/width²), one number and several."""
 
     depth: torch.Tensor
     width: torch.Tensor
@@ -243,14 +243,14 @@ def dome(u, coefficients, highest, along):
 def made_up(monkeypatch):
     kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
     monkeypatch.setitem(shapes.KINDS, "dome", kind)
-    ripple = shapes.DepartureKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
-    monkeypatch.setitem(shapes.DEPARTURES, "Ripple", ripple)
+    ripple = shapes.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
+    monkeypatch.setitem(shapes.SAG_TERMS, "Ripple", ripple)
 
 
 FACES = {
     "odd": lambda **others: odd([0.0, *BETA[1:]], **others),
     "dome": lambda **others: dataclasses.replace(odd([0.01, -2e-3], curvature=0.03, **others), kind="dome"),
-    "ripple": lambda **others: odd(None, departure=Ripple(vector(0.02, 0.01), scalar(6.0)), **others),
+    "ripple": lambda **others: odd(None, sag_terms=Ripple(vector(0.02, 0.01), scalar(6.0)), **others),
 }
 SYMMETRY = {"odd": "round", "dome": "round", "ripple": "none"}
 VARIABLES = {"odd": "a2:1 a3:1 a8:1", "dome": "a2:1 a4:1", "ripple": "depth1:1 depth2:1 width:1"}
@@ -311,7 +311,7 @@ class TestWhatHasToKnow:
         """Also one that a kind has for itself: each is a leaf of the shape."""
         system, memo = lens([surface(0.01, 3.0, 1.6), FACES[name](), surface(-0.02, 60.0)]), Memo()
         trace_bundle((system, field(0.0), system.wavelengths[:1], PUPIL), memo)
-        for place in places(system.surfaces[2]).values():
+        for place in parameter_paths(system.surfaces[2]).values():
             number = number_at(system.surfaces[2], place)
             moved = with_number(system.surfaces[2], place, number.clone().requires_grad_())
             changed = dataclasses.replace(system, surfaces=(*system.surfaces[:2], moved, *system.surfaces[3:]))
@@ -338,7 +338,7 @@ class TestWhatHasToKnow:
 
     def test_lens_rows_and_replace(self, name):
         face = FACES[name]()
-        row = {key: getattr(face, key) for key in ("curvature", "conic", "coefficients", "kind", "departure")}
+        row = {key: getattr(face, key) for key in ("curvature", "conic", "coefficients", "kind", "sag_terms")}
         made = lens_of_rows([row | {"thickness": 5.0, "glass": 1.5}], stop=1, f_number=8).surfaces[1]
         plain = lens_of_rows([dict(radius=50, thickness=5.0, glass=1.5)], stop=1, f_number=8)
         for found in (made, plain.replace(1, **row).surfaces[1]):
@@ -371,7 +371,7 @@ class TestWhatHasToKnow:
         system = system_of(name)
         rays = start(*bundle(300))
         found = trace_lens(system, rays, system.wavelengths[0])
-        with tracing("eager"):
+        with trace_engine("eager"):
             expected = trace_lens(system, rays, system.wavelengths[0])
         assert is_expressible(system.surfaces[1]) == (name == "odd")
         assert_close(found.position, expected.position, rtol=0, atol=1e-12)
@@ -479,8 +479,8 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
     position = torch.stack([vector(0.0, 4.0, 2.0, 2.1, 0.0), vector(0.0, 0.0, 1.5, 1.5, -3.1), torch.zeros(5).double()])
     axis = torch.zeros_like(position)
     axis[2] = 1
-    for engine in ("eager", "fused"):
-        with tracing(engine):
+    for engine in ("eager", "compiled"):
+        with trace_engine(engine):
             valid = trace_lens(system, start(position, axis), system.wavelengths[0]).valid
         assert valid.tolist() == [True, True, True, False, False]
     assert symmetry(scene_of(system)) == "mirror"

@@ -15,9 +15,10 @@ import raytrace as rt
 from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.kernels import psf, sharing
-from raytrace.kernels.result import mixture
 from raytrace.maths.grid import grid
+from raytrace.psf_models import compute as sharing
+from raytrace.psf_models import psf
+from raytrace.psf_models.result import mixture
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
@@ -27,7 +28,7 @@ ROOT = Path(rt.__file__).parents[1]
 ROUNDING = 1e-12
 FOCUS = 57.662  # mm, sensor of the double Gauss
 
-#: Conditions of `raytrace.kernels.psf`: every axis is cut, and every decision differs between the blocks of a scene.
+#: Conditions of `raytrace.psf_models.psf`: every axis is cut, and every decision differs between the blocks of a scene.
 CASES = {
     # A field on the axis is round, one in y-z a mirror image of itself, one beside it neither.
     "fields": {"model": "gaussian", "fields": [[0.0, 0.0, 5.0], [0.0, 9.0, 5.0]], "center": "chief", "order": 3},

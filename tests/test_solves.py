@@ -9,17 +9,17 @@ from test_corpus import CORPUS
 from test_merit_bounds import semi_diameters
 
 import raytrace as rt
+from raytrace.materials.glass import model_glass, refractive_index
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.media.glass import model_glass, refractive_index
-from raytrace.merit.model import Model
-from raytrace.merit.solves import SOLVES
-from raytrace.merit.vary import freedom
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import trace_lens
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import SOLVES
+from raytrace.optimization.variables import freedom
 from raytrace.system import configurations
-from raytrace.system.configurations import Place
-from raytrace.system.intent import Intent, Solve, Vary
+from raytrace.system.configurations import ScaledPath
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.surface import sag
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.trace import trace_lens
 
 VARY = Vary(1, "curvature"), Vary(3, "thickness"), Vary(5, "curvature")
 
@@ -38,7 +38,7 @@ RULES = {
 def moment_of(solves, x=None, *, duals=False, lens=None):
     model = Model(rt.read_lens("double_gauss") if lens is None else lens, VARY, solves)
     x = model.start * np.array([1.02, 0.97, 1.01]) if x is None else x
-    return model, x, model.views[0].moment(Dual(x, np.eye(len(x))) if duals else x)
+    return model, x, model.views[0].state(Dual(x, np.eye(len(x))) if duals else x)
 
 
 def marginal_slope(lens, last: int) -> tuple[float, float]:
@@ -89,7 +89,7 @@ def test_derivatives_go_through(kind):
     for k in range(len(x)):
         step = 1e-6 * abs(x[k])
         ahead, back = (
-            model.views[0].moment(x + sign * step * np.eye(len(x))[k]).numbers[solve.surface, solve.quantity]
+            model.views[0].state(x + sign * step * np.eye(len(x))[k]).numbers[solve.surface, solve.quantity]
             for sign in (1, -1)
         )
         assert slope[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-6, abs=1e-9)
@@ -111,7 +111,7 @@ def test_solves_that_wait_for_one_another_settle():
     for k in range(len(x)):
         step = 1e-6 * abs(x[k])
         for at, number in found.numbers.items():
-            ahead, back = (model.views[0].moment(x + s * step * np.eye(len(x))[k]).numbers[at] for s in (1, -1))
+            ahead, back = (model.views[0].state(x + s * step * np.eye(len(x))[k]).numbers[at] for s in (1, -1))
             assert number.slope[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-5, abs=1e-8)
 
 
@@ -131,10 +131,10 @@ def test_a_solve_in_the_object_space_of_a_finite_object():
 def differenced(model, x, at, configuration=1):
     """Derivatives of a number, exact and by differences."""
     view = model.views[configuration - 1]
-    exact = slope_of(view.moment(Dual(x, np.eye(len(x)))).numbers[at], len(x))
+    exact = slope_of(view.state(Dual(x, np.eye(len(x)))).numbers[at], len(x))
     steps = 1e-5 * np.abs(x)
     moved = [x + sign * h * one for h, one in zip(steps, np.eye(len(x)), strict=True) for sign in (1, -1)]
-    ends = np.array([value_of(view.moment(one).numbers[at]) for one in moved]).reshape(-1, 2)
+    ends = np.array([value_of(view.state(one).numbers[at]) for one in moved]).reshape(-1, 2)
     return exact, (ends[:, 0] - ends[:, 1]) / (2 * steps)
 
 
@@ -154,7 +154,7 @@ def test_a_real_ray_meets_the_image_at_the_height_of_its_solve(part):
 @pytest.mark.parametrize("height", [12.0, 0.0])
 def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(height):
     lens = rt.read_lens("double_gauss")
-    lens = dataclasses.replace(lens, intent=Intent(semi_diameter_margin=(5.0, 0.1)))
+    lens = dataclasses.replace(lens, optimization_data=OptimizationData(semi_diameter_margin=(5.0, 0.1)))
     model = Model(lens, (VARY[0], VARY[2]), (Solve(3, "thickness", "edge_thickness", (2.0, height)),))
     x = model.start * np.array([1.02, 1.01])
     here = model.lens_at(x)
@@ -168,7 +168,7 @@ def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(he
 def test_a_real_ray_that_is_lost_has_no_thickness():
     lens = rt.read_lens("double_gauss").at(f_number=0.5)
     model = Model(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.0, 1.0)),))
-    found = model.views[0].moment(Dual(model.start, np.eye(3))).numbers[11, "thickness"]
+    found = model.views[0].state(Dual(model.start, np.eye(3))).numbers[11, "thickness"]
     assert np.isnan(found.value)
 
 
@@ -184,10 +184,10 @@ def test_a_glass_that_is_picked_up_follows_every_number_of_it():
         told = refractive_index(here.surfaces[k].glass, here.wavelengths)
         assert torch.equal(told, refractive_index(here.surfaces[1].glass, here.wavelengths))
         assert float(told[1]) != float(refractive_index(lens.surfaces[k].glass, lens.wavelengths)[1])
-    moment = view.moment(Dual(x, np.eye(2)))
-    focal = moment.gaussian(1).effective_focal_length
+    state = view.state(Dual(x, np.eye(2)))
+    focal = state.gaussian(1).effective_focal_length
     for k, h in enumerate((1e-6, 1e-4)):
-        ends = [view.moment(x + s * h * np.eye(2)[k]).gaussian(1).effective_focal_length for s in (1, -1)]
+        ends = [view.state(x + s * h * np.eye(2)[k]).gaussian(1).effective_focal_length for s in (1, -1)]
         assert slope_of(focal, 2)[k] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-6)
     assert float(rt.first_order(here, wavelength=here.wavelengths[1]).effective_focal_length) == pytest.approx(
         value_of(focal), rel=1e-12
@@ -198,8 +198,10 @@ def zoom():
     """Two configurations, in which the thickness of surface 3, and -½ of it and 9 mm of surface 8, differ."""
     lens = configurations.made(rt.read_lens("double_gauss"), thickness={3: [4.0, 6.0]}, curvature={1: [0.02, 0.01]})
     gap, bend = lens.operands
-    gap = dataclasses.replace(gap, places=(*gap.places, Place(("surfaces", 8, "thickness"), -0.5, 9.0)))
-    return dataclasses.replace(lens, operands=(gap, bend), intent=Intent(unit=25.4)).configuration(1)
+    gap = dataclasses.replace(gap, paths=(*gap.paths, ScaledPath(("surfaces", 8, "thickness"), -0.5, 9.0)))
+    return dataclasses.replace(lens, operands=(gap, bend), optimization_data=OptimizationData(unit=25.4)).configuration(
+        1
+    )
 
 
 def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations():
@@ -207,7 +209,7 @@ def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations(
     follows = Solve(3, "thickness", "pickup", (0.0,), 1, 2.0, 0.1, configuration=2, operand=0)
     model = Model(lens, (Vary(3, "thickness", 1, 0), Vary(1, "curvature", 2, 1)), (follows,))
     x = np.array([5.0, 0.012])
-    first, second = (view.moment(Dual(x, np.eye(2))).numbers for view in model.views)
+    first, second = (view.state(Dual(x, np.eye(2))).numbers for view in model.views)
     assert (value_of(first[3, "thickness"]), value_of(first[8, "thickness"])) == (5.0, 6.5)
     assert value_of(second[3, "thickness"]) == pytest.approx(12.54)  # 2 · 5 + 0.1 inches
     assert value_of(second[8, "thickness"]) == pytest.approx(9 - 6.27)
@@ -228,7 +230,7 @@ def test_what_an_operand_moves_is_named_once():
     found = freedom(lens, "thickness:3,8")
     assert found.variables == (Vary(3, "thickness", 1, 0), Vary(3, "thickness", 2, 0))
     follows = Solve(3, "thickness", "pickup", (0.0,), 1, configuration=2, operand=0)
-    lens = dataclasses.replace(lens, intent=Intent(solves=(follows,)))
+    lens = dataclasses.replace(lens, optimization_data=OptimizationData(solves=(follows,)))
     assert [one for one in freedom(lens, "thickness").variables if one.surface == 3] == [Vary(3, "thickness", 1, 0)]
     assert freedom(lens, "thickness:3").solves == ()
 
@@ -245,6 +247,6 @@ def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
     if not (CORPUS / "zmx" / path).exists():
         pytest.skip("the files stand beside the repository")
     lens = rt.read_lens(CORPUS / "zmx" / path)
-    (solve,) = (one for one in lens.intent.solves if one.kind == kind)
-    found = Model(lens, (), (solve,)).views[0].moment(np.zeros(0)).numbers[solve.surface, "thickness"]
+    (solve,) = (one for one in lens.optimization_data.solves if one.kind == kind)
+    found = Model(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]
     assert value_of(found) == pytest.approx(float(lens.surfaces[solve.surface].thickness), rel=near)

@@ -11,12 +11,10 @@ from test_hardcases import of_kind
 
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.maths import pupil
-from raytrace.optics.arrivals import chief_reference
-from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import EmptySpot, spot_of, spot_of_points
 from raytrace.system.rays import Rays
+from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
 ROUNDING = 2.0**-53
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.camera.training import DamagedRun, Run
 from raytrace.files import append_text
-from raytrace.media.catalog import find_glass
+from raytrace.imaging.codesign import Outcome
+from raytrace.imaging.training import DamagedRun, Run
+from raytrace.materials.catalogs import find_glass
 from raytrace.optimization.journal import BadSearch, Ended, Journal
 from raytrace.stores import (
     DamagedLine,
@@ -30,10 +31,9 @@ from raytrace.stores import (
     text,
     whole,
 )
-from raytrace.studies.codesign.experiment import Outcome
-from raytrace.wave.element import Element, Rings
-from raytrace.wave.element_file import read_label, write_element
-from raytrace.wave.exchange import HeightMapError
+from raytrace.wave_optics.element import Element, Rings
+from raytrace.wave_optics.element_files import read_label, write_element
+from raytrace.wave_optics.height_maps import HeightMapError
 
 #: What JSON can hold that no store expects, as it is written.
 STRANGE = {

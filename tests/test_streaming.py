@@ -12,21 +12,31 @@ import torch
 from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 import raytrace as rt
-from raytrace.kernels import psf
-from raytrace.kernels import rays as plain
-from raytrace.kernels.streaming import stream_kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.optics import streaming
-from raytrace.optics.launch import launch
-from raytrace.optics.scene import scene
-from raytrace.optics.spot import EmptySpot, spot_of
-from raytrace.optics.stream_gradient import mean_square_gradient, stream_gradient
-from raytrace.optics.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
-from raytrace.optics.trace import trace_lens
+from raytrace.psf_models import psf
+from raytrace.psf_models import rays as plain
+from raytrace.psf_models.compute import stream_kernels
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing import streaming
+from raytrace.tracing.launch import launch
+from raytrace.tracing.scene import scene
+from raytrace.tracing.spot import EmptySpot, spot_of
+from raytrace.tracing.streaming import (
+    Moments,
+    chunk_size,
+    mean_square_gradient,
+    merge,
+    moments,
+    pupil_chunks,
+    shot,
+    stream_gradient,
+    stream_spot,
+    stream_spots,
+)
+from raytrace.tracing.trace import trace_lens
 
 LIKE = torch.zeros((), dtype=torch.float64)
 SMALL = 512 * 768  # bytes: chunks of 512 rays
@@ -383,10 +393,10 @@ MEMORY = """
 import ctypes, resource, sys, torch
 sys.path.insert(0, "tests")
 from problems import double_gauss, aspheric_singlet, vector
-from raytrace.optics import streaming
+from raytrace.tracing import streaming
 from raytrace.maths.grid import grid
-from raytrace.kernels import psf
-from raytrace.optics.stream_gradient import mean_square_gradient
+from raytrace.psf_models import psf
+from raytrace.tracing.streaming import mean_square_gradient
 import dataclasses
 
 def peak():

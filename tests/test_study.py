@@ -7,24 +7,27 @@ import math
 
 import pytest
 import torch
+from scripts import script
 
 from raytrace.cli import build_parser
+from raytrace.cli.codesign import ROWS
+from raytrace.cli.codesign_compare import CAPTIONS, Report
+from raytrace.cli.codesign_runs import settings_of
+from raytrace.cli.settings import words as words_of
 from raytrace.files import shipped, write_table
-from raytrace.formats import read_lens
-from raytrace.optics.focus import best_focus
-from raytrace.optics.paraxial import first_order
-from raytrace.pages import kept_of, markdown
-from raytrace.studies.codesign import optima
-from raytrace.studies.codesign.claims import CLAIMS, Seen, claims, is_of_paper
-from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum, scan
-from raytrace.studies.codesign.conjugates import paraxial_image
-from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start, write_outcome
-from raytrace.studies.codesign.figures import _marks
-from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms
-from raytrace.studies.codesign.page import CAPTIONS, Report
-from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
-from raytrace.studies.codesign.setup import settings_of
-from raytrace.studies.codesign.study import (
+from raytrace.imaging import codesign as optima
+from raytrace.imaging.closed_form import even_distances, optimise_closed_form, paraxial_image, power_spectrum, scan
+from raytrace.imaging.codesign import (
+    Optimum,
+    Outcome,
+    batch,
+    camera,
+    closed_form,
+    closed_forms,
+    lens_at_start,
+    write_outcome,
+)
+from raytrace.imaging.codesign_study import (
     COLUMNS,
     StepTime,
     blur_diameters,
@@ -37,10 +40,18 @@ from raytrace.studies.codesign.study import (
     step_times,
     summaries,
 )
-from raytrace.studies.pictures import dead_leaves
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.io import read_lens
+from raytrace.pages import kept_of, markdown
+from raytrace.plotting.codesign import _marks
+from raytrace.settings import AFTER_PARAXIAL, CodesignSettings
 from raytrace.system.lens import with_object_distance, with_sensor_distance
+from raytrace.tracing.focus import best_focus
+from raytrace.tracing.paraxial import first_order
 
-SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
+study = script("codesign")
+CLAIMS, Seen, claims, is_of_paper = study.CLAIMS, study.Seen, study.claims, study.is_of_paper
+SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3
 
 SIMULATED = ("paraxial", "fourier", "gaussian", "drt")
@@ -312,7 +323,7 @@ def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
     own.use("drt")
     at_optimum = scan(own, spectrum, [found.sensor_mm], distances)[0]
     assert at_optimum == pytest.approx(found.error_drt, rel=0.02)  # the plan's tolerance
-    write_table(tmp_path / "spectral.csv", [found], optima.COLUMNS)
+    write_table(tmp_path / "spectral.csv", [found], optima.OPTIMUM_COLUMNS)
     with open(tmp_path / "spectral.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["model"], float(row["error_drt"])) == (model, found.error_drt)
@@ -388,10 +399,11 @@ def test_the_page_names_settings_that_are_not_usual():
         times=tuple(TIMES),
         figures=("loss.png",),
         machine={"cores": 2},
+        publication=study.publication(read_lens(shipped("lenses") / "double_gauss.zmx")),
     )
     page = markdown(report.parts(), "By hand.")
     command = page.splitlines()[2].strip()
-    assert command.startswith("raytrace codesign compare double_gauss --data DIR -o FOLDER --docs docs ")
+    assert command.startswith("python docs/experiments/codesign.py double_gauss --data DIR -o FOLDER --docs docs ")
     for option in ("--f-number 4.0", "--field 0 10", "--vary sensor thickness:5", "--seeds 0 1 2", "--patch 16"):
         assert option in command
     assert "--noise" not in command
@@ -399,12 +411,13 @@ def test_the_page_names_settings_that_are_not_usual():
     assert "**Unfinished: 6 of 7 runs.** Missing, by model and seed: drt 2." in page
     assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
     assert kept_of(page) == "By hand."
-    assert "codesign_sweep.md" not in page
     assert "## The paper's claims" in page
-    other = markdown(dataclasses.replace(report, of_paper=False).parts())
+    assert "[codesign_sweep.md](codesign_sweep.md)" in page
+    other = markdown(dataclasses.replace(report, publication=None).parts())
     assert "paper" not in other
-    assert "[codesign_sweep.md](codesign_sweep.md)" in markdown(dataclasses.replace(report, sweep=True).parts())
-    second = markdown(dataclasses.replace(report, folder="second").parts())
+    assert "codesign_sweep.md" not in other
+    assert other.splitlines()[2].startswith("    raytrace codesign compare double_gauss --data DIR")
+    second = markdown(dataclasses.replace(report, folder="second", publication=None).parts())
     assert "--page second" in second.splitlines()[2]
     assert "](second/loss.png)" in second
     assert "codesign/" not in second
@@ -431,7 +444,7 @@ def test_the_options_of_a_page_are_read_back_as_its_settings():
         normalise="energy",
         edge=0.3,
     )
-    words = " ".join(settings.words()).split()
+    words = " ".join(words_of(settings, ROWS)).split()
     assert settings_of(build_parser().parse_args(["codesign", "double_gauss", *words])) == settings
 
 

@@ -7,8 +7,9 @@ import torch
 from problems import FEMTOMETRE, surface, turned, vector
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.system.aperture import Aperture, inside
-from raytrace.system.surface import intersect, normal, sag
+from raytrace.system.apertures import Aperture, inside
+from raytrace.system.intersection import intersect, normal
+from raytrace.system.surface import sag
 
 KINDS = {
     "plane": surface(),

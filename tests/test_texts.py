@@ -9,8 +9,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, spelling, write_lens
-from raytrace.formats.frame import lens_from_frame, to_frame
+from raytrace.io import LensFileError, LensFileWarning, read_lens, source, write_lens
+from raytrace.io.frames import lens_from_frame, to_frame
 
 LENSES = Path(__file__).parents[1] / "lenses"
 TABLES = (".csv", ".tsv", ".txt")
@@ -67,7 +67,7 @@ def test_a_zmx_file_brings_a_text_back_or_refuses_it_or_says_so(tmp_path_factory
 
 
 def test_a_warning_names_the_text_that_a_zmx_file_loses(tmp_path):
-    with pytest.warns(LensFileWarning, match=r"the comment of surface 3 \(' x '\): not brought back as it is"):
+    with pytest.warns(LensFileWarning, match=r"the comment of surface 3 \(' x '\): not preserved"):
         write_lens(with_texts("a", "b", " x "), tmp_path / "lens.zmx")
 
 
@@ -81,12 +81,12 @@ def test_any_text_comes_back_from_pandas(name, note, comment):
 @settings(max_examples=500)
 @given(st.lists(NASTY.filter(bool), min_size=1))
 def test_words_come_back(listed):
-    assert spelling.words(" ".join(map(spelling.word, listed))) == listed
+    assert source.words(" ".join(map(source.word, listed))) == listed
 
 
 def test_plain_texts_stay_plain():
     for text in ("Größe 2: λ", "a, b", "# 1", "it's", 'the "front" lens', "表面\u30001", "a  b"):
-        assert spelling.quoted(text) == text
+        assert source.quoted(text) == text
 
 
 @pytest.mark.parametrize(

@@ -20,14 +20,15 @@ from problems import (
 )
 from torch.autograd import gradcheck, gradgradcheck
 
+from raytrace.materials.glass import MIRROR, sellmeier
 from raytrace.maths import pupil
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR, sellmeier
-from raytrace.optics.launch import launch, rays_from_infinity, rays_from_point
-from raytrace.optics.trace import axial_path, media, reflect, refract, steps, trace_lens, trace_surfaces
+from raytrace.system.intersection import normal
 from raytrace.system.rays import Rays, start
-from raytrace.system.surface import normal
+from raytrace.tracing.launch import launch, rays_from_infinity, rays_from_point
+from raytrace.tracing.refraction import reflect, refract
+from raytrace.tracing.trace import axial_path, media, steps, trace_lens, trace_surfaces
 
 ROUNDING = 2.0**-53
 

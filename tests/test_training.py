@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import raytrace
-from raytrace.camera.training import NotFinite, OtherSettings, Run, Share, train
+from raytrace.imaging.training import NotFinite, OtherSettings, Run, Share, train
 
 #: Where processes started by a test find it and the package.
 PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]
@@ -70,7 +70,7 @@ def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):
     script = textwrap.dedent(f"""
         import sys, time
         sys.path[:0] = {PATHS!r}
-        import raytrace.camera.training as training
+        import raytrace.imaging.training as training
         from test_training import fit
         append = training.Run.append
         def slowly(self, rows):

@@ -10,9 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.fused import library, trust
-from raytrace.fused.library import NoCompiler, compiler
-from raytrace.fused.trust import Untrusted, check_file, objection, open_folder, private_folder
+from raytrace.tracing.compiled import library
+from raytrace.tracing.compiled.library import (
+    NoCompiler,
+    Untrusted,
+    check_file,
+    compiler,
+    objection,
+    open_folder,
+    private_folder,
+)
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="owners and modes are POSIX's")
 
@@ -80,7 +87,7 @@ def test_what_belongs_to_others_is_refused(tmp_path, monkeypatch):
     (tmp_path / "file").chmod(0o600)
     folder = open_folder(tmp_path)
     check_file("file", folder)
-    monkeypatch.setattr(trust.os, "geteuid", lambda: NOBODY)
+    monkeypatch.setattr(library.os, "geteuid", lambda: NOBODY)
     with pytest.raises(Untrusted, match=f"file belongs to user {os.getuid()}, not to {NOBODY}"):
         check_file("file", folder)
     os.close(folder)
@@ -120,7 +127,7 @@ def test_a_temporary_folder_that_others_could_exchange_is_refused(tmp_path, monk
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not folder.exists()
     tmp_path.chmod(0o777)
-    monkeypatch.setattr(trust.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(library.tempfile, "tempdir", str(tmp_path))
     with pytest.raises(Untrusted, match="can be written by everybody"), private_folder():
         pass
     assert not list(tmp_path.iterdir())
@@ -135,7 +142,7 @@ __attribute__((constructor)) static void run(void) { fclose(fopen("%s", "w")); }
 
 PROBE = """
 import os, sys, torch
-from raytrace.fused import choice, library
+from raytrace.tracing.compiled import library
 from raytrace.system.rays import Rays
 one = torch.ones(3, 1, dtype=torch.float64)
 for word in sys.argv[1:]:
@@ -143,7 +150,7 @@ for word in sys.argv[1:]:
     os.environ[name] = value
     library.cache_folder.cache_clear()
     library.is_built.cache_clear()
-    print(choice.is_fused(Rays(one, one, one[0] > 0), one, 1), flush=True)
+    print(library.uses_compiled(Rays(one, one, one[0] > 0), one, 1), flush=True)
     del os.environ[name]
 """
 

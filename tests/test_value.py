@@ -9,11 +9,11 @@ from problems import aspheric_singlet, double_gauss, surface
 from torch.utils import _pytree as pytree
 
 import raytrace as rt
+from raytrace.materials.glass import AIR
 from raytrace.maths.value import to
-from raytrace.media.glass import AIR
-from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
+from raytrace.tracing.trace import trace_lens
 
 
 def test_values_are_frozen_and_have_no_dict():

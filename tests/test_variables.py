@@ -10,18 +10,28 @@ import torch
 from problems import scalar
 from torch.utils import _pytree as pytree
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.variables import BadVariables, OtherLens, Variables, parse_bounds
-from raytrace.formats import read_lens
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
-from raytrace.system.departure import ZernikeSag
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.variables import (
+    BadLimits,
+    BadVariables,
+    Limits,
+    OtherLens,
+    PhaseVariables,
+    Variables,
+    edge_thickness,
+    limits_of,
+    parse_bounds,
+    parse_range,
+    violation,
+)
+from raytrace.io import read_lens
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.system.lens import with_sensor_distance
-from raytrace.system.places import places
+from raytrace.system.parameter_paths import parameter_paths
+from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag
-from raytrace.wave.element import Element, Rings
+from raytrace.wave_optics.element import Element, Rings
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6
@@ -361,11 +371,12 @@ def test_elements_either_side_of_a_stop_may_not_touch():
 
 
 def test_every_number_of_a_shape_can_be_varied_by_its_name():
-    """Coefficients by their power of r, a departure's by its fields; one unit is 1 mm of sag at the edge."""
+    """Coefficients by their power of r, those of sag terms by its fields; one unit is 1 mm of sag at the edge."""
     lens = read_lens("double_gauss").replace(3, coefficients=[1e-4, 2e-7, 0.0])
     bumps = ZernikeSag(torch.tensor([0.0, 1e-3, 0.0], dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
-    lens = lens.replace(5, departure=bumps)
-    assert list(places(lens.surfaces[5])) == ["curvature", "conic", *(f"coefficients{j}" for j in (1, 2, 3)), "radius"]
+    lens = lens.replace(5, sag_terms=bumps)
+    names = ["curvature", "conic", *(f"coefficients{j}" for j in (1, 2, 3)), "radius"]
+    assert list(parameter_paths(lens.surfaces[5])) == names
     variables = Variables(lens, "a4:3 coefficients2:5 radius:5")
     assert variables.numbers() == {"a4_3": 2e-7, "coefficients2_5": 1e-3, "radius_5": 20.0}
     edge = lens.surfaces[3].semi_diameter
@@ -375,9 +386,9 @@ def test_every_number_of_a_shape_can_be_varied_by_its_name():
     changed = variables()
     moved = sag(changed.surfaces[3], scalar(edge**2)) - sag(lens.surfaces[3], scalar(edge**2))
     assert float(moved) == pytest.approx(1e-3, rel=1e-9)
-    assert changed.surfaces[5].departure.coefficients[1] > 1e-3
+    assert changed.surfaces[5].sag_terms.coefficients[1] > 1e-3
     assert torch.equal(changed.surfaces[3].coefficients[[0, 2]], lens.surfaces[3].coefficients[[0, 2]])
-    total = changed.surfaces[3].coefficients.sum() + changed.surfaces[5].departure.radius
+    total = changed.surfaces[3].coefficients.sum() + changed.surfaces[5].sag_terms.radius
     total.backward()
     assert float(variables.a4_3.grad) == variables.variables[0].unit
     assert float(variables.radius_5.grad) == variables.variables[2].unit

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.media.glass import abbe_number, nd
-from raytrace.merit.model import Model
-from raytrace.merit.vary import VariedGlass, bounds_of, freedom, name_of
-from raytrace.system.intent import Intent, Solve, Vary
-from raytrace.system.naming import BadVariables
+from raytrace.materials.glass import abbe_number, nd
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.variables import VariedGlass, bounds_of, freedom, name_of
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import BadVariables
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_what_the_file_says_holds_where_no_word_says_otherwise(lens):
     import dataclasses
 
     solve = Solve(11, "thickness", "marginal_height", (0.0, 0.0))
-    lens = dataclasses.replace(lens, intent=Intent((Vary(1, "curvature"),), (solve,)))
+    lens = dataclasses.replace(lens, optimization_data=OptimizationData((Vary(1, "curvature"),), (solve,)))
     own = freedom(lens)
     assert (names(lens, None), own.solves) == (["curvature_1"], (solve,))
     assert freedom(lens, "curvature").solves == (solve,)

@@ -8,12 +8,11 @@ import torch
 from problems import double_gauss, fields, vector
 
 from raytrace.files import shipped
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.maths import pupil
-from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
-from raytrace.optics.vignetting import vignette
+from raytrace.tracing.launch import launch, vignette
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import trace_lens
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

@@ -8,10 +8,10 @@ from problems import number
 from scipy.special import j0, j1
 from torch.autograd import gradcheck
 
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import constant, index
-from raytrace.wave.designs import BASELINES, FOCI, achromat, aim, baseline, converging, encircled_energy
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, as_rings, features, height, path
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import constant, index
+from raytrace.wave_optics.designs import BASELINES, FOCI, achromat, aim, baseline, converging, encircled_energy
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, as_rings, features, height, path
 
 COLOURS = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
 PMMA, SILICA = find_glass("PMMA"), find_glass("F_SILICA")

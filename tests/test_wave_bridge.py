@@ -8,21 +8,21 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 from torch.autograd import gradcheck
 
-from raytrace.kernels import diffraction, psf
+from raytrace.materials.glass import constant
 from raytrace.maths.grid import centres, grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.media.glass import constant
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import cross_scene, scene
-from raytrace.optics.trace import media, trace_surfaces
-from raytrace.optics.wavefront import wavefront_of
-from raytrace.system import departure
+from raytrace.psf_models import psf, wave
+from raytrace.system import sag_terms as sag_terms
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import sag_at
-from raytrace.wave import bridge
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
-from raytrace.wave.psf import psf as wave_psf
-from raytrace.wave.scene import WaveScene, excess, residual
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import cross_scene, scene
+from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.wavefront import wavefront_of
+from raytrace.wave_optics import hybrid as bridge
+from raytrace.wave_optics.compute import psf as wave_psf
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
+from raytrace.wave_optics.scene import WaveScene, excess, residual
 
 PMMA, WAVE = 1.493, 0.55e-3  # index and wavelength in mm
 INDEX = 1.5
@@ -212,8 +212,8 @@ def test_a_height_map_of_pixels_is_traced_as_the_powers_it_samples():
 def test_a_height_map_is_filtered_once_however_often_it_is_traced(monkeypatch):
     """Gradients to the heights are those of differences of 10 nm."""
     filtered = []
-    real = departure._spline_coefficients
-    monkeypatch.setattr(departure, "_spline_coefficients", lambda heights: filtered.append(0) or real(heights))
+    real = sag_terms._spline_coefficients
+    monkeypatch.setattr(sag_terms, "_spline_coefficients", lambda heights: filtered.append(0) or real(heights))
     line = 0.25 * (torch.arange(22, dtype=torch.float64) - 10.5)
     heights = 0.5 + sag_of_powers(singlet(), line**2 + line[:, None] ** 2)
     pupil, _ = gauss_rings(4)
@@ -272,7 +272,7 @@ def test_without_height_the_kernel_is_that_of_the_wave_model(elements, y):
     """Bit for bit where the element keeps the symmetry of the lens; on the axis else to the digits of torch's J₀."""
     view = view_of(slow_gauss(), y)
     pixels = window(view)
-    expected = diffraction.kernels(view, pixels, order=1).kernel
+    expected = wave.kernels(view, pixels, order=1).kernel
     found = bridge.kernels(view, elements, pixels, order=1)
     assert (found.kernel - expected).abs().max() <= (2e-7 if y == 0 else 1e-14) * expected.max()
     if all(isinstance(element.profile, EvenPowers | Rings) for element in elements):
@@ -320,7 +320,7 @@ def test_tilt_shifts_the_kernel_as_the_chief_ray(y, waves):
     ]
     assert landed[1][1] > landed[0][1]
     here, there = (grid(scalar(0.002), 21, centre) for centre in landed)
-    straight = diffraction.kernels(view, here, order=1).kernel
+    straight = wave.kernels(view, here, order=1).kernel
     shifted = bridge.kernels(view, (tilt,), there, order=1).kernel
     assert (shifted - straight).abs().sum() / straight.sum() < 0.003 * waves
     x, y_ = centres(here)

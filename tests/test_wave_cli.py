@@ -16,16 +16,16 @@ from problems import number
 
 import raytrace as rt
 from raytrace.cli import wave, wave_options, wave_psf
+from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
-from raytrace.media.glass import index
-from raytrace.plot.wave import height_figure
-from raytrace.wave.designs import BASELINES, aim, baseline
-from raytrace.wave.element import as_rings
-from raytrace.wave.element_file import read_element, read_label, write_element
-from raytrace.wave.exchange import write_heights
-from raytrace.wave.plan import ENGINES, plan
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import WaveScene
+from raytrace.plotting.wave import height_figure
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.designs import BASELINES, aim, baseline
+from raytrace.wave_optics.element import as_rings
+from raytrace.wave_optics.element_files import read_element, read_label, write_element
+from raytrace.wave_optics.height_maps import write_heights
+from raytrace.wave_optics.plan import ENGINES, plan
+from raytrace.wave_optics.scene import WaveScene
 
 FORM = ["--focus", "1000", "--depth", "500", "1000", "inf", "--wavelength", "0.46", "0.55", "0.64"]
 FORM += ["--pixel", "0.00369", "--size", "128"]

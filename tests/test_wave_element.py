@@ -7,11 +7,11 @@ import torch
 from problems import number
 from torch.autograd import gradcheck
 
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import constant, index
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll, polynomials
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import constant, index
-from raytrace.wave.element import (
+from raytrace.wave_optics.element import (
     Element,
     EvenPowers,
     Pixels,

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from problems import number
 
-from raytrace.media.catalog import find_glass
-from raytrace.wave.element import (
+from raytrace.materials.catalogs import find_glass
+from raytrace.wave_optics.element import (
     Element,
     EvenPowers,
     Pixels,
@@ -23,7 +23,7 @@ from raytrace.wave.element import (
     period,
     wrapped,
 )
-from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
+from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 EXACT = (".npy", ".csv")
 PICTURES = (".png", ".tif", ".tiff")

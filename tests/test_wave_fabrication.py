@@ -9,8 +9,8 @@ import torch
 from problems import generator, number
 
 import raytrace as rt
-from raytrace.media.catalog import find_glass
-from raytrace.wave.element import (
+from raytrace.materials.catalogs import find_glass
+from raytrace.wave_optics.element import (
     Element,
     EvenPowers,
     Pixels,

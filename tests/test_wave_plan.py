@@ -9,12 +9,11 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
-from raytrace.kernels.dft import Aliased, integrate
-from raytrace.wave import pupil
-from raytrace.wave.element import Element, EvenPowers, Pixels, Zernike
-from raytrace.wave.plan import ENGINES, AliasedSampling, plan
-from raytrace.wave.psf import psf
-from raytrace.wave.spread import blur
+from raytrace.psf_models.dft import Aliased, integrate
+from raytrace.wave_optics import pupil
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Zernike
+from raytrace.wave_optics.plan import ENGINES, AliasedSampling, blur, plan
 
 TILTED = Element(Zernike(vector(0, 0, 0, 0, 0, 0, 1e-4)), scalar(R), PLASTIC)
 

@@ -10,14 +10,13 @@ import torch
 from problems import scalar
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
-from raytrace.kernels.dft import integrate, phasor, sub_pixels
-from raytrace.wave import mixed, radial
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import aperture, millimetres, residual
-from raytrace.wave.spread import spread
+from raytrace.psf_models.dft import integrate, phasor, sub_pixels
+from raytrace.wave_optics import mixed, propagation
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
+from raytrace.wave_optics.plan import plan, spread
+from raytrace.wave_optics.scene import aperture, millimetres, residual
 
 GREEN, BLUE = (0.55,), (0.46,)
 #: Padding and band limit that bring light back round.
@@ -104,13 +103,13 @@ def limit(name: str) -> torch.Tensor:
 
 def polar_sum(s, nodes: int = 6, arms: int = 512) -> torch.Tensor:
     """The diffraction integral over Gauss radii between all steps and even angles: exact at rings, any angle."""
-    r, weight = radial.rule(radial.edges(s), nodes)
+    r, weight = propagation.rule(propagation.edges(s), nodes)
     angle = (torch.arange(arms, dtype=r.dtype) + 0.5) * (2 * math.pi / arms)
     x, y = ((r[:, None] * turn(angle)).flatten() for turn in (torch.cos, torch.sin))
     u, v, share = sub_pixels(s.grid, 4)
     wavelength = millimetres(s)[0]
     area = (weight[:, None] * (2 * math.pi / arms)).expand(-1, arms).flatten()
-    t, light = (one[:, None].expand(-1, arms) for one in radial.slope(s, r))
+    t, light = (one[:, None].expand(-1, arms) for one in propagation.slope(s, r))
     field = phasor(residual(s, x, y)[0, 0] / wavelength) * area * light.flatten()
     tx, ty = ((t * turn(angle)).flatten() for turn in (torch.cos, torch.sin))
     along_x, along_y = (phasor(-place[:, None] * at / wavelength) for place, at in ((u, tx), (v, ty)))

@@ -9,14 +9,14 @@ import rayleigh
 import torch
 from problems import scalar, vector
 
-from raytrace.kernels.dft import bessel_j1, integrate
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import constant, index
 from raytrace.maths.grid import grid
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import constant, index
-from raytrace.wave import propagate, pupil, radial
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import WaveScene, excess
+from raytrace.psf_models.dft import bessel_j1, integrate
+from raytrace.wave_optics import propagation, pupil
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.wave_optics.scene import WaveScene, excess
 
 R, Z = 2.5, 35.5  # mm
 WAVELENGTHS = (0.46, 0.55, 0.64)
@@ -115,7 +115,7 @@ def test_transfer_functions_keep_energy():
     generator = torch.Generator().manual_seed(0)
     field = torch.complex(*torch.randn(2, 64, 64, generator=generator, dtype=torch.float64))
     for spectrum in (False, True):
-        sent = propagate.propagate(
+        sent = propagation.propagate(
             field, scalar(2e-3), scalar(20.0), scalar(0.55e-3), size=96, band_limit=False, spectrum=spectrum
         )
         assert abs((sent.abs() ** 2).sum() / (field.abs() ** 2).sum() - 1) < 1e-12
@@ -147,7 +147,7 @@ def test_kinoform_focuses_as_the_wavelength():
         s = dataclasses.replace(
             scene(element, depths=(math.inf,), wavelengths=(wavelength,)), sensor_distance=scalar(distance)
         )
-        found = radial.field(s, vector(0.0), 4).abs().square()[0, 0, 0]
+        found = propagation.radial_field(s, vector(0.0), 4).abs().square()[0, 0, 0]
         full = math.pi * R**2 / (1e-3 * wavelength * distance) ** 2
         assert abs(found / full - torch.sinc(scalar(0.55 / wavelength - 1)) ** 2) < 2e-3
 
@@ -210,7 +210,7 @@ def test_efficiency_of_a_stepped_kinoform(levels):
     """sinc²(1/L) of the light reaches the focus of 160 whole zones (Goodman and Silvestri 1970)."""
     radius = math.sqrt(2 * 160 * 0.55e-3 / (1 / 1000 + 1 / Z))
     element = dataclasses.replace(lens(radius=radius), period=scalar(0.55e-3), levels=levels)
-    found = radial.field(scene(element), vector(0.0), 8).abs().square()[0, 0, 0]
+    found = propagation.radial_field(scene(element), vector(0.0), 8).abs().square()[0, 0, 0]
     assert abs(found / (math.pi * radius**2 / (0.55e-3 * Z) ** 2) - torch.sinc(scalar(1 / levels)) ** 2) < 1e-9
 
 
@@ -258,7 +258,7 @@ def test_interpolation_of_the_transfer_functions_field():
     place = (torch.arange(200, dtype=torch.float64) - 99.5) * 0.002
     wave = torch.polar(torch.ones_like(place), 2 * math.pi * 150.0 * place)
     u = torch.linspace(-0.05, 0.05, 37, dtype=torch.float64)
-    found = propagate.at_nodes(wave * wave[:, None], scalar(0.002), u, u)
+    found = propagation.at_nodes(wave * wave[:, None], scalar(0.002), u, u)
     expected = torch.polar(torch.ones_like(u), 2 * math.pi * 150.0 * u)
     assert (found - expected * expected[:, None]).abs().max() < 1e-6
 

@@ -8,14 +8,14 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
-from raytrace.kernels.dft import phasor
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import InvalidIndex, OutOfRange, sellmeier
 from raytrace.maths.value import to
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import InvalidIndex, OutOfRange, sellmeier
-from raytrace.optics.reuse import Memo
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
+from raytrace.psf_models.dft import phasor
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.wave_optics.plan import plan
 
 
 def random(*shape, scale=2e-4):

@@ -8,12 +8,12 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
-from raytrace.kernels.dft import bessel_j0, bessel_j1
-from raytrace.optics.reuse import Memo
-from raytrace.wave import radial
-from raytrace.wave.element import Element, EvenPowers, Rings
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
+from raytrace.psf_models.dft import bessel_j0, bessel_j1
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import propagation
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.element import Element, EvenPowers, Rings
+from raytrace.wave_optics.plan import plan
 
 
 def rings(count=40, pitch=None, radius=R):
@@ -45,7 +45,7 @@ def test_rings_against_their_closed_form():
     disc = edge[:, None] * bessel_j1(edge[:, None] * q) / q
     signs = 1 - 2 * (torch.arange(count) % 2).double()
     expected = (signs[:, None] * disc.diff(dim=0)).sum(0) * 2 * math.sqrt(math.pi) / (R * 0.55e-3 * Z)
-    found = radial.field(s, rho, 40)[0, 0]
+    found = propagation.radial_field(s, rho, 40)[0, 0]
     # The Bessel functions of torch err by up to 5e-7 about x = 5.
     assert (found.real - expected).abs().max() < 3e-6 * expected.abs().max()
     assert found.imag.abs().max() < 1e-9 * expected.abs().max()
@@ -55,14 +55,14 @@ def test_rings_of_unlike_pitches_and_the_edge_that_cuts_one():
     """Edges of all rings, sorted, none twice and none beyond the aperture."""
     s = scene(rings(5, 0.5), rings(10, 0.25), rings(3, 0.9))
     expected = [0, 0.25, 0.5, 0.75, 0.9, 1, 1.25, 1.5, 1.75, 1.8, 2, 2.25, 2.5]
-    assert torch.allclose(radial.edges(s), vector(*expected))
+    assert torch.allclose(propagation.edges(s), vector(*expected))
 
 
 def test_zones_lie_where_the_height_has_wrapped():
     """√(2 m λ/P), to a nanometre."""
     power = 1 / 1000 + 1 / Z
     s = scene(dataclasses.replace(lens(), period=scalar(0.55e-3)))
-    found = radial.edges(s)[1:-1]
+    found = propagation.edges(s)[1:-1]
     m = torch.arange(1, len(found) + 1, dtype=torch.float64)
     assert len(found) == int(R**2 * power / 2 / 0.55e-3)
     assert (found - torch.sqrt(2 * m * 0.55e-3 / power)).abs().max() < 1e-6

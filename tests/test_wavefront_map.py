@@ -9,11 +9,11 @@ from problems import vector
 
 from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.scene import scene, trace_scene
-from raytrace.optics.spot import EmptySpot
-from raytrace.optics.wavefront import mean_opd, peak_to_valley, rms, wavefront_of, without, zernike_coefficients
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import scene, trace_scene
+from raytrace.tracing.spot import EmptySpot
+from raytrace.tracing.wavefront import mean_opd, peak_to_valley, rms, wavefront_of, without, zernike_coefficients
 
 WAVE = 0.53e-3  # mm
 POINTS, WEIGHTS = gauss_rings(8, 32)

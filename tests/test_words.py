@@ -1,5 +1,6 @@
 """Words for readers: commands that the documentation quotes, columns and labels in the field's terms."""
 
+import argparse
 import contextlib
 import io
 import re
@@ -7,6 +8,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from scripts import script
 
 from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
@@ -25,6 +27,26 @@ def commands(page: str) -> list[str]:
 PAGES = sorted(path for path in (*ROOT.glob("docs/*.md"), ROOT / "README.md") if commands(path.read_text("utf-8")))
 
 
+#: Pages whose code has been removed.
+FROZEN = sorted(path for path in ROOT.glob("docs/*.md") if path.read_text("utf-8").startswith("Frozen: "))
+
+
+def test_frozen_pages_name_their_commit():
+    assert len(FROZEN) > 10
+    for page in FROZEN:
+        assert re.match(
+            r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", page.read_text("utf-8")
+        ), page
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/*.md")), ids=lambda path: path.name)
+def test_quoted_scripts_understand_their_options(page):
+    for name, words in re.findall(r"python docs/experiments/(\w+)\.py([^`\n]*)", page.read_text("utf-8")):
+        parser = argparse.ArgumentParser()
+        (script(name).codesign if name == "codesign" else script(name)).options(parser)
+        parser.parse_args(shlex.split(words))
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_quoted_commands_are_understood(page):
     for line in commands(page.read_text("utf-8")):
@@ -36,7 +58,7 @@ def test_pages_that_quote_commands_are_many():
     assert len(PAGES) > 10
 
 
-@pytest.mark.parametrize("words", [(c.name,) for c in COMMANDS] + [("wave", s) for s in ("edof", "table", "superres")])
+@pytest.mark.parametrize("words", [(c.name,) for c in COMMANDS] + [("wave", s) for s in ("psf", "design", "restore")])
 def test_help_has_no_private_words(words):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
@@ -50,11 +72,8 @@ def test_pages_have_no_private_words(page):
 
 
 def test_the_error_axis_of_learning_has_numbers():
-    from raytrace.studies.focusing.experiment import Setting, learn_to_focus
-    from raytrace.studies.focusing.figures import focus_figure
-
-    found = learn_to_focus(Setting(samples=16), steps=2, frames=(0, 2))
-    figure = focus_figure(found)
+    focusing = script("focusing")
+    figure = focusing.learn_to_focus(focusing.Setting(samples=16), steps=2, frames=(0, 2)).plot()
     figure.canvas.draw()
     (error,) = [axes for axes in figure.axes if axes.get_ylabel() == "mean square error"]
     low, high = error.get_ylim()

@@ -6,10 +6,10 @@ import re
 
 import pytest
 
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax_read
-from raytrace.formats.source import Place, decode
-from raytrace.media.catalog import UnknownGlass, find_glass
-from raytrace.media.glass import MIRROR, mil_glass
+from raytrace.io import FORMATS, LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens
+from raytrace.io.source import Place, decode
+from raytrace.materials.catalogs import UnknownGlass, find_glass
+from raytrace.materials.glass import MIRROR, mil_glass
 
 HEAD = {
     "MODE": "MODE SEQ",
@@ -43,7 +43,7 @@ def _indented(text: str) -> list[str]:
 
 
 def read(text: str, **options):
-    return zemax_read.read(text, "lens.zmx", **options)
+    return FORMATS[".zmx"].read(text, "lens.zmx", **options)
 
 
 def lens(**changes):
@@ -400,7 +400,7 @@ def test_environment_apodisation_and_afocal_are_warned_of():
 def test_repeated_keyword_warns_and_the_last_counts():
     found, report = read(file(surface="CURV 0.03"))
     assert float(found.surfaces[1].curvature) == 0.03
-    assert "CURV stands again" in report.warnings[0]
+    assert "CURV occurs again" in report.warnings[0]
 
 
 def test_files_that_lost_their_indentation():

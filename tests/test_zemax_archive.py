@@ -9,12 +9,13 @@ from test_catalog import SMALL
 from test_zemax import file as singlet
 
 from raytrace.cli import main
-from raytrace.formats import LensFileError, check, convert, read_lens, read_lens_with_report, zemax_archive
-from raytrace.formats.source import MAX_BYTES, Place
-from raytrace.formats.zemax_archive import Member, members, unpacked
-from raytrace.media.agf import MOST_GLASSES, CatalogError, format_agf, listed, parse_agf
-from raytrace.media.catalog import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
-from raytrace.media.glass import index
+from raytrace.io import LensFileError, check, convert, read_lens, read_lens_with_report
+from raytrace.io.source import MAX_BYTES, Place
+from raytrace.io.zemax import archive as zemax_archive
+from raytrace.io.zemax.archive import Member, members, unpacked
+from raytrace.materials.agf import MOST_GLASSES, CatalogError, format_agf, listed, parse_agf
+from raytrace.materials.catalogs import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
+from raytrace.materials.glass import index
 
 PLACE = Place("lens.zar")
 #: A catalog of one glass, N-BK7 by name, with other figures: those of SF6.
@@ -248,7 +249,7 @@ def test_a_catalog_beside_the_lens_is_found_by_itself(suffix, name, tmp_path):
     (tmp_path / name).write_text(ACME)
     lens, report = read_lens_with_report(path)
     assert first(lens).catalog == "ACME"
-    assert f"catalog ACME: {name} beside the lens" in report.notes
+    assert f"catalog ACME: {name} in the folder of the lens" in report.notes
     assert not any("not shipped" in note for note in report.notes)
 
 
@@ -274,9 +275,9 @@ def test_the_catalog_of_the_lens_goes_before_the_shipped_one_of_its_name_and_it_
     (tmp_path / "schott.agf").write_text(OWN)
     lens, report = read_lens_with_report(path)
     assert float(index(first(lens), 0.5875618)) == float(index(find_glass("N-SF6"), 0.5875618))
-    assert "catalog SCHOTT: schott.agf beside the lens, which goes before the shipped one" in report.notes
+    assert "catalog SCHOTT: schott.agf in the folder of the lens, which precedes the shipped one" in report.notes
     (warning,) = report.warnings
-    assert "surface 1: N-BK7 is the one of the SCHOTT that came with the lens; its index differs" in warning
+    assert "surface 1: N-BK7 is that of the SCHOTT that came with the lens; its index differs" in warning
     with pytest.raises(LensFileError, match="its index differs"):
         read_lens(path, strict=True)
     (tmp_path / "schott.agf").write_text(format_agf(shipped_catalog("SCHOTT")))
@@ -334,7 +335,7 @@ def test_a_lens_is_written_beside_its_catalog_and_read_again(tmp_path):
     elsewhere.mkdir()
     with (
         pytest.warns(UserWarning, match="its index differs"),
-        pytest.raises(LensFileError, match="put its catalog beside the file"),
+        pytest.raises(LensFileError, match="put its catalog into the folder of the file"),
     ):
         convert(path, elsewhere / "again.zmx")
     assert not any(elsewhere.iterdir())

@@ -15,12 +15,12 @@ from problems import number
 from test_formats import damaged, leaves, read_damaged
 
 import raytrace as rt
-from raytrace.formats import LensFileError, UnsupportedSurface, zemax_read, zemax_write
-from raytrace.formats.source import Place, decode
-from raytrace.formats.zemax_numbers import inverse, spelled_inverse
-from raytrace.formats.zemax_types import types
-from raytrace.optics.trace import media, steps
+from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
+from raytrace.io.source import Place, decode
+from raytrace.io.zemax import write as zemax_write
+from raytrace.io.zemax.surfaces import inverse, spelled_inverse, types
 from raytrace.system.rays import start
+from raytrace.tracing.trace import media, steps
 
 MILLIMETRES = {"MM": 1.0, "IN": 25.4, "METER": 1000.0}
 
@@ -92,7 +92,7 @@ def file(second: str, unit: str = "MM", *more: str) -> str:
 
 
 def read(content: str, **options):
-    return zemax_read.read(content, "lens.zmx", **options)
+    return FORMATS[".zmx"].read(content, "lens.zmx", **options)
 
 
 def again(lens) -> tuple[rt.Lens, str]:

@@ -18,11 +18,10 @@ from raytrace.analysis.setting import (
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
-from raytrace.optics.arrivals import chief_points, keeps_coordinates, unclipped
-from raytrace.optics.axis import is_bent
-from raytrace.optics.focus import image_rays
-from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.launch import is_at_infinity
+from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration
@@ -47,7 +46,7 @@ class Distortion(OverField):
     valid: Tensor
 
     COMMAND = "distortion"
-    FIGURE = "plot.analysis.distortion_curves"
+    FIGURE = "plotting.analysis.distortion_curves"
 
     def columns(self) -> dict[str, Tensor]:
         relative = {"f_tan_percent": self.f_tan, "f_theta_percent": self.f_theta}
@@ -73,7 +72,7 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    FIGURE = "plot.analysis.curvature_curves"
+    FIGURE = "plotting.analysis.curvature_curves"
     UNIT = "mm"
 
     def columns(self) -> dict[str, Tensor]:
@@ -98,7 +97,7 @@ class LateralColour(OverField):
     valid: Tensor
 
     COMMAND = "lateral-colour"
-    FIGURE = "plot.analysis.lateral_curves"
+    FIGURE = "plotting.analysis.lateral_curves"
 
     def columns(self) -> dict[str, Tensor]:
         return {**self.heads(wavelength=self.wavelengths), "shift": masked(self.shift, self.valid)}

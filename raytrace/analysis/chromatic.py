@@ -6,8 +6,8 @@ from torch import Tensor
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
 from raytrace.maths.value import value
-from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import Lens, check_media, with_wavelengths
+from raytrace.tracing.paraxial import first_order
 
 
 @value
@@ -23,7 +23,7 @@ class ChromaticFocalShift(Analysis):
     depth_of_focus: Tensor
 
     COMMAND = "chromatic-focal-shift"
-    FIGURE = "plot.analysis.chromatic_curve"
+    FIGURE = "plotting.analysis.chromatic_curve"
     EVERY = 10
 
     def columns(self) -> dict[str, Tensor]:

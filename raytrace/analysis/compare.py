@@ -8,19 +8,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.kernels.compute import PIXEL, SIZE, psf
-from raytrace.kernels.ladder import NotConverged
-from raytrace.kernels.models import MODELS, Model
-from raytrace.kernels.result import Psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
-from raytrace.optics.axis import need_axis
-from raytrace.optics.focus import NoImage, focused, real_image_distance
-from raytrace.optics.paraxial import first_order, largest_field
-from raytrace.optics.trace import media
+from raytrace.psf_models.compute import PIXEL, SIZE, psf
+from raytrace.psf_models.models import MODELS, Model, NotConverged
+from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
+from raytrace.tracing.aiming import need_axis
+from raytrace.tracing.focus import NoImage, focused, real_image_distance
+from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.trace import media
 
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
@@ -106,7 +105,7 @@ class Comparison(Result):
     models: tuple[str, ...]
     abilities: Abilities | None = None
 
-    FIGURE = "plot.psf.model_grid"
+    FIGURE = "plotting.psf.model_grid"
 
     @property
     def sigma(self) -> Tensor:

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.aperture import ExitPupil, exit_pupil
+from raytrace.analysis.pupil_autocorrelation import ExitPupil, exit_pupil
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
     Numbers,
@@ -17,13 +17,13 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, afford, piece
-from raytrace.kernels.dft import phasor
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import value
-from raytrace.optics.f_number import axial_f_number
-from raytrace.optics.focus import image_rays
-from raytrace.optics.scene import Scene
+from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.spot import image_rays
 
 _RAYS = 4096
 _RINGS_PER_STEP = 16
@@ -46,7 +46,7 @@ class EncircledEnergy(Analysis):
     marked: bool = False
 
     COMMAND = "encircled-energy"
-    FIGURE = "plot.analysis.encircled_curves"
+    FIGURE = "plotting.analysis.encircled_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:

@@ -8,8 +8,8 @@ from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength,
 from raytrace.maths.pupil import fan as pupil_fan
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
-from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.system.lens import Lens
+from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 #: Whose sphere an OPD is measured on.
 REFERENCES = ("primary", "own")
@@ -34,7 +34,7 @@ class Fan(Analysis):
     sagittal_valid: Tensor
     quantity: str
 
-    FIGURE = "plot.analysis.fan_plot"
+    FIGURE = "plotting.analysis.fan_plot"
     EVERY = 5
     COMMAND = property(lambda self: f"{self.quantity}-fan")
     UNIT = property(lambda self: {"ray": "mm", "opd": "waves"}[self.quantity])

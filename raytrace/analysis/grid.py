@@ -15,10 +15,9 @@ from raytrace.analysis.setting import (
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
-from raytrace.optics.arrivals import chief_points
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens, with_wavelengths
+from raytrace.tracing.launch import is_at_infinity, warn_of_filling
+from raytrace.tracing.spot import chief_points
 
 _NEAR_AXIS = 1e-4  # of the largest field: its rays give the scale of the image; they leave 1e-8 of the distortion
 
@@ -41,7 +40,7 @@ class GridDistortion(Analysis):
     valid: Tensor
 
     COMMAND = "distortion-grid"
-    FIGURE = "plot.analysis.distorted_grid"
+    FIGURE = "plotting.analysis.distorted_grid"
 
     def columns(self) -> dict[str, Tensor]:
         (x, y), (ideal_x, ideal_y) = (masked(point, self.valid) for point in (self.actual, self.ideal))

@@ -11,8 +11,8 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
-from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens
+from raytrace.tracing.wavefront import wavefront_of
 
 _RINGS = 24, 96
 _WORST_CONDITION = 1e8  # of the fit of that map
@@ -33,7 +33,7 @@ class RelativeIllumination(OverField):
     marked: bool = False
 
     COMMAND = "relative-illumination"
-    FIGURE = "plot.analysis.illumination_curve"
+    FIGURE = "plotting.analysis.illumination_curve"
 
     def columns(self) -> dict[str, Tensor]:
         return {

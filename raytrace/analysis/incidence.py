@@ -8,11 +8,12 @@ from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setti
 from raytrace.maths.numerics import dot
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import lens_steps
+from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
-from raytrace.system.pose import Gap, direction_in
-from raytrace.system.surface import Surface, gap_behind, normal
+from raytrace.system.poses import Gap, direction_in
+from raytrace.system.surface import Surface, gap_behind
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import lens_steps
 
 _RAYS = ("lower", "chief", "upper")
 _CHIEF = _RAYS.index("chief")
@@ -38,7 +39,7 @@ class Incidence(OverField):
     surfaces: bool = False
 
     COMMAND = "incidence"
-    FIGURE = "plot.analysis.incidence_curves"
+    FIGURE = "plotting.analysis.incidence_curves"
 
     def columns(self) -> dict[str, Tensor]:
         numbers = torch.arange(1, self.angle.shape[-1] + 1, device=self.angle.device)

@@ -8,10 +8,10 @@ from raytrace.analysis.setting import Numbers, like
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
-from raytrace.optics.axis import need_axis
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optics.focus import image_rays
 from raytrace.system.lens import Lens, with_wavelengths
+from raytrace.tracing.aiming import need_axis
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.spot import image_rays
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-8 of the spherical aberration
 
@@ -29,7 +29,7 @@ class LongitudinalAberration(Analysis):
     valid: Tensor
 
     COMMAND = "longitudinal-aberration"
-    FIGURE = "plot.analysis.longitudinal_curves"
+    FIGURE = "plotting.analysis.longitudinal_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:

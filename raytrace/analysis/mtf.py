@@ -6,7 +6,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.aperture import exit_pupil, points_needed
+from raytrace.analysis.pupil_autocorrelation import MARGIN, beam_of, exit_pupil, otf, points_needed, polynomials_of
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
     Numbers,
@@ -19,19 +19,16 @@ from raytrace.analysis.setting import (
     setting,
     wavelength_shares,
 )
-from raytrace.analysis.shear import otf
-from raytrace.analysis.smooth_pupil import MARGIN, beam_of, polynomials_of
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.kernels.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import axis
 from raytrace.maths.value import value
-from raytrace.optics.f_number import axial_f_number
-from raytrace.optics.focus import image_rays
-from raytrace.optics.scene import Scene
-from raytrace.optics.spot import spot_of
+from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.spot import image_rays, spot_of
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 _FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for
@@ -63,7 +60,7 @@ class Mtf(Analysis):
     marked: bool = False
 
     COMMAND = "mtf"
-    FIGURE = "plot.analysis.mtf_curves"
+    FIGURE = "plotting.analysis.mtf_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
@@ -98,7 +95,7 @@ class ThroughFocusMtf(Analysis):
     by_rays: Tensor
 
     COMMAND = "mtf"
-    FIGURE = "plot.analysis.mtf_through_focus_curves"
+    FIGURE = "plotting.analysis.mtf_through_focus_curves"
 
     def about(self) -> dict:
         return {"transfer": transfer(self)}

@@ -12,10 +12,9 @@ from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import spot_of, spot_of_points
-from raytrace.optics.wavefront import rms, wavefront_of
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
+from raytrace.tracing.wavefront import rms, wavefront_of
 
 _RINGS = 10, 40
 
@@ -40,7 +39,7 @@ class RmsOverField(OverField):
     reference: str
 
     COMMAND = "rms-over-field"
-    FIGURE = "plot.analysis.rms_curves"
+    FIGURE = "plotting.analysis.rms_curves"
 
     @property
     def quantity(self) -> str:

@@ -20,12 +20,12 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.optics.axis import need_axis
-from raytrace.optics.launch import paraxial_field
-from raytrace.optics.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed
-from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
+from raytrace.tracing.aiming import need_axis
+from raytrace.tracing.launch import is_at_infinity, paraxial_field
+from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
+from raytrace.tracing.trace import media
 from raytrace.words import named, with_article
 
 
@@ -53,7 +53,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
-    FIGURE = "plot.analysis.seidel_bars"
+    FIGURE = "plotting.analysis.seidel_bars"
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
@@ -108,29 +108,46 @@ def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> 
     need_axis(lens, "Seidel's theory", instead)
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
-            what = "has a departure" if surface.departure is not None else f"is {with_article(surface.kind)}"
+            what = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
             what = what if surface.phase is None else f"is {named(surface.phase)}"
             raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r; {instead}")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)
     H = chief[1] * marginal[0] - marginal[1] * chief[0]
-    n, dispersion = _indices(lens)
     names, convert, unit = KINDS[kind]
-    rows = []
-    for k, surface in enumerate(lens.surfaces[1:-1]):
-        row, marginal, chief = _cross(surface, marginal, chief, H, n[k : k + 2], dispersion[k : k + 2])
-        rows.append(row)
-    found = torch.stack([torch.stack(torch.broadcast_tensors(*row, H)[:-1]) for row in rows], -1)
+    surfaces, (n, dispersion) = lens.surfaces[1:-1], _indices(lens)
+    vertex = [vertex_curvature(surface) for surface in surfaces]
+    powers = [c * (behind - before) for c, before, behind in zip(vertex, n[:-1], n[1:], strict=True)]
+    gaps = [surface.thickness / behind for surface, behind in zip(surfaces, n[1:], strict=True)]
+    (y, omega), (y_bar, omega_bar) = (
+        tuple(_per_surface(column, H) for column in zip(*ynu(*ray, powers, gaps), strict=True))
+        for ray in (marginal, chief)
+    )
+    c, n, dispersion = _per_surface(vertex, H), _per_surface(n, H), _per_surface(dispersion, H)
+    departure = _per_surface([_departure(surface, v) for surface, v in zip(surfaces, vertex, strict=True)], H)
+    before, behind = n[..., :-1], n[..., 1:]
+    A, A_bar = (w[..., :-1] + before * h[..., :-1] * c for h, w in ((y, omega), (y_bar, omega_bar)))
+    sums = third_order(
+        (y[..., :-1], omega[..., :-1]),
+        (y_bar[..., :-1], omega_bar[..., :-1]),
+        c,
+        (before, behind),
+        departure,
+        H[..., None],
+    )
+    colour = y[..., :-1] * (dispersion[..., 1:] / behind - dispersion[..., :-1] / before)
     wavelength = primary_wavelength(lens)
     return Seidel(
         lens=lens,
         fields=fields,
-        contributions=convert(found[:7], marginal[1], n[-1], 1e-3 * wavelength),
-        marginal_yni=found[7],
-        chief_yni=found[8],
-        marginal_height=found[9],
-        chief_height=found[10],
+        contributions=convert(
+            torch.stack([*sums, A * colour, A_bar * colour]), omega[..., -1:], n[..., -1:], 1e-3 * wavelength
+        ),
+        marginal_yni=y[..., :-1] * A,
+        chief_yni=y_bar[..., :-1] * A_bar,
+        marginal_height=y[..., :-1],
+        chief_height=y_bar[..., :-1],
         invariant=H,
         wavelength=wavelength,
         names=names,
@@ -143,14 +160,15 @@ def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor
     """(ȳ, ω̄) (F,) in front of surface 1, of fields in the direction of +y."""
     upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
     extent = paraxial_field(lens, upwards, paraxial)[1]
-    distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
-    n = media(lens, primary_wavelength(lens))[0]
-    if bool(torch.isinf(distance)):
-        return -pupil * extent, n * extent
-    if lens.fields.telecentric or not bool(torch.isfinite(pupil)):
-        return extent, torch.zeros_like(extent)
-    slope = -extent / (distance + pupil)
-    return -pupil * slope, n * slope
+    pupil, n = paraxial.entrance_pupil_position, media(lens, primary_wavelength(lens))[0]
+    height, slope = chief_ray(
+        extent,
+        at_infinity=is_at_infinity(lens),
+        distance=lens.surfaces[0].thickness,
+        entrance_pupil=pupil,
+        parallel=lens.fields.telecentric or not bool(torch.isfinite(pupil)),
+    )
+    return height, n * slope
 
 
 def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
@@ -162,49 +180,57 @@ def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
     return primary, [long - short for short, long in zip(shortest, longest, strict=True)]
 
 
-def _cross(surface: Surface, marginal, chief, H: Tensor, n, dispersion):
-    """S1 … S5, C1, C2, y n i, ȳ n ī, y, ȳ at one surface, and both rays (y, ω) before the next one."""
-    (y, omega), (y_bar, omega_bar) = marginal, chief
-    c, step = vertex_curvature(surface), n[1] - n[0]
-    A, A_bar = omega + n[0] * y * c, omega_bar + n[0] * y_bar * c
-    behind, behind_bar = omega - y * c * step, omega_bar - y_bar * c * step
-    bending = y * (behind / n[1] ** 2 - omega / n[0] ** 2)
-    inverse = 1 / n[1] - 1 / n[0]
-    colour = y * (dispersion[1] / n[1] - dispersion[0] / n[0])
-    asphere = 8 * _departure_from_sphere(surface, c) * step
-    row = (
-        -A * A * bending + asphere * y**4,
-        -A * A_bar * bending + asphere * y**3 * y_bar,
-        -A_bar * A_bar * bending + asphere * y**2 * y_bar**2,
+def _per_surface(numbers: list[Tensor], H: Tensor) -> Tensor:
+    """Numbers of the surfaces as (F, K)."""
+    return torch.stack(torch.broadcast_tensors(*numbers, H)[:-1], -1)
+
+
+def third_order(marginal: tuple, chief: tuple, c, n: tuple, departure, H) -> tuple:
+    """S1 … S5 in mm at every surface, of tensors or dual numbers.
+
+    marginal, chief: (y, ω) before the surfaces; c: vertex curvature, 1/mm; n: signed indices before and behind;
+    departure: G, 1/mm³; H: mm.
+    """
+    (y, omega), (y_bar, omega_bar), (n, n_behind) = marginal, chief, n
+    A, A_bar, step = omega + n * c * y, omega_bar + n * c * y_bar, n_behind - n
+    bending = y * ((omega - c * step * y) / (n_behind * n_behind) - omega / (n * n))
+    inverse, asphere, y2, y_bar2 = 1 / n_behind - 1 / n, 8 * departure * step, y * y, y_bar * y_bar
+    return (
+        -A * A * bending + asphere * y2 * y2,
+        -A * A_bar * bending + asphere * y2 * y * y_bar,
+        -A_bar * A_bar * bending + asphere * y2 * y_bar2,
         -H * H * c * inverse,
-        -(A_bar**3) * y * (1 / n[1] ** 2 - 1 / n[0] ** 2)
+        -(A_bar * A_bar * A_bar) * y * (1 / (n_behind * n_behind) - 1 / (n * n))
         + A_bar * y_bar * c * inverse * (H + A_bar * y)
-        + asphere * y * y_bar**3,
-        A * colour,
-        A_bar * colour,
-        y * A,
-        y_bar * A_bar,
-        y,
-        y_bar,
+        + asphere * y * y_bar2 * y_bar,
     )
-    gap = surface.thickness / n[1]
-    return row, (y + gap * behind, behind), (y_bar + gap * behind_bar, behind_bar)
 
 
-def _departure_from_sphere(surface: Surface, vertex: Tensor) -> Tensor:
-    """G in 1/mm³: the r⁴ term (1+k) c³/8 + a₂ of the sag less that of the sphere of the vertex curvature."""
-    G = -(vertex**3) / 8
-    if surface.curvature is not None:
-        shape = 1 if surface.conic is None else 1 + surface.conic
-        G = G + shape * surface.curvature**3 / 8
-    if surface.coefficients is not None and len(surface.coefficients) > 1:
-        G = G + surface.coefficients[1]
-    return G
+def departure_from_sphere(curvature, shape, quartic, vertex):
+    """G in 1/mm³: the r⁴ term (1+k) c³/8 + a₂ of the sag less that of the sphere of the vertex curvature.
+
+    shape: 1 + k; quartic: a₂, 1/mm³. Any number type.
+    """
+    return (shape * curvature * curvature * curvature - vertex * vertex * vertex) / 8 + quartic
+
+
+def _departure(surface: Surface, vertex: Tensor) -> Tensor:
+    terms = surface.coefficients
+    return departure_from_sphere(
+        0.0 if surface.curvature is None else surface.curvature,
+        1.0 if surface.conic is None else 1 + surface.conic,
+        0.0 if terms is None or len(terms) < 2 else terms[1],
+        vertex,
+    )
+
+
+#: S1 … S5, C1, C2 over the coefficients W040, W131, W222, W220P, W311, W020, W111 of the wavefront.
+OF_WAVEFRONT = 8, 2, 2, 4, 2, 2, 1
 
 
 def _waves(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
     """W040, W131, W222, W220P, W311, W020, W111 of S1 … C2, wavelength in mm."""
-    return S / S.new_tensor([8, 2, 2, 4, 2, 2, 1]).reshape(-1, 1, 1) / wavelength
+    return S / S.new_tensor(OF_WAVEFRONT).reshape(-1, 1, 1) / wavelength
 
 
 def _transverse(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:

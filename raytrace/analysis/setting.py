@@ -11,21 +11,13 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optics.launch import is_at_infinity, object_field
-from raytrace.optics.losses import check_reach, losses
-from raytrace.optics.paraxial import first_order, largest_field
-from raytrace.optics.scene import Scene
-from raytrace.optics.scene import scene as make_scene
-from raytrace.optics.spot import EmptySpot
-from raytrace.system.lens import (
-    FIELD_UNITS,
-    Lens,
-    field_points,
-    name_of_field,
-    with_field_kind,
-    with_wavelengths,
-)
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_field_kind, with_wavelengths
+from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
+from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.ray_failures import check_reach, ray_failures
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.scene import scene as make_scene
+from raytrace.tracing.spot import EmptySpot
 
 #: What verbs take for fields, y or pairs (x, y), and for other numbers; None stands for the lens's own.
 Points = Tensor | Sequence | float | None
@@ -113,7 +105,7 @@ def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, what: str) -> None:
         return
     f, w = torch.nonzero(~lit)[0].tolist()
     wavelength = lens.wavelengths[w : w + 1]
-    found = losses(lens, gauss_rings(6, **like(lens))[0], fields=fields[:, f : f + 1], wavelengths=wavelength)
+    found = ray_failures(lens, gauss_rings(6, **like(lens))[0], fields=fields[:, f : f + 1], wavelengths=wavelength)
     lost = found.words(0, 0) if int(found.arrived) == 0 else "too few rays reach the sensor"
     where = f"field {field_words(lens, fields[:, f])}, {float(wavelength):g} µm"
     raise EmptySpot(f"{where} has no {what}: {lost}; leave the field out")

@@ -9,14 +9,14 @@ from torch import Tensor
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
-from raytrace.kernels.diffraction import strehl
 from raytrace.maths import zernike
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.optics.scene import Scene
-from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
+from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.words import calling_level
 
 _RINGS = 14, 56
@@ -53,7 +53,7 @@ class WavefrontMap(Analysis):
     listed: bool = False
 
     COMMAND = "wavefront"
-    FIGURE = "plot.analysis.wavefront_maps"
+    FIGURE = "plotting.analysis.wavefront_maps"
     UNIT = "waves"
 
     def columns(self) -> dict[str, Tensor]:

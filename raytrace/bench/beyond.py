@@ -26,16 +26,16 @@ from raytrace.bench.measure import (
 )
 from raytrace.bench.report import digits, table
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.fused import tracing
+from raytrace.io import read_lens
+from raytrace.materials.glass import AIR, MIRROR, Glass, constant
 from raytrace.maths.value import to
-from raytrace.media.glass import AIR, MIRROR, Glass, constant
-from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.phases import Grating
-from raytrace.system.pose import Pose
+from raytrace.system.poses import Pose
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.trace import trace_lens
 
 MOST = 100_000  # rays
 WORK = ("forward", "forward+backward")
@@ -192,7 +192,7 @@ def error_of(tracer: Tracer) -> float:
     rays = to(field_rays(tracer.lens, SAMPLE), dtype=tracer.dtype)
     wavelength = tracer.lens.primary.double()
     tracer.prepare()
-    with torch.no_grad(), tracing("eager"):
+    with torch.no_grad(), trace_engine("eager"):
         exact = trace_lens(*(to(x, dtype=torch.float64) for x in (tracer.lens, rays)), wavelength)
     return 1e6 * _largest(tracer.forward(rays)[0].double() - exact.position[:2])
 

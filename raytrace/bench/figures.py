@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-from raytrace.plot import style
+from raytrace.plotting import style
 
 #: By the start of an entrant's name: number of its colour (None: grey), dashes, marker.
 _TRACERS = {

@@ -13,11 +13,11 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.kernels.dft import huygens, sub_pixels
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings, square
-from raytrace.optics.scene import Scene, trace_scene
-from raytrace.optics.wavefront import Wavefront, wavefront_of
+from raytrace.psf_models.dft import huygens, sub_pixels
+from raytrace.tracing.scene import Scene, trace_scene
+from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 _TERMS = 2**21  # wavelets × points that are added at once
 _STEP = 1e-4  # of the pupil radius, for Ω

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.measure import field_rays, in_turns, nothing, slope, with_leaf, with_sensor_leaf
-from raytrace.formats import read_lens
-from raytrace.fused import prepare, tracing
-from raytrace.kernels import psf
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import sobol
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import trace_lens
+from raytrace.psf_models import psf
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
+from raytrace.tracing.compiled import prepare, trace_engine
+from raytrace.tracing.scene import Memo, trace_bundle
+from raytrace.tracing.trace import trace_lens
 
 SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it
 FIELD = 10.0  # degrees
@@ -69,7 +69,7 @@ def measure(sizes, *, repeats: int, progress: Callable[[str], object] = nothing)
 def cases(sizes) -> list[Case]:
     """All of them (sizes: `speed.Sizes`); nothing is traced before a case is called. Without a compiler those of the
     compiled trace lack."""
-    engines = ["fused", "eager"] if prepare() == "fused" else ["eager"]
+    engines = ["compiled", "eager"] if prepare() == "compiled" else ["eager"]
     found = [Case(what, engine, *pair) for engine in engines for what, pair in _traced(sizes.less).items()]
     others = _kernel_cases(sizes.distances) | _launched(sizes.less)
     return [*found, *(Case(what, "auto", *pair) for what, pair in sorted(others.items(), key=_kind))]
@@ -80,7 +80,7 @@ def _kind(case: tuple[str, object]) -> int:
 
 
 def _gain(case: Case, repeats: int) -> Gain:
-    with tracing(case.engine):
+    with trace_engine(case.engine):
         less, full = case.less(), case.full()
         taken = in_turns({one: (one, nothing) for one in (case.less, case.full)}, repeats=repeats, threads=1)
         seconds, without = (statistics.median(one) for one in taken.values())

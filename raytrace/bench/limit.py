@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.measure import name_of, shape_of
-from raytrace.fused.library import NoCompiler, compiler, run_compiler
-from raytrace.fused.trust import private_folder
 from raytrace.maths.value import to
-from raytrace.optics.trace import media
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
+from raytrace.tracing.compiled.library import NoCompiler, compiler, private_folder, run_compiler
+from raytrace.tracing.trace import media
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
 #: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.

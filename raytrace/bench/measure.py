@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
-from raytrace.fused import engine as engine_asked_for
-from raytrace.fused import tracing
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
+from raytrace.tracing.compiled import engine as engine_asked_for
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.trace import media, trace_lens, trace_surfaces
 
 DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference
@@ -85,12 +85,12 @@ class Own:
         pass
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
-        with torch.no_grad(), tracing(self.engine):
+        with torch.no_grad(), trace_engine(self.engine):
             end = trace_lens(self.lens, self._with_path(rays), self.wavelength)
         return end.position[:2], end.opl
 
     def gradient(self, rays: Rays, centroid: Tensor) -> tuple[Tensor, ...]:
-        with tracing(self.engine):
+        with trace_engine(self.engine):
             how = {"indices": self.indices, "wavelength": self.wavelength}
             end = trace_surfaces(self.surfaces, self._with_path(rays), **how)
             return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)

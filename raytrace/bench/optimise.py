@@ -18,14 +18,14 @@ import numpy as np
 
 from raytrace.bench.report import Asked, Measured, digits, in_words, table
 from raytrace.cli.progress import progress
-from raytrace.formats import read_lens
-from raytrace.fused import prepare
-from raytrace.merit.default import rows_of
-from raytrace.merit.model import Model
-from raytrace.merit.vary import freedom, name_of
+from raytrace.io import read_lens
+from raytrace.optimization.default_merit import rows_of
+from raytrace.optimization.lens_model import Model
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
+from raytrace.optimization.variables import freedom, name_of
 from raytrace.system.lens import Lens
+from raytrace.tracing.compiled import prepare
 
 MOST = 10.0  # s a file
 FRACTION = 0.05  # by which variables are moved

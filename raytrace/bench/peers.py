@@ -31,11 +31,11 @@ from raytrace.bench.measure import DTYPES
 from raytrace.bench.peers_trace import Optiland, PosedOptiland, RayOptics
 from raytrace.bench.psf import Truth
 from raytrace.bench.psf_cases import Case, Method
-from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene
+from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene
 
 _RANDOM = (10_000, 100_000, 1_000_000)
 _HUYGENS = ((64, 3), (96, 5))  # rays across the pupil, points across a pixel

@@ -32,14 +32,14 @@ from optiland.samples.objectives import CookeTriplet, DoubleGauss
 from torch import Tensor
 
 from raytrace.bench.report import table
+from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.pupil import gauss_legendre
-from raytrace.media.glass import AIR, Glass, from_table
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import trace_lens
-from raytrace.system.intent import Intent, Row, Vary
 from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.surface import Surface
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import trace_lens
 
 RINGS, ARMS = 3, 6
 AGREE = 1e-9  # of the merits of both programs, relative
@@ -57,7 +57,7 @@ PROBLEMS: dict[str, tuple[type[Optic], tuple[int, ...], tuple[int, ...], float]]
 class Problem:
     """What both programs are given.
 
-    lens: Optiland's at the start, with variables and rows as its intent; moved: by how much, as a part of itself, every
+    lens: Optiland's at the start, with variables and rows; moved: by how much, as a part of itself, every
     variable was moved up and down in turn from the sample. merit_in_optiland: M² at the start.
     """
 
@@ -119,7 +119,7 @@ def problem(name: str, *, moved: float = 0.0) -> Problem:
     theirs, ours = float(posed(optic, rows, variables, "rays").sum_squared()), float(merit_of(lens, rows))
     if not abs(theirs - ours) <= AGREE * ours:
         raise ValueError(f"{name}: M² is {ours:.12g} here and {theirs:.12g} in Optiland")
-    lens = dataclasses.replace(lens, intent=Intent(variables=variables, merit=rows))
+    lens = dataclasses.replace(lens, optimization_data=OptimizationData(variables=variables, merit=rows))
     return Problem(name, moved, lens, variables, rows, theirs)
 
 

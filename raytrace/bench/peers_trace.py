@@ -23,12 +23,12 @@ from torch import Tensor
 
 from raytrace.bench.measure import name_of, shape_of, squared_radius, variables
 from raytrace.maths.value import to
-from raytrace.optics.frames import Frame, frames
-from raytrace.optics.trace import media
 from raytrace.system.lens import Lens
 from raytrace.system.phases import Grating
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
+from raytrace.tracing.geometry import Frame, frames
+from raytrace.tracing.trace import media
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 # mm, where Optiland's search for a toroid ends: what float32 does not reach it would try in vain a hundred times
@@ -250,7 +250,7 @@ def _shaped(surface: Surface, dtype: torch.dtype) -> dict:
         radii = {"radius_x": 1 / across if across else math.inf, "radius_y": radius}
         numbers = {"conic": k, "toroidal_coeffs_poly_y": terms, "tol": _CLOSE[dtype]}
         return {"surface_type": "toroidal"} | numbers | radii
-    if surface.coefficients is not None or surface.departure is not None:
+    if surface.coefficients is not None or surface.sag_terms is not None:
         raise ValueError("this shape is not handed over")
     if isinstance(surface.phase, Grating):
         period = 1 / float(surface.phase.frequency)  # µm

@@ -16,10 +16,10 @@ from pathlib import Path
 import torch
 
 from raytrace.bench.measure import Own, field_rays, name_of, some
-from raytrace.formats import read_lens
-from raytrace.fused import prepare
+from raytrace.io import read_lens
 from raytrace.maths.value import to
 from raytrace.system.rays import Rays
+from raytrace.tracing.compiled import prepare
 
 _PATTERN = 2**12  # rays that are repeated to fill a large batch: launching many would set the peak
 _WARM_UP = 2**14

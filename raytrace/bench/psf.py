@@ -1,6 +1,6 @@
 """Speed of PSFs beside their error: time forward and forward + backward of every model against converged references.
 
-Geometric models are compared with `raymap.reference` (10⁸ random rays would be no closer), waves with the direct
+Geometric models are compared with `drt.reference` (10⁸ random rays would be no closer), waves with the direct
 Huygens sum, the others with their own limit: Gaussians with that of converged moments, the Fourier model with its
 finest order.
 """
@@ -22,16 +22,16 @@ from raytrace.bench.measure import clock, name_of, nothing, with_leaves
 from raytrace.bench.psf_cases import DIRECT, RANDOM, USUAL, Case, Method, cases, doors, methods, random_histogram
 from raytrace.bench.report import Asked, Measured
 from raytrace.cli.progress import progress
-from raytrace.kernels import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
-from raytrace.kernels.dft import nodes_per_pixel, rings_and_arms
-from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.optics.scene import Scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.psf_models import MODELS, NotConverged, Psf, drt, paraxial, wave
+from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
+from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.wavefront import wavefront_of
 
 _PIECE = 2**16  # random rays at a time
 _PILOT = 2**17  # random rays that find how many are needed
@@ -101,7 +101,7 @@ def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
     shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (light.centroid, light.variance)))
     own = case.window(paraxial.chief_ray_height(scene).flatten())
     kernels = {
-        "rays": raymap.reference(scene, window)[0, 0, 0],
+        "rays": drt.reference(scene, window)[0, 0, 0],
         "gaussian": light.energy * shape[0, 0, 0],
         "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
     }
@@ -131,7 +131,7 @@ def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
     spread = torch.hypot(L - L.mean(), M - M.mean()).max()
     cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
     return (
-        *rings_and_arms(diffraction.phase_along_radius(front, reach), 0),
+        *rings_and_arms(wave.phase_along_radius(front, reach), 0),
         nodes_per_pixel(float(grid.pitch), cutoff, 0),
     )
 

@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.kernels import MODELS, Psf, paraxial, psf, rays
-from raytrace.kernels.gaussian import kernels as gaussian_kernels
-from raytrace.kernels.result import Kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.paraxial import first_order, largest_field
-from raytrace.optics.scene import Scene, scene
+from raytrace.psf_models import MODELS, Psf, drt, paraxial, psf
+from raytrace.psf_models.gaussian import kernels as gaussian_kernels
+from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.scene import Scene, scene
 
 PIXELS = 21  # across every window
 RANDOM, DIRECT = "random rays", "direct sum"
@@ -94,7 +94,7 @@ def methods() -> list[Method]:
             sampling = f"{order} rings" if model == "gaussian" else f"order {order}"
             run = functools.partial(MODELS[model].kernels, order=order)
             found.append(Method(model, sampling, run, _limit_of(model)))
-    sobol = (Method("Sobol rays", f"{n} rays", functools.partial(rays.kernels, rays=n), "rays") for n in _SOBOL)
+    sobol = (Method("Sobol rays", f"{n} rays", functools.partial(drt.kernels_of_rays, rays=n), "rays") for n in _SOBOL)
     return [*found, *sobol]
 
 
@@ -118,7 +118,7 @@ def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int, seed: 
     generator = torch.Generator().manual_seed(seed)
     sampling = functools.partial(pupil.random, generator=generator)
     sizes = [min(piece, count - first) for first in range(0, count, piece)]
-    parts = [rays.kernels(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
+    parts = [drt.kernels_of_rays(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
     centroid, covariance, kernel = (
         sum(size / count * getattr(part, name) for size, part in zip(sizes, parts, strict=True))
         for name in ("centroid", "covariance", "kernel")

@@ -36,18 +36,18 @@ from raytrace.bench.processes import bytes_per_ray, spot_process_ratio, two_proc
 from raytrace.bench.report import Asked, Measured
 from raytrace.cli.door import say
 from raytrace.cli.progress import progress
-from raytrace.formats import read_lens
-from raytrace.fused import NoCompiler, prepare
+from raytrace.io import read_lens
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
-from raytrace.optics.focus import spot_parabola
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import trace_lens
 from raytrace.shards import torch_threads
-from raytrace.system.build import lens as lens_of
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.prescription import lens as lens_of
 from raytrace.system.rays import Rays
+from raytrace.tracing.compiled import NoCompiler, prepare
+from raytrace.tracing.focus import spot_parabola
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.scene import Memo, trace_bundle
+from raytrace.tracing.trace import trace_lens
 
 _PIECE = 2**16
 _PIECES = (_PIECE, 2**18)  # rays at a time that tracers are tried with, beside all at once

@@ -17,20 +17,20 @@ from torch import Tensor
 from raytrace.bench.measure import clock, name_of, nothing
 from raytrace.bench.report import Asked, Measured, digits, table, yes
 from raytrace.cli.progress import progress
-from raytrace.kernels.dft import Aliased, phasor
+from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
 from raytrace.maths.result import number
 from raytrace.maths.value import to
-from raytrace.media.glass import index
-from raytrace.optics.reuse import Memo
 from raytrace.pages import measured
+from raytrace.psf_models.dft import Aliased, phasor
 from raytrace.shards import torch_threads
-from raytrace.wave import radial
-from raytrace.wave.designs import aim, singlet
-from raytrace.wave.plan import AliasedSampling
-from raytrace.wave.plan import plan as plan_of
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import WaveScene
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import propagation
+from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.designs import aim, singlet
+from raytrace.wave_optics.plan import AliasedSampling
+from raytrace.wave_optics.plan import plan as plan_of
+from raytrace.wave_optics.scene import WaveScene
 
 WAVELENGTH, DEPTH, PIXEL, SIZE = 0.46, 500.0, 0.00369, 128
 #: Samples across and padding of Sitzmann's method: 2 µm over 5 mm, half as wide again.
@@ -251,7 +251,7 @@ def sitzmann_method(scene: WaveScene, dtype: torch.dtype, *, samples: int = SAMP
     seen = slice(samples // 2 - side, samples - samples // 2 + side)
     r = torch.sqrt(x[seen] ** 2 + x[seen, None] ** 2)
     distances, place = torch.unique(r, return_inverse=True)
-    waves = radial.field(scene, distances, _FINEST["samples"])[0, 0]
+    waves = propagation.radial_field(scene, distances, _FINEST["samples"])[0, 0]
     truth = (waves.real**2 + waves.imag**2)[place] * pitch**2
 
     def prepare():

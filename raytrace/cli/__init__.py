@@ -30,7 +30,7 @@ double_gauss.
 Lengths are mm, wavelengths µm, angles degrees. `raytrace COMMAND --help` teaches each command by example.
 
 Large batches are traced by C++ that is compiled once for the machine, where there is a compiler; RAYTRACE_TRACE=eager
-traces by torch alone, =fused always by C++, and RAYTRACE_CACHE is the folder that the compiled code is kept in.
+traces by torch alone, =compiled always by C++, and RAYTRACE_CACHE is the folder that the compiled code is kept in.
 """
 
 

@@ -1,7 +1,6 @@
 """The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
 
 from raytrace.cli.command import Command
-from raytrace.cli.studies import command
 
 #: The analyses, each a file of this folder.
 ANALYSES = (
@@ -15,6 +14,6 @@ COMMANDS = (
     *(Command.of(f"cli.{name}") for name in ("info", "check", "convert", "layout", "spot", "focus", "optimize")),
     *(Command.of(f"cli.{name}") for name in ("search", "evaluate", "trace", "psf")),
     *(Command.of(f"cli.{name}") for name in ("compare", "glass", "bench", *ANALYSES)),
-    command("codesign"),
+    Command.of("cli.codesign"),
     Command.of("cli.wave"),
 )

@@ -18,7 +18,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "target",
         metavar="OUT",
-        type=file_of(Names("formats", "WRITTEN")),
+        type=file_of(Names("io", "WRITTEN")),
         help="lens file to write: .zmx, .seq, .csv, .tsv, .txt",
     )
     configuration(parser)

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from raytrace.files import shipped
-from raytrace.formats import FORMATS, read_lens, shipped_lens
-from raytrace.media.catalog import shipped_file
+from raytrace.io import FORMATS, read_lens, shipped_lens
+from raytrace.materials.catalogs import shipped_file
 from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
 

@@ -43,7 +43,7 @@ def run(arguments):
 
     from raytrace.cli.door import catalogs, find_lens, say
     from raytrace.cli.run import printed_anyway, verb_of_lens
-    from raytrace.formats import read_lens, write_lens
+    from raytrace.io import read_lens, write_lens
     from raytrace.system.lens import with_sensor_distance
 
     found = verb_of_lens(sys.modules[__name__], arguments)

@@ -8,7 +8,7 @@ from raytrace.cli.options import catalog, environment, json, positive_finite
 SUMMARY = "look up a glass"
 DESCRIPTION = (
     "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions. With a "
-    "temperature or a pressure also its indices there, beside the air of that place, and how they change with it."
+    "temperature or a pressure also its indices there, relative to air there, and their change with temperature."
 )
 EXAMPLES = """examples:
   raytrace glass N-BK7

@@ -6,11 +6,11 @@ from raytrace.cli.options import Names, count, positive_finite
 
 
 def merit(parser: argparse.ArgumentParser) -> None:
-    """--merit and what goes with it: `merit.value.merit_for`."""
+    """--merit and what goes with it: `optimization.merit.merit_for`."""
     parser.add_argument(
         "--merit",
         metavar="KIND",
-        choices=Names("merit.default", "KINDS"),
+        choices=Names("optimization.default_merit", "KINDS"),
         help="a default merit function instead of the file's: spot (where rays land), wavefront (path differences), "
         "angular (directions behind an afocal lens) or mtf",
     )
@@ -19,10 +19,10 @@ def merit(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reading",
-        dest="readings",
+        dest="conventions",
         metavar="NAME=CHOICE",
         nargs="+",
-        help="where the meaning of an operand is open, another reading than by default: opd_tilt=common, "
+        help="where the meaning of an operand is open, another convention than the default: opd_tilt=common, "
         "opd_chief=primary, opd_sign=shorter, boundary=largest, behind_mirrors=signed, focal_length=in-air, "
         "total_track=sum, colour=second, seidel=wavefront, f_theta=axis-included",
     )
@@ -44,7 +44,8 @@ def merit(parser: argparse.ArgumentParser) -> None:
 
 
 def freedom(parser: argparse.ArgumentParser) -> None:
-    """--vary, --bounds and --hold: `merit.vary.freedom`, `merit.vary.bounds_of`, `merit.hold.conditions_of`."""
+    """--vary, --bounds and --hold: `optimization.variables.freedom`, `optimization.variables.bounds_of`,
+    `optimization.constraints.conditions_of`."""
     group = parser.add_argument_group(
         "what varies, where it is not the file's, and what holds",
         "Words in quotes: 'curvature thickness' (all surfaces that bend light, all gaps), curvature:1-4,7 conic:3 a4:3 "

@@ -329,7 +329,7 @@ def output(parser: argparse.ArgumentParser, what: str, suffixes: Iterable[str]) 
 
 def output_lens(parser: argparse.ArgumentParser, what: str) -> None:
     """-o FILE, a lens file."""
-    output(parser, what, Names("formats", "WRITTEN"))
+    output(parser, what, Names("io", "WRITTEN"))
 
 
 def output_folder(

@@ -8,7 +8,7 @@ from pathlib import Path
 from raytrace.cli.door import CommandError
 from raytrace.cli.paths import InputFile, OutputFile, OutputFolder
 from raytrace.files import check_output, check_output_folder
-from raytrace.formats import shipped_lens
+from raytrace.io import shipped_lens
 
 #: An output that may be an input: a checkpoint replaces the one that is resumed.
 _REPLACES = {("checkpoint", "resume")}

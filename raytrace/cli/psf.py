@@ -24,7 +24,7 @@ def options(parser) -> None:
     parser.add_argument(
         "--model",
         metavar="MODEL",
-        choices=Names("kernels.models", "MODELS", "auto"),
+        choices=Names("psf_models.models", "MODELS", "auto"),
         help="how much of the lens the PSF knows: paraxial, fourier, gaussian, drt or wave; auto (default) climbs "
         "until the next model changes nothing",
     )

@@ -13,7 +13,7 @@ import raytrace
 from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
 from raytrace.cli.outputs import check_outputs
 from raytrace.cli.progress import progress
-from raytrace.formats import LensFileError
+from raytrace.io import LensFileError
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
 
@@ -68,7 +68,7 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
 
 
 def takes(command: ModuleType, keyword: str) -> bool:
-    """Whether the verb of a command has a keyword; those of studies and of bench are no verbs."""
+    """Whether the verb of a command has a keyword; those of codesign, wave and bench are no verbs."""
     return _verb(command) in raytrace.PUBLIC and keyword in inspect.signature(verb_of(command)).parameters
 
 

@@ -52,5 +52,5 @@ def run(arguments):
     else:
         with Lines(count, "ray", what="trace") as lines:  # no bar: the terminal may be where the rays are written
             found.write(sys.stdout.write, lines.update)
-    for line in found.losses():
+    for line in found.failures():
         say(line)

@@ -10,7 +10,7 @@ SUMMARY = "point spread functions over depth and colour"
 DESCRIPTION = """\
 Kernels of a phase element for points on the axis, over depth and wavelength, integrated over pixels. 1 is all light
 through the aperture: `energy` is the share inside the window, `peak` that in the brightest pixel, or in a pixel centred
-on the axis, where a window of an even number of pixels has a corner. Named elements are those of `raytrace wave table`:
+on the axis, where a window of an even number of pixels has a corner. Named elements are listed under --element:
 smooth ones (ideal, singlet, …-refractive) of PMMA, wrapped ones of fused silica, all for one focus.
 
 The engine is chosen by the scene, its sampling by --tol; a sampling that would repeat the image inside the window is

@@ -11,6 +11,10 @@ Source: Clifford 1873; Griewank & Walther, Evaluating Derivatives, 2008, ch. 3 (
 from collections.abc import Callable
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import safe_sqrt
 
 
 class Dual:
@@ -112,6 +116,34 @@ def value_of(number):
 def slope_of(number, variables: int) -> np.ndarray:
     """The derivatives (n, ...) of a number by n variables; 0 where it is no dual one."""
     return number.full() if isinstance(number, Dual) else np.zeros((variables, *np.shape(number)))
+
+
+def quotient(a, b):
+    """a/b of tensors or numbers; infinite where a number b is 0."""
+    return a / b if isinstance(b, Tensor) or value_of(b) != 0 else np.inf
+
+
+def select(condition, a, b):
+    """a where a condition holds, else b: entry by entry of tensors, else one or the other number."""
+    return torch.where(condition, a, b) if isinstance(condition, Tensor) else a if condition else b
+
+
+def root(x):
+    """√x, 0 where x is negative, of a tensor, an array or dual numbers."""
+    return safe_sqrt(x) if isinstance(x, Tensor) else np.sqrt(np.maximum(x, 0.0))
+
+
+class Vector(tuple):
+    """Three numbers, arrays or dual numbers with the arithmetic of a tensor (3, ...)."""
+
+    __slots__ = ()
+    __array_ufunc__ = None
+
+    def __sub__(self, other):
+        return Vector(a - b for a, b in zip(self, other, strict=True))
+
+    def __mul__(self, factor):
+        return Vector(part * factor for part in self)
 
 
 def _dim(one: Dual, other) -> int:

@@ -19,15 +19,15 @@ def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(nonzero, numerator / torch.where(nonzero, denominator, 1.0), 0.0)
 
 
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Scalar product over the leading axis of length 3.
+def dot(a, b):
+    """Scalar product over the leading axis of length 3, of tensors or of three dual numbers each.
 
     Written out, not summed over an axis: a reduction may associate differently in batches of different shape, and
     results must not depend on how rays are batched.
     """
     ax, ay, az = a
     bx, by, bz = b
-    return torch.addcmul(ax * bx + ay * by, az, bz)
+    return torch.addcmul(ax * bx + ay * by, az, bz) if isinstance(az, Tensor) else ax * bx + ay * by + az * bz
 
 
 def dot_2(a: Tensor, b: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class Result:
 
     __slots__ = ()
 
-    #: The function that draws it, "plot.file.function"(result, **options) -> Figure.
+    #: The function that draws it, "plotting.file.function"(result, **options) -> Figure.
     FIGURE: ClassVar[str] = ""
 
     @property
@@ -60,8 +60,8 @@ class Result:
         """Units of columns, by the name of the column, of those that have one; `to_frame` has them in `attrs`."""
         return {}
 
-    to_frame = lent("formats.frame.frame_of")
-    save = lent("formats.frame.save")
+    to_frame = lent("io.frames.frame_of")
+    save = lent("io.frames.save")
 
     def document(self) -> dict:
         """The result for JSON: plain numbers, null for what is undefined."""
@@ -73,7 +73,7 @@ class Result:
             raise TypeError(f"{type(self).__name__} has no figure")
         figure = called(self.FIGURE)(self, **options)
         if path is not None:
-            called("plot.style.save")(figure, path)
+            called("plotting.style.save")(figure, path)
         return figure
 
     def __repr__(self) -> str:

@@ -13,8 +13,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.merit.model import Model
 from raytrace.optimization.least_squares import Cycle
+from raytrace.optimization.lens_model import Model
 from raytrace.system.lens import Lens
 
 _FAR = 1e3  # of the merit at the start: what a lens costs of which it is no number
@@ -43,8 +43,8 @@ class Function:
         x = np.array(x, dtype=float)
         if (known := self.known.get(x.tobytes())) is not None:
             return float(known[len(x)]), known[len(x) + 1 :].copy()
-        moment = self.view.moment(Dual(x, np.eye(len(x))))
-        (found,) = moment.through_torch(lambda lens: [self.function(lens).reshape(())], clips=True)
+        state = self.view.state(Dual(x, np.eye(len(x))))
+        (found,) = state.through_torch(lambda lens: [self.function(lens).reshape(())], clips=True)
         value, slope = float(value_of(found)), slope_of(found, len(x))
         self.evaluated.append(np.array([*x, value, *slope]))
         return value, slope

@@ -1,41 +1,116 @@
-"""Optimising: the lens whose merit function is least, from the lens as it is."""
+"""Optimising: the lens whose merit function is least, from the lens as it is.
+
+Opening: a start that most rays do not get through, opened step by step until they do.
+
+Through a small enough part of its pupil and its field light passes every lens. There the lens descends for a few
+cycles, then more is opened; what does not lose more at the next opening is kept, until no ray of the whole is lost.
+"""
 
 import dataclasses
 import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from os import PathLike
 
 import numpy as np
 import torch
 
 from raytrace.files import check_output
-from raytrace.fused import prepare
 from raytrace.maths.result import plain
-from raytrace.merit.hold import conditions_of
-from raytrace.merit.merit import Evaluated
-from raytrace.merit.model import Model
-from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, in_unit, merit_for
-from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optics.geometry import warn_of_defects
+from raytrace.optimization.attained import NotReached, reached, refuse_contradictions
 from raytrace.optimization.bfgs import Function, lowest
-from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Kept, Log, resumed
-from raytrace.optimization.glass import Choice
-from raytrace.optimization.glass_freedom import without_glass
-from raytrace.optimization.glass_pool import catalogs_of, pool_of
-from raytrace.optimization.least_squares import Cycle
-from raytrace.optimization.opening import opened
-from raytrace.optimization.paths import Course, Found, best_of_paths
-from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_of, typical_of
-from raytrace.optimization.reached import NotReached, reached, refuse_contradictions
+from raytrace.optimization.checkpoint import (
+    BadCheckpoint,
+    Checkpoint,
+    Course,
+    Found,
+    Kept,
+    Log,
+    best_of_paths,
+    is_better,
+    resumed,
+)
+from raytrace.optimization.constraints import conditions_of
+from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of, without_glass
+from raytrace.optimization.least_squares import Cycle, Manner, least_squares
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit import Merit, in_unit, merit_for
+from raytrace.optimization.merit_rows import Evaluated
+from raytrace.optimization.problem import Condition, NoProblem, Problem, optimization_data_of, typical_of
 from raytrace.optimization.result import Optimized
+from raytrace.optimization.variables import Freedom, bounds_of, freedom, name_of
 from raytrace.system.identity import digest, identity
-from raytrace.system.intent import Row, Vary
 from raytrace.system.lens import Lens, field_points
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.tracing.compiled import prepare
+from raytrace.tracing.geometry import warn_of_defects
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
+
+#: Parts of the pupil and of the field, in the order in which they are opened.
+PARTS = (0.02, 0.05, *np.geomspace(0.1, 1.0, 14).tolist())
+
+_FEW = 0.05  # of the rows: what fewer lose the descent itself brings back
+_CYCLES = 12  # at one opening
+_STEEPEST = 9.0  # curvature of what is typical: 0.9 over the radius of the beam
+_DAMPED = Manner(damping=0.1, bends=False)
+
+
+def opened(
+    problem: Problem,
+    x: np.ndarray,
+    *,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    typical: np.ndarray | None = None,
+    until: float = np.inf,
+    watch: Callable[[Cycle], None] | None = None,
+) -> np.ndarray:
+    """Variables (n,) at which less light is lost than at x; x itself where next to none is, or no way was found.
+
+    lower, upper, typical: as for `least_squares`. until: of `time.monotonic`, when it ends; watch: invoked after each
+    cycle.
+    """
+    begin = best = problem.state(x, False)
+    if begin.lost <= _FEW * (problem.evaluation.weights != 0).sum():
+        return x
+    lower, upper = _no_steeper(problem, x, lower, upper)
+    stages = [*(problem.through(part) for part in PARTS[:-1]), problem]
+    for stage, wider in pairwise(stages):
+        if time.monotonic() > until:
+            break
+        trial = _descended(stage, x, until, watch, lower=lower, upper=upper, typical=typical)
+        if trial is None or wider.state(trial, False).lost > wider.state(x, False).lost:
+            continue
+        x, whole = trial, problem.state(trial, False)
+        best = whole if whole.is_finite and is_better(whole, best) else best
+        if best.lost == 0:
+            break
+    return best.x
+
+
+def _no_steeper(problem: Problem, x: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Bounds within which the axial beam meets every sphere: a narrow part of it would let any curvature grow."""
+    bent = np.array([one.quantity == "curvature" for one in problem.model.variables])
+    steepest = np.where(bent, _STEEPEST * typical_of(problem.model), np.inf)
+    return np.maximum(lower, np.minimum(x, -steepest)), np.minimum(upper, np.maximum(x, steepest))
+
+
+def _descended(problem: Problem, x: np.ndarray, until: float, watch, **bounds) -> np.ndarray | None:
+    """Where a few cycles lead; None where numbers overflow on the way."""
+    try:
+        with np.errstate(all="ignore"):
+            each = watch and (lambda cycle, standing: watch(cycle))
+            state = least_squares(
+                problem.state, x, manner=_DAMPED, cycles=_CYCLES, until=until, watch=each, **bounds
+            ).state
+    except np.linalg.LinAlgError:
+        return None
+    return state.x if state.is_finite else None
+
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
@@ -61,7 +136,7 @@ def optimize(
     seconds: float | None = None,
     paths: int = 1,
     skip_unknown: bool = False,
-    readings: Readings | str | Sequence[str] | None = None,
+    conventions: Conventions | str | Sequence[str] | None = None,
     catalog: Sequence[str | PathLike] = (),
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
@@ -75,10 +150,12 @@ def optimize(
     belong to, as in `default.rows_of`; boundaries in mm beside it: glass_thickness, air_thickness (least, greatest),
     edge (least); or any function of a lens that gives one number (), to be least, which L-BFGS descends on.
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
-    "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
+    "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`optimization.constraints`). cycles,
+    seconds: after
     which it ends, by default 500 cycles a path; paths: how many ways of damping are tried. skip_unknown: leave rows of
-    unknown operands out; readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF
-    files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a
+    unknown operands out; conventions: of operands (`Conventions`). catalog: names of shipped catalogs, or AGF
+    files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
+    with a
     line for every cycle; checkpoint: a file (.json) that keeps all that decides the next cycle; resume: one of the same
     lens, variables and merit function, which is resumed bit-identically, cycles counted from its beginning
     (`checkpoint.py`). Ctrl-C ends with the best lens.
@@ -114,7 +191,7 @@ def optimize(
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
     )  # fmt: skip
     conditions = _conditions(lens, hold, function.unit)
-    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
+    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "conventions": conventions_of(conventions)}
     problem = Problem(model, function.rows, conditions, **of_rows)
     of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
     kept = Kept(model.start, {}) if resume is None else resumed(resume, of, names)
@@ -222,7 +299,7 @@ def _timed(evaluate: Callable):
 def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:
     if vary is None or isinstance(vary, str) or all(isinstance(one, str) for one in vary):
         return freedom(lens, vary)
-    return Freedom(lens, tuple(vary), () if lens.intent is None else lens.intent.solves)
+    return Freedom(lens, tuple(vary), () if lens.optimization_data is None else lens.optimization_data.solves)
 
 
 def _conditions(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
@@ -299,7 +376,7 @@ def _optimized(
 
     history = [[c.merit, c.missed, c.step, c.damping, c.seconds] for c in found.history]
     return Optimized(
-        lens=_with_intent(model.lens_at(x), model, rows, unit),
+        lens=_with_optimization_data(model.lens_at(x), model, rows, unit),
         before=lens,
         merit=rows,
         names=names,
@@ -343,16 +420,18 @@ def _contributions(found: Evaluated, rows: int) -> np.ndarray:
     return squares / max(squares.sum(), 1e-300)
 
 
-def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -> Lens:
+def _with_optimization_data(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -> Lens:
     """The lens with what it was optimised for, where its file says nothing of it."""
-    if lens.intent is not None:
+    if lens.optimization_data is not None:
         return lens
-    return dataclasses.replace(lens, intent=intent_of(model, rows, unit))
+    return dataclasses.replace(lens, optimization_data=optimization_data_of(model, rows, unit))
 
 
 def _with_bounds(lens: Lens, variables: Sequence[Vary], lower: np.ndarray, upper: np.ndarray) -> Lens:
-    """The lens whose variables, where its intent has them, have the bounds that held."""
+    """The lens whose variables, where its optimisation data has them, have the bounds that held."""
     ends = zip(map(float, lower), map(float, upper), strict=True)
     held = {name_of(one): pair for one, pair in zip(variables, ends, strict=True) if not np.isinf(pair).all()}
-    told = tuple(dataclasses.replace(one, bounds=held.get(name_of(one), one.bounds)) for one in lens.intent.variables)
-    return dataclasses.replace(lens, intent=dataclasses.replace(lens.intent, variables=told))
+    told = tuple(
+        dataclasses.replace(one, bounds=held.get(name_of(one), one.bounds)) for one in lens.optimization_data.variables
+    )
+    return dataclasses.replace(lens, optimization_data=dataclasses.replace(lens.optimization_data, variables=told))

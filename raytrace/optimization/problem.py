@@ -1,6 +1,16 @@
 """Problem: the rows of a merit function over a model, as the sum of squares and conditions that a solver descends on.
 
 Rows of positive weight are squared; rows of negative weight, and what is held, are conditions that are met exactly.
+
+Lost rays: how far each misses the surface that it is lost at, with derivatives, so that a descent brings it back.
+
+A ray that meets no point of a conic misses it by the negative discriminant of its crossing; one that is totally
+reflected has the sine of its refraction beyond 1:
+
+    A t² + 2 B t + C = 0,  missed by A C - B²;    (n/n')² sin² I - 1
+
+Both are without a unit and 0 where the ray just passes. At any other surface it is how far the ray stands outside the
+vertex sphere, c² r².
 """
 
 import dataclasses
@@ -8,15 +18,126 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from raytrace.merit.hold import Condition as Condition
-from raytrace.merit.merit import LOST, Evaluated, Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.readings import Readings
-from raytrace.optimization.least_squares import State
-from raytrace.optimization.lost import MARGIN, STEEP, Recovery
-from raytrace.optimization.step import Sides
-from raytrace.system.intent import Intent, Row
+from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.optimization.constraints import Condition as Condition
+from raytrace.optimization.conventions import Conventions
+from raytrace.optimization.least_squares import Sides, State
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.merit_rows import LOST, Evaluated, Evaluation
+from raytrace.optimization.ray_bundle import Bundle, Ray
 from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import OptimizationData, Row
+from raytrace.system.surface import is_posed
+
+#: How much a miss of 1 weighs beside the loss itself, and how far inside a ray is brought back.
+STEEP, MARGIN = 5.0, 0.1
+
+
+class Recovery:
+    """What is charged for the lost rays of the rows of a merit function."""
+
+    def __init__(self, evaluation: Evaluation):
+        self.evaluation = evaluation
+        self.planners = {line.number - 1: (planner, line) for planner, lines, _ in evaluation.groups for line in lines}
+        self._bundles: dict = {}
+
+    def excess(self, x: np.ndarray, rows: Sequence[int], *, derivatives: bool) -> tuple[np.ndarray, ...]:
+        """How far the rays of rows (K,), from 0, miss: (K,), by variables (K, n), and how many surfaces are left.
+
+        0 of a ray that runs along the surface, as behind a break of 90°: there is no way back that derivatives know.
+        """
+        variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
+        missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
+        for view, wanted in self._by_view(rows).items():
+            state = view.state(variables)
+            with np.errstate(all="ignore"):
+                found = [*self._missed(view, state, wanted)]
+            for place, number, left in found:
+                behind[place], slope = left, slope_of(number, len(x))
+                if np.isfinite(value_of(number)) and np.isfinite(slope).all():  # else the ray runs along the surface
+                    missed[place], slopes[place] = float(value_of(number)), slope
+        return missed, slopes, behind
+
+    def _by_view(self, rows: Sequence[int]) -> dict:
+        """For every configuration: the places in `rows` and their rays."""
+        found: dict = {}
+        for place, row in enumerate(rows):
+            planner, line = self.planners[row]
+            ray = Ray(line.wavelength, line.field, line.pupil)
+            if any(ray in bundle.rays for bundle in planner.bundles.values()):  # else a row of no ray
+                found.setdefault(planner.view, []).append((place, ray))
+        return found
+
+    def _missed(self, view, state: LensState, wanted: list[tuple[int, Ray]]):
+        """(place, how far it misses, surfaces left) of every ray that is lost on its way to the image."""
+        rays = tuple(dict.fromkeys(ray for _, ray in wanted))
+        ended, traced = self._ends(view, state, rays), {}
+        for place, ray in wanted:
+            surface = ended.get(ray)
+            if surface is None or is_posed(view.lens.surfaces[surface]):
+                continue
+            before = self._before(view, state, rays, ray, surface, traced)
+            yield place, _miss(state, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
+
+    def _ends(self, view, state: LensState, rays: tuple[Ray, ...]) -> dict[Ray, int]:
+        """The surface at which each ray is lost."""
+        ended: dict[Ray, int] = {}
+        plain = view.state(value_of(state.variables))
+        for k in range(1, len(view.lens.surfaces)):
+            bundle, numbers = self._bundle(view, k, rays)
+            valid = bundle.hits(plain).at(numbers).valid
+            ended |= {ray: k for ray, there in zip(rays, valid, strict=True) if not there and ray not in ended}
+            if len(ended) == len(rays):
+                break
+        return ended
+
+    def _bundle(self, view, last: int, rays: tuple[Ray, ...]) -> tuple[Bundle, np.ndarray]:
+        key = id(view), last, rays
+        if key not in self._bundles:
+            bundle = Bundle(view, last)
+            self._bundles[key] = bundle, np.array([bundle.ask(*ray) for ray in rays])
+        return self._bundles[key]
+
+    def _before(self, view, state: LensState, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict):
+        """Position and direction of a ray before a surface, in the axes of its vertex; traced: all rays by surface."""
+        number = rays.index(ray)
+        if surface == 1:
+            bundle, numbers = self._bundle(view, 1, rays)
+            position, direction, *_ = bundle.launched(state)
+            at = int(bundle._places[0][numbers[number]])
+            flat = [part.reshape(-1)[at] for part in (*position, *direction)]
+            return flat[:3], flat[3:]
+        bundle, numbers = self._bundle(view, surface - 1, rays)
+        if surface not in traced:
+            traced[surface] = bundle.hits(state)
+        hit = traced[surface].at(numbers[number : number + 1])
+        x, y, z = (hit.position[k][0] for k in range(3))
+        return (x, y, z - state.thickness[surface - 1]), tuple(hit.direction[k][0] for k in range(3))
+
+
+def _miss(state: LensState, surface: int, wavelength: int, position, direction):
+    """How far a ray misses a surface, or passes its critical angle."""
+    (x, y, z), (L, M, N) = position, direction
+    c, k = state.curvature[surface], state.number(surface, "conic") if _has_conic(state, surface) else 0.0
+    A = c * (1 + k * N * N)
+    B = c * (x * L + y * M + (1 + k) * z * N) - N
+    C = c * (x * x + y * y + (1 + k) * z * z) - 2 * z
+    inside = B * B - A * C
+    if value_of(inside) < 0:
+        return -inside
+    root = np.sqrt(inside)
+    t = C / (-B + np.where(value_of(B) < 0, 1.0, -1.0) * root)
+    x, y, z = x + t * L, y + t * M, z + t * N
+    steep = (c * x) ** 2 + (c * y) ** 2 + (c * (1 + k) * z - 1) ** 2
+    n = np.abs(state.index(wavelength))
+    beyond = (value_of(n[surface - 1]) / value_of(n[surface])) ** 2 * (1 - inside / steep) - 1
+    return beyond if value_of(beyond) > 0 else c * c * (x * x + y * y)
+
+
+def _has_conic(state: LensState, surface: int) -> bool:
+    return (surface, "conic") in state.numbers or state.lens.surfaces[surface].conic is not None
+
 
 #: Signs by which a relation is a limit ≤ 0; equalities have none.
 RELATIONS = {"=": 0, "<=": 1, ">=": -1}
@@ -37,16 +158,16 @@ class Problem:
         *,
         unit: float = 1.0,
         skip_unknown: bool = False,
-        readings: Readings | None = None,
+        conventions: Conventions | None = None,
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
         self._again = lambda model: Problem(
-            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, readings=readings
+            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, conventions=conventions
         )
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(
-            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
+            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, conventions=conventions
         )
         weights = self.evaluation.weights
         if not len(model.variables):
@@ -118,10 +239,10 @@ class Problem:
         return float(np.sqrt(own @ own))
 
 
-def intent_of(model: Model, rows: Sequence[Row], unit: float) -> Intent:
+def optimization_data_of(model: Model, rows: Sequence[Row], unit: float) -> OptimizationData:
     """What a lens is optimised for, where its file says nothing of it; all semi-diameters that it has stay given."""
     given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
-    return Intent(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
+    return OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
 
 
 def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:
@@ -138,8 +259,8 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
 
 def typical_of(model: Model) -> np.ndarray:
     """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
-    moment = model.views[model.lens.current_configuration - 1].moment(model.start)
-    h = 0.5 * float(moment.entrance_pupil_diameter)
+    state = model.views[model.lens.current_configuration - 1].state(model.start)
+    h = 0.5 * float(state.entrance_pupil_diameter)
     return np.array([_typical(one.quantity, h) for one in model.variables])
 
 

@@ -6,16 +6,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.formats import write_lens
+from raytrace.io import write_lens
 from raytrace.maths.result import Result, cell, number, plain
 from raytrace.maths.value import value
-from raytrace.merit.operands import OPERANDS
-from raytrace.merit.value import configurations_of
-from raytrace.optics.paraxial import first_order
-from raytrace.optimization.glass import GlassStep
-from raytrace.optimization.reached import Reached
-from raytrace.system.intent import Row
+from raytrace.optimization.attained import Reached
+from raytrace.optimization.glass_choice import GlassStep
+from raytrace.optimization.merit import configurations_of
+from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import Row
+from raytrace.tracing.paraxial import first_order
 
 #: Why a descent ends, by what is told of it.
 STOPPED = {
@@ -59,7 +59,7 @@ class Optimized(Result):
     glasses: tuple[GlassStep, ...] = ()
     conditions: tuple[Reached, ...] = ()
 
-    FIGURE = "plot.optimize.optimize_report"
+    FIGURE = "plotting.optimize.optimize_report"
 
     @property
     def rows(self) -> tuple[int, ...]:

@@ -15,30 +15,27 @@ from typing import ClassVar
 import numpy as np
 
 from raytrace.files import NotWritten, check_output_folder
-from raytrace.formats import LensFileError
-from raytrace.fused import prepare
-from raytrace.merit.default import KINDS
-from raytrace.merit.hold import Condition, conditions_of
-from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, in_unit, merit_for
-from raytrace.merit.vary import Freedom, bounds_of, freedom
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optimization.asked import Asked
-from raytrace.optimization.insertion import Insertion
+from raytrace.io import LensFileError
+from raytrace.optimization.attained import refuse_contradictions
+from raytrace.optimization.constraints import Condition, conditions_of
+from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.default_merit import KINDS
 from raytrace.optimization.journal import Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner
-from raytrace.optimization.meniscus import places_of
-from raytrace.optimization.minima import Minima, Minimum
-from raytrace.optimization.opening import opened
+from raytrace.optimization.merit import Merit, in_unit, merit_for
+from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.optimization.reached import refuse_contradictions
-from raytrace.optimization.searched import Searched, searched
-from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
+from raytrace.optimization.saddle_points import Insertion, places_of
+from raytrace.optimization.search_result import Minima, Minimum, Searched, searched
+from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
 from raytrace.optimization.starts import Space
+from raytrace.optimization.variables import Freedom, bounds_of, freedom
 from raytrace.shards import Share
-from raytrace.system.intent import Row
 from raytrace.system.lens import Lens, field_points
-from raytrace.system.naming import parse_range
+from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import parse_range
+from raytrace.tracing.compiled import prepare
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
 
 STARTS = 64
@@ -72,7 +69,7 @@ def search(
     air_thickness: str | tuple[float, float] | None = None,
     edge: float | None = None,
     skip_unknown: bool = False,
-    readings: Readings | str | Sequence[str] | None = None,
+    conventions: Conventions | str | Sequence[str] | None = None,
     starts: int | None = None,
     insert: bool | Sequence[int] | None = None,
     seconds: float | None = None,
@@ -83,7 +80,7 @@ def search(
 ) -> Searched:
     """The distinct minima of a merit function, from starts spread over all that the bounds allow; the lens is one.
 
-    merit to readings: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
+    merit to conventions: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
     which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
     more (`insertion.py`). seconds: after which it ends; seed: of all that is drawn. folder: keeps the minima as lens
@@ -107,7 +104,7 @@ def search(
         )
     glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
     ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
-    how = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
+    how = {"unit": function.unit, "skip_unknown": skip_unknown, "conventions": conventions_of(conventions)}
     asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
     until = begun + (np.inf if seconds is None else seconds)
     places = () if insert is None or insert is False else _places(free, insert, starts)

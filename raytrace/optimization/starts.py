@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
-from raytrace.merit.hold import Condition
-from raytrace.merit.model import Model
-from raytrace.merit.moment import Moment
+from raytrace.optimization.constraints import Condition
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import NoProblem
-from raytrace.system.intent import Row, Vary
-from raytrace.system.naming import sensor
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.parameter_paths import sensor
 
 STEEPEST = 3.0  # curvature of a start in units of 1/f
 _FACTORS = np.concatenate([np.geomspace(0.15, 4, 24), -np.geomspace(0.15, 4, 24)])  # of all curvatures
@@ -61,19 +61,19 @@ class Space:
     def _is_sensor(self, one: Vary) -> bool:
         return (one.surface, one.quantity) == (sensor(self.model.lens), "thickness")
 
-    def _moment(self, x: np.ndarray) -> Moment:
-        return self.model.views[self.model.lens.current_configuration - 1].moment(x)
+    def _state(self, x: np.ndarray) -> LensState:
+        return self.model.views[self.model.lens.current_configuration - 1].state(x)
 
     def _excess(self, x: np.ndarray) -> float:
         """Power beyond that of the focal length, in its units."""
-        moment = self._moment(x)
-        data = moment.gaussian(moment.primary)
+        state = self._state(x)
+        data = state.gaussian(state.primary)
         return float(-data.C / abs(data.n_image) * self.focal_length - 1)
 
     def _image_distance(self, x: np.ndarray) -> float:
-        moment = self._moment(x)
-        data = moment.gaussian(moment.primary)
-        height, omega = data.A + data.B * moment.vergence, data.C + data.D * moment.vergence
+        state = self._state(x)
+        data = state.gaussian(state.primary)
+        height, omega = data.A + data.B * state.vergence, data.C + data.D * state.vergence
         return float(-height * data.n_image / omega) if omega != 0 else np.nan
 
     def _focused(self, x: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ def _pupil_radius(model: Model, length: float) -> float:
         return 0.5 * float(aperture.value)
     if aperture.kind in ("image_f_number", "paraxial_working_f_number"):
         return 0.5 * length / float(aperture.value)
-    found = float(model.views[0].moment(model.start).entrance_pupil_diameter)
+    found = float(model.views[0].state(model.start).entrance_pupil_diameter)
     return 0.5 * found if np.isfinite(found) and found > 0 else length / 16
 
 
@@ -172,11 +172,11 @@ def length_of(model: Model, rows: Sequence[Row], unit: float, conditions: Sequen
     aimed = [row for row in rows if row.operand == "EFFL" and row.weight != 0 and row.target != 0]
     if aimed:
         return abs(aimed[0].target * unit)
-    moment = model.views[model.lens.current_configuration - 1].moment(model.start)
+    state = model.views[model.lens.current_configuration - 1].state(model.start)
     with np.errstate(divide="ignore"):
-        found = abs(float(moment.gaussian(moment.primary).effective_focal_length)) if _has_power(moment) else np.inf
+        found = abs(float(state.gaussian(state.primary).effective_focal_length)) if _has_power(state) else np.inf
     return found if np.isfinite(found) else None
 
 
-def _has_power(moment: Moment) -> bool:
-    return float(moment.gaussian(moment.primary).C) != 0
+def _has_power(state: LensState) -> bool:
+    return float(state.gaussian(state.primary).C) != 0

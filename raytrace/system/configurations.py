@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from raytrace.materials.glass import Glass, label
 from raytrace.maths.value import value
-from raytrace.media.glass import Glass, label
 
 Whole = TypeVar("Whole")
 
@@ -20,7 +20,7 @@ Whole = TypeVar("Whole")
 Path = tuple[str | int | tuple[int, ...], ...]
 
 
-class Place(NamedTuple):
+class ScaledPath(NamedTuple):
     """Where a lens holds the number of an operand: factor · number + offset, as a pickup has it."""
 
     path: Path
@@ -34,7 +34,7 @@ class Operand:
 
     name, number, parameter: as OpticStudio has it, "THIC" of surface `number`, "PRAM" of a surface and a parameter,
         "YFIE" of a field point; 0 where the operand has none.
-    places: where the lens holds it; none of an operand that says nothing about rays, as the weight of a configuration.
+    paths: where the lens holds it; none of an operand that says nothing about rays, as the weight of a configuration.
     numbers: (C,) as the lens holds them, mm or degrees, a value a configuration; or
     media: a glass each; or words: for each configuration what stands in every place.
     refusal: why it is not followed; a configuration in which it differs is refused.
@@ -43,7 +43,7 @@ class Operand:
     name: str
     number: int = 0
     parameter: int = 0
-    places: tuple = ()
+    paths: tuple = ()
     numbers: Tensor | None = None
     media: tuple[Glass, ...] = ()
     words: tuple = ()
@@ -116,8 +116,8 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
             if not 0 <= surface < len(lens.surfaces):
                 raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
             numbers = torch.as_tensor(values, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-            place = Place(("surfaces", surface, name))
-            operands.append(Operand(_NAMES[name], surface, places=(place,), numbers=numbers))
+            place = ScaledPath(("surfaces", surface, name))
+            operands.append(Operand(_NAMES[name], surface, paths=(place,), numbers=numbers))
     if len({operand.numbers.shape for operand in operands}) > 1 or any(one.numbers.ndim != 1 for one in operands):
         raise ValueError("the configurations are told by lists of values, as many for one number as for another")
     return with_operands(dataclasses.replace(lens, operands=tuple(operands)), 1)
@@ -136,7 +136,7 @@ def freed(lens: Whole, **conditions) -> Whole:
     starts = [path for name, given in conditions.items() if given is not None for path in _set_by(name, lens)]
 
     def is_set(operand: Operand) -> bool:
-        return any(place.path[: len(start)] == start for place in operand.places for start in starts)
+        return any(place.path[: len(start)] == start for place in operand.paths for start in starts)
 
     operands = (_unused(len(operand)) if is_set(operand) else operand for operand in lens.operands)
     return dataclasses.replace(lens, operands=tuple(operands))
@@ -161,7 +161,7 @@ def _unused(configurations: int) -> Operand:
 
 def _with_operand(lens: Whole, operand: Operand, k: int) -> Whole:
     """The lens with an operand at its value of configuration k, from 0."""
-    for position, (path, factor, offset) in enumerate(operand.places):
+    for position, (path, factor, offset) in enumerate(operand.paths):
         if operand.numbers is not None:
             plain = (factor, offset) == (1.0, 0.0)
             part = operand.numbers[k] if plain else factor * operand.numbers[k] + offset
@@ -172,10 +172,10 @@ def _with_operand(lens: Whole, operand: Operand, k: int) -> Whole:
 
 
 def taken(operand: Operand, lens: Whole, k: int) -> Operand:
-    """The operand that has for configuration k what the lens holds in its places."""
-    if not operand.places or operand.refusal:
+    """The operand that has for configuration k what the lens holds in its paths."""
+    if not operand.paths or operand.refusal:
         return operand
-    held = [part(lens, place.path) for place in operand.places]
+    held = [part(lens, place.path) for place in operand.paths]
     if operand.numbers is not None:
         number = torch.zeros_like(operand.numbers[k]) if held[0] is None else held[0]
         return dataclasses.replace(operand, numbers=_with_entry(operand.numbers, (k,), number))

@@ -12,10 +12,12 @@ from raytrace.system.lens import Lens
 
 #: Fields that change no ray.
 _WORDS = {
-    *("name", "notes", "comment", "catalogs", "intent", "catalog", "status", "nd_listed", "abbe_listed"),
+    *("name", "notes", "comment", "catalogs", "optimization_data", "catalog", "status", "nd_listed", "abbe_listed"),
     *("alternatives", "listed_name", "records", "wavelength_range"),
 }
 _SHOWN = ("curvature", "thickness")  # of a surface, in its identity
+#: Names that fields had when the first identities were stored: a digest hashes these, so that stored ones stay valid.
+_DIGESTED = {"sag_terms": "departure", "paths": "places"}
 
 
 def identity(lens: Lens) -> dict:
@@ -55,7 +57,10 @@ def _add(found, value: object) -> None:
         _add(found, torch.tensor(value))
     elif dataclasses.is_dataclass(value):
         found.update(type(value).__name__.encode())
-        _add(found, {field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
+        _add(
+            found,
+            {_DIGESTED.get(field.name, field.name): getattr(value, field.name) for field in dataclasses.fields(value)},
+        )
     elif isinstance(value, Mapping):
         _add(found, [(name, one) for name, one in value.items() if name not in _WORDS])
     elif isinstance(value, Sequence) and not isinstance(value, str):

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.result import lent
-from raytrace.maths.value import check_precision, value
-from raytrace.media.environment import (
+from raytrace.materials.environment import (
     REFERENCE,
     Environment,
     NoThermalCoefficients,
@@ -17,14 +15,16 @@ from raytrace.media.environment import (
     objection,
     unknown_change,
 )
-from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.materials.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.maths.result import lent
+from raytrace.maths.value import check_precision, value
 from raytrace.system import configurations as multiple
-from raytrace.system.aperture import SHAPES
+from raytrace.system.apertures import SHAPES
 from raytrace.system.conditions import APERTURE_KINDS as APERTURE_KINDS
 from raytrace.system.conditions import FIELD_UNITS as FIELD_UNITS
 from raytrace.system.conditions import RAY_AIMING, Fields, SystemAperture
 from raytrace.system.configurations import Operand
-from raytrace.system.intent import Intent
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import both_spellings, calling_level, did_you_mean
@@ -46,7 +46,7 @@ class Lens:
     environment: temperature and pressure of the lens and the air around it; None: every glass as its catalog has it.
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
-    intent: which numbers vary and follow, and the merit function, as the file has them; None where it says nothing.
+    optimization_data: variables, solves and the merit function of the file; None without any.
     """
 
     surfaces: tuple[Surface, ...]
@@ -63,7 +63,7 @@ class Lens:
     environment: Environment | None = None
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
-    intent: Intent | None = None
+    optimization_data: OptimizationData | None = None
 
     with_configurations = multiple.made
     configuration = multiple.chosen
@@ -74,8 +74,8 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
-    __str__ = lent("optics.views.text")
-    _repr_html_ = lent("plot.notebook.page")
+    __str__ = lent("tracing.lens_report.text")
+    _repr_html_ = lent("plotting.notebook.page")
 
     @both_spellings
     def at(

@@ -1,7 +1,7 @@
 """Phases: what a thin structure on a surface does to light beside Snell's law; one row for every kind.
 
 A grating, a hologram or a diffractive lens adds a path p(x, y), in mm, and its gradient to what light carries along
-the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`optics.trace`). An ideal lens bends slopes instead, and the facets
+the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`tracing.trace`). An ideal lens bends slopes instead, and the facets
 of a Fresnel lens stand on a plane. A new kind is a new value and a new row of PHASES: rays, derivatives, first order,
 variables and files read it.
 """
@@ -118,7 +118,7 @@ class IdealLens:
 
     power_x, power_y: 1/mm. vergence: 1/s, s mm from the point that is imaged sharply, in the direction of light, to the
     lens: light from there has the same path along every ray (of unequal powers only near the axis); None, or 0, for a
-    point at infinity. A lens that is traced as a whole finds it out itself: see `optics.sequence`.
+    point at infinity. A lens that is traced as a whole finds it out itself: see `tracing.trace.sequence_of`.
     opd_mode: how OpticStudio counts the path, 0 to 3; kept for the file.
     """
 

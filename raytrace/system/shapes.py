@@ -1,10 +1,15 @@
-"""Shapes: one row for every kind of sag, which holds all that the rest of the package knows of the kind.
+"""Shapes of surfaces: conic, even and odd asphere, toroid, biconic, and sag terms added to a round sag.
 
     z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y)
+    toroidal   z = g + c_x x²/(q + √(q² - c_x² x²)),  q = 1 - c_x g,  g = g(y) a conic and Σ_j a_j y^(2j)
+    biconic    z = (c_x x² + c y²)/(1 + √(1 - (1+k_x) c_x² x² - (1+k) c² y²))
 
-KINDS tells the b_j, by `Surface.kind`, or the form that a kind has in place of them and the conic; DEPARTURES tells D,
-by the class of `Surface.departure`. A new kind is a new row: rays, derivatives, first order, variables, figures, files
-and, with its terms in fused/sags.h, the compiled trace read it.
+A toroid is the curve g turned about a line along y through z = 1/c_x. Of toroid and biconic, curvature c and conic k
+are those of the section along y; the other numbers are coefficients. Beyond its edge a surface keeps the height there.
+
+KINDS has a row for each `Surface.kind`, SAG_TERMS one for each class of `Surface.sag_terms`, D(x, y). A new kind is a
+new row, which tracing, derivatives, first order, variables, figures and files read, and its terms in
+tracing/cpp/sags.h, if the compiled engine is to trace it.
 """
 
 import dataclasses
@@ -14,15 +19,20 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.system import departure as own
-from raytrace.system import freeform
-from raytrace.system.departure import FringeSag, GridSag, Sag, SplineSag, ZernikeSag
-from raytrace.system.polynomials import (
+from raytrace.maths.numerics import polynomial
+from raytrace.system.sag_terms import (
+    FringeSag,
+    GridSag,
     IrregularSag,
     PolynomialSag,
     PowerSag,
+    Sag,
+    SplineSag,
     TiltSag,
+    ZernikeSag,
     as_polynomial,
+    fringe_sag,
+    fringe_size,
     polynomial_sag,
     polynomial_size,
     power_sag,
@@ -30,15 +40,198 @@ from raytrace.system.polynomials import (
     powers_of_fringe,
     powers_of_polynomial,
     powers_of_zernike,
+    spline,
+    spline_covers,
+    spline_sag,
+    spline_size,
+    zernike_sag,
+    zernike_size,
 )
-from raytrace.system.terms import Terms, conic_terms, even_terms, odd_terms
 
 EVEN = "even asphere"
+_TIP = 1e-24  # mm²: r² up to which a ray goes through the vertex
+
+
+#: What terms add to a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope
+#: and f² times its second derivative; None for those above the highest. The b_j are at least 0.
+Terms = Callable[[Tensor, Tensor, int, Tensor | float], tuple[Tensor, Tensor | None, Tensor | None]]
+
+
+def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+    """b_j = u^j, as `Terms`."""
+    P = u * polynomial(coefficients, u)
+    if highest == 0:
+        return P, None, None
+    order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
+    first = order.reshape(-1, *(1,) * (coefficients.dim() - 1)) * coefficients
+    dP = polynomial(first, u)
+    if highest == 1:
+        return P, dP, None
+    second = (order - 1).reshape(-1, *(1,) * (coefficients.dim() - 1)) * first
+    return P, dP, polynomial(second[1:], u) * along * along
+
+
+def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+    """b_j = r^j, as `Terms`: those of even j, and r q(u) with q = a_1 + a_3 u + …
+
+    The cone a_1 r has no slope at its tip: a ray through the vertex sees the mean of all directions, 0.
+    """
+    S, dS, d2S = even_terms(u, coefficients[1::2], highest, along)
+    q, dq, d2q = even_terms(u, coefficients[2::2], highest, along)
+    q = coefficients[0] + q
+    apart = u > _TIP
+    r = torch.sqrt(torch.where(apart, u, 1.0))
+    dr, r = torch.where(apart, 0.5 / r, 0.0), torch.where(apart, r, 0.0)
+    S = S + r * q
+    if highest == 0:
+        return S, None, None
+    dS = dS + dr * q + r * dq
+    if highest == 1:
+        return S, dS, None
+    turn = dr * along
+    return S, dS, d2S + r * d2q + 2 * turn * (dq * along) - 2 * dr * turn * turn * q
+
+
+def conic_terms(
+    u: Tensor, c: Tensor, conic: Tensor | None, highest: int, along: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """S = c u/(1+w), w = √(1 - (1+k) c² u); dS = c/2w, v² d²S = v² (1+k) c³/4w³; those above `highest` are 0."""
+    shape = 1.0 if conic is None else 1 + conic
+    radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
+    w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
+    S = c * u / (1 + w)
+    dS = d2S = torch.zeros_like(u)
+    if highest > 0:
+        dS = 0.5 * c / w
+    if highest > 1:
+        tilt = c * along / w
+        d2S = 0.25 * shape * c / w * tilt * tilt
+    return S, dS, d2S
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """A sag of x and y, by functions of curvature c (...), conic k (...), coefficients a (m, ...), and points (...) mm.
+
+    sag: with its derivatives up to the highest; covers: where there is a surface, on the sheet of the vertex;
+    extent: of c, k, a and a limit (...) mm, how far that sheet goes along x and y, at most to the limit;
+    size: of c, a and points, what the sag adds up from, by which its rounding is judged.
+    """
+
+    sag: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, int], Sag]
+    covers: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+    extent: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+    size: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
+def _section(c: Tensor, k: Tensor, a: Tensor, y: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
+    """g(y), g' and g''."""
+    S, dS, d2S = conic_terms(y * y, c, k, highest, y)
+    if len(a):
+        P, dP, d2P = even_terms(y * y, a, highest, y)
+        S, dS, d2S = S + P, dS if dP is None else dS + dP, d2S if d2P is None else d2S + d2P
+    return S, 2 * dS * y, 2 * dS + 4 * d2S
+
+
+def _toroid(c, k, a, x, y, highest: int) -> Sag:
+    """w = 1 - c_x z gives w z_x = c_x x and w z_y = q g', and these the second derivatives."""
+    c_x, zero = a[0], torch.zeros_like(x * y)
+    g, dg, d2g = _section(c, k, a[1:], y, highest)
+    p, q = c_x * x, 1 - c_x * g
+    inside = (q > 0) & (q > p.abs())
+    q = torch.where(inside, q, 1.0)
+    p = torch.where(inside, p, 0.0)
+    w = torch.sqrt((q - p) * (q + p))
+    edge = 1 / torch.where(inside, 1.0, c_x)
+    z = torch.where(inside, g + x * p / (q + w), edge)
+    if highest == 0:
+        return Sag(z, *(zero,) * 5)
+    dg = torch.where(inside, dg, 0.0)
+    z_x, z_y = p / w, q / w * dg
+    if highest == 1:
+        return Sag(z, z_x, z_y, *(zero,) * 3)
+    turn = c_x / w
+    z_yy = torch.where(inside, q / w * d2g, 0.0) + turn * (z_y * z_y - dg * dg)
+    return Sag(z, z_x, z_y, turn * (1 + z_x * z_x), turn * z_x * z_y, z_yy)
+
+
+def _toroid_covers(c, k, a, x, y) -> Tensor:
+    g, *_ = _section(c, k, a[1:], y, 0)
+    q = 1 - a[0] * g
+    return (1 - (1 + k) * (c * (c * (y * y))) > 0) & (q > 0) & (q > (a[0] * x).abs())
+
+
+def _toroid_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
+    along_y = _edge(c, k, limit)
+    y = torch.linspace(0, 1, 17, dtype=c.dtype, device=c.device).reshape(-1, *(1,) * along_y.dim()) * along_y
+    q = 1 - a[0] * _section(c, k, a[1:], y * (1 - 1e-8), 0)[0]
+    reach = q.amax(0) / torch.where(a[0] == 0, 1.0, a[0]).abs()
+    return torch.where((a[0] != 0) & (reach < limit), reach, limit), along_y
+
+
+def _biconic(c, k, a, x, y, highest: int) -> Sag:
+    """z (1 + w) = c_x x² + c y², derived twice; w w_x = -(1+k_x) c_x² x."""
+    c_x, shape_x, shape_y = a[0], 1 + a[1], 1 + k
+    zero = torch.zeros_like(x * y)
+    p, q = c_x * x, c * y
+    radicand = 1 - shape_x * (p * p) - shape_y * (q * q)
+    inside = radicand > 0
+    root = torch.sqrt(torch.where(inside, radicand, 1.0))
+    z = (x * p + y * q) / (1 + torch.where(inside, root, 0.0))
+    if highest == 0:
+        return Sag(z, *(zero,) * 5)
+    over_w = torch.where(inside, 1 / root, 0.0)
+    share = 1 / (1 + torch.where(inside, root, 0.0))
+    w_x, w_y = -shape_x * c_x * p * over_w, -shape_y * c * q * over_w
+    z_x, z_y = (2 * p - z * w_x) * share, (2 * q - z * w_y) * share
+    if highest == 1:
+        return Sag(z, z_x, z_y, *(zero,) * 3)
+    w_xx, w_yy = -(shape_x * c_x * c_x + w_x * w_x) * over_w, -(shape_y * c * c + w_y * w_y) * over_w
+    w_xy = -w_x * w_y * over_w
+    return Sag(
+        z,
+        z_x,
+        z_y,
+        (2 * c_x - 2 * z_x * w_x - z * w_xx) * share,
+        -(z_x * w_y + z_y * w_x + z * w_xy) * share,
+        (2 * c - 2 * z_y * w_y - z * w_yy) * share,
+    )
+
+
+def _biconic_covers(c, k, a, x, y) -> Tensor:
+    p, q = a[0] * x, c * y
+    return 1 - (1 + a[1]) * (p * p) - (1 + k) * (q * q) > 0
+
+
+def _biconic_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
+    """A section that stays open along one axis moves the edge along the other one out."""
+    open_x, open_y = (
+        torch.sqrt(1 + (-(1 + conic) * (bend * limit) ** 2).clamp_min(0.0)) for bend, conic in ((a[0], a[1]), (c, k))
+    )
+    return (_edge(a[0], a[1], limit) * open_y).minimum(limit), (_edge(c, k, limit) * open_x).minimum(limit)
+
+
+def _size(c, a, x, y, terms: Tensor | float = 0.0) -> Tensor:
+    return (c * y * y).abs() + (a[0] * x * x).abs() + terms
+
+
+def _toroid_size(c, a, x, y) -> Tensor:
+    return _size(c, a, x, y, even_terms(y * y, a[1:].abs(), 0, 1.0)[0])
+
+
+def _edge(c: Tensor, k: Tensor, limit: Tensor) -> Tensor:
+    """Where a conic closes, at most the limit."""
+    closed = (1 + k) * c * c
+    return torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), limit).minimum(limit)
+
+
+TOROIDAL = Form(_toroid, _toroid_covers, _toroid_extent, _toroid_size)
+BICONIC = Form(_biconic, _biconic_covers, _biconic_extent, _size)
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of sag: of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or of a form of its own.
+    """A kind of sag: of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or of a form of its
 
     terms: the sum and its derivatives.
     form: the whole sag of a kind that is not round; curvature and conic are those of its section along y.
@@ -47,12 +240,12 @@ class Kind:
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
-    code: the kind in fused/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
+    code: the kind in tracing/cpp/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
     name: str
     terms: Terms = even_terms
-    form: freeform.Form | None = None
+    form: Form | None = None
     heads: tuple[str, ...] = ()
     least: int = 0
     most: int | None = None
@@ -88,7 +281,7 @@ KINDS = {
         Kind(
             "toroidal",
             zemax="TOROIDAL",
-            form=freeform.TOROIDAL,
+            form=TOROIDAL,
             heads=("curvature_x",),
             least=1,
             most=8,
@@ -98,7 +291,7 @@ KINDS = {
         Kind(
             "biconic",
             zemax="BICONICX",
-            form=freeform.BICONIC,
+            form=BICONIC,
             heads=("curvature_x", "conic_x"),
             least=2,
             most=2,
@@ -109,12 +302,12 @@ KINDS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class DepartureKind:
+class SagTermKind:
     """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
 
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
-    prepare: to the departure whose tensors are the numbers; is_round: about the axis.
+    prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
     powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
     traced by torch alone.
     """
@@ -124,50 +317,50 @@ class DepartureKind:
     covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda numbers, x, y: torch.ones_like(
         x, dtype=torch.bool
     )
-    prepare: Callable = lambda departure: departure
+    prepare: Callable = lambda sag_terms: sag_terms
     is_round: bool = False
     powers: Callable | None = None
     compiled: int | None = None
 
 
-DEPARTURES = {
-    "GridSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
-    "SplineSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers),
-    "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size, powers=powers_of_zernike, compiled=91),
-    "FringeSag": DepartureKind(own.fringe_sag, own.fringe_size, powers=powers_of_fringe, compiled=37),
-    "PolynomialSag": DepartureKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
-    "IrregularSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "TiltSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "PowerSag": DepartureKind(power_sag, power_size, powers=lambda departure: departure),
+SAG_TERMS = {
+    "GridSag": SagTermKind(spline_sag, spline_size, spline_covers, prepare=spline),
+    "SplineSag": SagTermKind(spline_sag, spline_size, spline_covers),
+    "ZernikeSag": SagTermKind(zernike_sag, zernike_size, powers=powers_of_zernike, compiled=91),
+    "FringeSag": SagTermKind(fringe_sag, fringe_size, powers=powers_of_fringe, compiled=37),
+    "PolynomialSag": SagTermKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
+    "IrregularSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "TiltSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "PowerSag": SagTermKind(power_sag, power_size, powers=lambda sag_terms: sag_terms),
 }
 
-Departure = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
+SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
 
 
 @dataclasses.dataclass(frozen=True)
 class Relief:
-    """A departure made ready for rays: its row, by the name of its class, and its numbers."""
+    """sag terms made ready for rays: its row, by the name of its class, and its numbers."""
 
     kind: str
     numbers: Sequence[Tensor]
 
     def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
         """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
-        return DEPARTURES[self.kind].sag(self.numbers, x, y, highest)
+        return SAG_TERMS[self.kind].sag(self.numbers, x, y, highest)
 
     def covers(self, x: Tensor, y: Tensor) -> Tensor:
         """Whether there is a surface at points (...) mm."""
-        return DEPARTURES[self.kind].covers(self.numbers, x, y)
+        return SAG_TERMS[self.kind].covers(self.numbers, x, y)
 
     def size(self, radius: Tensor) -> Tensor:
         """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
-        return DEPARTURES[self.kind].size(self.numbers, radius)
+        return SAG_TERMS[self.kind].size(self.numbers, radius)
 
 
-def relief(departure: Departure) -> Relief:
-    """A departure made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
-    name = type(departure).__name__
-    return Relief(name, [number.double() for number in tree_leaves(DEPARTURES[name].prepare(departure))])
+def relief(sag_terms: SagTerms) -> Relief:
+    """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
+    name = type(sag_terms).__name__
+    return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])
 
 
 def sag_and_derivatives(

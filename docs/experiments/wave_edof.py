@@ -1,0 +1,591 @@
+"""Extended depth of field: every baseline and the designed elements, on several kinds of pictures.
+
+    python docs/experiments/wave_edof.py --data DIR --limit 60 --steps 150 --starts 5 -o FOLDER --docs docs
+
+PSNR of restored pictures over 0.5 m to infinity behind two filters: the Wiener filter of the PSF at 1 m with the best
+constant, and the best depth-invariant one. Designed elements are stored in FOLDER and read again. Sitzmann et al.
+(SIGGRAPH 2018), who defined the task, give the PSNR of restored pictures for six elements; their pictures, filters and
+prescriptions differ, so that gains over the Fresnel lens are compared.
+"""
+
+import argparse
+import dataclasses
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from raytrace.cli import wave_design
+from raytrace.cli.door import CommandError, say
+from raytrace.cli.options import json, output_folder
+from raytrace.cli.progress import progress
+from raytrace.cli.run import present
+from raytrace.cli.settings import add_options, defaults_of, documents, picture_options, picture_words, words
+from raytrace.cli.wave_design import LIMIT, PICTURES
+from raytrace.cli.wave_design_run import LEAVES, WIDE, learn, training_pictures
+from raytrace.experiments import publish
+from raytrace.files import table as csv
+from raytrace.imaging.image import blur_layers, depth_masks
+from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
+from raytrace.imaging.restoration import depth_invariant_wiener, psnr, restore
+from raytrace.imaging.wave_camera import (
+    FILTERS,
+    Judged,
+    Quality,
+    WaveCameraConfig,
+    depth_text,
+    expected_error,
+    kernels,
+    mirrored,
+    periodic,
+    quality,
+    spectrum,
+    transfer,
+)
+from raytrace.maths.result import Result, plain
+from raytrace.pages import grid, picture
+from raytrace.plotting.images import show_image
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
+from raytrace.plotting.wave_design import mark_depths
+from raytrace.settings import DesignSettings
+from raytrace.wave_optics.designs import Aim, aim, baseline
+from raytrace.wave_optics.element import Element, height_range
+from raytrace.words import did_you_mean
+
+_LEARNED = ("learned", "learned-16", "learned-smooth")
+
+
+#: Figures of the page, by file name: what each shows.
+CAPTIONS = {
+    "gain.png": "Gains over the Fresnel lens, by content and filter, beside those that Sitzmann et al. published.",
+    "depth.png": "PSNR over depth behind the best linear filter that does not know the depth.",
+    "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (depth-invariant "
+    "filter).",
+    "deep.png": "A scene from 0.5 m (below) to infinity (above) in nine layers, near leaves hiding far ones.",
+    "learned.png": "The learned element: rings of fused silica, its PSFs over depth and colour, its PSNR.",
+    "learned-smooth.png": "The learned smooth element of PMMA.",
+}
+_SHOWN = ("fresnel", "singlet", "ideal", "cubic-refractive", "learned")  # in the scenes
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """title: what it is called; published: PSNR in dB by Sitzmann et al.; learning: settings it is learned with, else
+    it is the baseline of its name; is_extra: only there where it is asked for."""
+
+    title: str
+    published: float | None = None
+    learning: dict | None = None
+    is_extra: bool = False
+
+
+_FROM_PICTURES = {"kind": "rings", "loss": "images", "restoration": "towards"}
+_ADADELTA = {"optimizer": "adadelta", "schedule": "constant", "rate": 1.0}
+
+ROWS = {
+    "fresnel": Row("Fresnel lens", 17.95),
+    "multifocal": Row("multifocal Fresnel lens", 18.32),
+    "cubic": Row("cubic plate on a Fresnel lens", 18.33),
+    "hybrid": Row("hybrid achromat", 18.92),
+    "achromat": Row("diffractive achromat", 20.20),
+    "singlet": Row("PMMA singlet"),
+    "ideal": Row("ideal lens without dispersion"),
+    "multifocal-refractive": Row("multifocal PMMA lens"),
+    "cubic-refractive": Row("cubic plate on a PMMA lens"),
+    "learned-smooth": Row("learned, smooth PMMA", learning={"kind": "smooth", "glass": "PMMA"}),
+    "learned": Row("learned, fused silica rings", 24.30, {"kind": "rings"}),
+    "learned-16": Row("learned, wrapped, 16 levels", learning={"kind": "rings", "levels": 16}),
+    "learned-images": Row("rings, learned from pictures", learning=_FROM_PICTURES, is_extra=True),
+    "learned-adadelta": Row("rings, from pictures by Adadelta", learning=_FROM_PICTURES | _ADADELTA, is_extra=True),
+    "learned-zernike": Row(
+        "learned, Zernike PMMA, by Adadelta",
+        learning={"kind": "zernike", "glass": "PMMA", "terms": 22, "spread": 0.05, **_ADADELTA},
+        is_extra=True,
+    ),
+}
+
+
+def title_of(row: str) -> str:
+    """Of a row of the table, or of a file."""
+    return ROWS[row].title if row in ROWS else row
+
+
+#: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
+STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Content:
+    """Pictures (B, n, n), periodic: to make filters for, and to restore; classes: of those, each its own by default."""
+
+    name: str
+    train: Tensor
+    test: Tensor
+    classes: tuple[str, ...] = ()
+
+
+def elements_of(
+    rows: Iterable[str], world: WaveCameraConfig, S: Tensor, *, learned: Mapping[str, Sequence[Element]]
+) -> dict[str, Sequence[Element]]:
+    """The elements of rows, in the order of the table: learned ones as given, those that are not there left out.
+
+    Cubic plates have the strength that is best for pictures of spectrum S (n, n) on the PMMA lens, searched once.
+    """
+    made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
+    named = [name for name in ROWS if name in set(rows)]
+    options = {}
+    if any(name.startswith("cubic") for name in named):
+        options = {"strength": min(STRENGTHS, key=lambda own: _error_of_cubic(own, made_for, world, S))}
+    found = {}
+    for name in named:
+        if ROWS[name].learning is None:
+            found[name] = baseline(name, made_for, **(options if name.startswith("cubic") else {}))
+        elif name in learned:
+            found[name] = learned[name]
+    return found
+
+
+def _error_of_cubic(strength: float, made_for: Aim, world: WaveCameraConfig, S: Tensor) -> float:
+    elements = baseline("cubic-refractive", made_for, strength=strength)
+    return float(expected_error(transfer(kernels(elements, world), S.shape[-1]), S, world.noise))
+
+
+def table_of(
+    contents: Sequence[Content],
+    elements: Mapping[str, Sequence[Element]],
+    world: WaveCameraConfig,
+    *,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> dict[str, dict[str, Quality]]:
+    """Quality by content and row, of the elements of each row."""
+    found: dict[str, dict[str, Quality]] = {content.name: {} for content in contents}
+    for name in progress(list(elements)):
+        own = kernels(elements[name], world)
+        for content in contents:
+            found[content.name][name] = quality(
+                elements[name], world, train=content.train, test=content.test, found=own
+            )
+    return found
+
+
+def records(found: Mapping[str, Mapping[str, Quality]]) -> list[dict]:
+    """The table, a row for each content and element; gains over the Fresnel lens, dB."""
+    result = []
+    for content, rows in found.items():
+        base = rows.get("fresnel")
+        for name, own in rows.items():
+            gains = {f"gain_{filter}": own.mean[filter] - base.mean[filter] if base else None for filter in own.mean}
+            each = {f"mean_{filter}": value for filter, value in own.of_pictures.items()}
+            each |= {
+                f"mean_gain_{filter}": value - base.of_pictures[filter] if base else None
+                for filter, value in own.of_pictures.items()
+            }
+            spread = {"spread_blind": own.spread["blind"], "worst_blind": min(own.by_depth["blind"])}
+            head = {"content": content, "row": name}
+            result.append({**head, **own.mean, **gains, **each, **spread, "published": ROWS[name].published})
+    return result
+
+
+# -- scenes of dead leaves, restored -----------------------------------------------------------------------------------
+
+_KEY = 99  # of what is drawn
+_LAYERS = 9  # of a deep scene, even in dioptres
+
+
+@dataclasses.dataclass(frozen=True)
+class Deep:
+    """A scene from the nearest to the farthest depth: picture (h, w, 3), dioptres (h, w).
+
+    seen, restored: by row what the sensor saw and what was made of it, (h, w, 3) each, with the PSNR.
+    """
+
+    picture: np.ndarray
+    dioptres: np.ndarray
+    seen: dict[str, np.ndarray]
+    restored: dict[str, tuple[np.ndarray, float]]
+
+
+def coloured_leaves(size: int, *, colours: int = 3, seed: int = 0) -> np.ndarray:
+    """Dead leaves (colours, size, size) that end at one place in all colours: a colour for every shade of grey."""
+    leaves = dead_leaves(1, size=size, seed=seed + _KEY, smallest=4.0).samples[0]
+    return np.stack([table[leaves] for table in draws(seed, _KEY).uniform(0.05, 0.95, (colours, 256))])
+
+
+@torch.no_grad()
+def flat(
+    elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, seed: int = 0
+) -> tuple[dict[str, dict[str, tuple[np.ndarray, float]]], np.ndarray]:
+    """A scene at the nearest, the middle and the farthest depth: by row and depth what is restored, with its PSNR; and
+    the scene.
+    """
+    size, part = 512, slice(40, 200)
+    leaves = coloured_leaves(size // 2, colours=len(world.wavelengths), seed=seed)
+    picture = torch.as_tensor(np.stack([mirrored(colour) for colour in leaves]))
+    S, noise = spectrum(picture), noise_like(picture, world, seed)
+    found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
+    for name, own in elements.items():
+        H = transfer(kernels(own, world), size)
+        G = depth_invariant_wiener(H, S, world.noise)
+        found[name] = {}
+        for d in (0, len(H) // 2, len(H) - 1):
+            estimate = torch.fft.ifft2(torch.fft.fft2(torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise) * G)
+            ratio = float(psnr((estimate.real - picture).square().mean()))
+            found[name][depth_text(world.depths[d])] = shown(estimate.real[:, part, part]), ratio
+    return found, shown(picture[:, part, part])
+
+
+@torch.no_grad()
+def deep(elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, seed: int = 0) -> Deep:
+    """Leaves on a floor from the nearest depth, below, to the farthest, above; near layers hide far ones."""
+    size, half = 320, world.size // 2
+    picture = torch.as_tensor(coloured_leaves(size + 2 * half, colours=len(world.wavelengths), seed=seed))
+    dioptres = [1e3 / depth for depth in world.depths]
+    rise = torch.linspace(min(dioptres), max(dioptres), size, dtype=picture.dtype)
+    depth = torch.cat([rise.new_full((half,), float(rise[0])), rise, rise.new_full((half,), float(rise[-1]))])
+    depth = depth[:, None].expand(picture.shape[1:])
+    planes = torch.linspace(min(dioptres), max(dioptres), _LAYERS, dtype=picture.dtype)
+    masks = depth_masks(depth, planes, softness=0.1 * float(planes[1] - planes[0]))
+    truth, S = picture[:, half:-half, half:-half], spectrum(picture)
+    seen, back = {}, {}
+    depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
+    for name, own in elements.items():
+        found = kernels(own, world, depths=depths)
+        # What misses the window comes back as haze, even over the scene.
+        haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
+        image = blur_layers(picture, masks, found.kernel) + haze
+        image = image + noise_like(image, world, seed)
+        G = depth_invariant_wiener(transfer(found, picture.shape[-1]), S, world.noise)
+        estimate = restore(image, G, boundary="taper")
+        seen[name] = shown(image)
+        back[name] = shown(estimate), float(psnr((estimate - truth).square().mean()))
+    return Deep(shown(truth), depth[half:-half, half:-half].numpy(), seen, back)
+
+
+def noise_like(like: Tensor, world: WaveCameraConfig, seed: int) -> Tensor:
+    random = torch.Generator().manual_seed(seed)
+    return world.noise * torch.randn(like.shape, generator=random, dtype=like.dtype)
+
+
+def shown(picture: Tensor) -> np.ndarray:
+    return picture.flip(0).movedim(0, -1).numpy()
+
+
+# -- figures -----------------------------------------------------------------------------------------------------------
+
+
+@styled
+def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: WaveCameraConfig) -> Figure:
+    """PSNR behind the depth-invariant filter over depth in dioptres, a panel for each content, a line for each row."""
+    figure = new_figure(3.1 * len(found) + 1.9, 3.8)
+    axes = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
+    dioptres = [1e3 / depth for depth in world.depths]
+    for panel, (content, rows) in zip(axes, found.items(), strict=True):
+        for name, own in rows.items():
+            panel.plot(dioptres, own.by_depth["blind"], label=ROWS[name].title, **look(name, list(rows)))
+        panel.set(title=content, xlabel="object distance")
+        mark_depths(panel, world)
+    axes[0].set_ylabel("PSNR, depth-invariant filter (dB)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
+    return figure
+
+
+@styled
+def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
+    """Gains over the Fresnel lens: of every content and both filters, and those that Sitzmann et al. published."""
+    rows = [name for name in next(iter(found.values())) if name != "fresnel"]
+    figure = new_figure(7.6, 0.42 * len(rows) + 1.1)
+    axes = figure.subplots()
+    place = np.arange(len(rows))[::-1]
+    marks = {"wiener": "o", "blind": "s"}
+    for number, (content, own) in enumerate(found.items()):
+        for filter, mark in marks.items():
+            gain = [own[name].mean[filter] - own["fresnel"].mean[filter] for name in rows]
+            label = f"{content}, {'1 m Wiener' if filter == 'wiener' else 'depth-invariant'} filter"
+            face = FIELD_COLOURS[number] if filter == "blind" else "white"
+            axes.plot(gain, place, mark, ms=5.5, mfc=face, mec=FIELD_COLOURS[number], label=label)
+    published = [
+        (ROWS[name].published - ROWS["fresnel"].published, y)
+        for name, y in zip(rows, place, strict=True)
+        if ROWS[name].published
+    ]
+    axes.plot(*zip(*published, strict=True), "|", ms=15, mew=2, color=INK, label="Sitzmann 2018")
+    axes.set_yticks(place, [ROWS[name].title for name in rows])
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.axvline(0, color=GREY, lw=0.8)
+    axes.set(xlabel="mean PSNR over that of the Fresnel lens (dB)")
+    figure.legend(loc="outside upper center", ncols=2, fontsize=7.5)
+    return figure
+
+
+@styled
+def scene_figure(columns: Mapping[str, Mapping[str, tuple[np.ndarray, float]]], picture: np.ndarray) -> Figure:
+    """Restored scenes: a column for each row of the table, a line for each depth; the picture itself in front.
+
+    columns: name -> what it shows -> (picture (h, w, 3), its PSNR).
+    """
+    shown = list(next(iter(columns.values())))
+    figure = new_figure(1.55 * (len(columns) + 1), 1.62 * len(shown) + 0.3)
+    axes = figure.subplots(len(shown), len(columns) + 1, squeeze=False)
+    for line, name in enumerate(shown):
+        _show(axes[line, 0], picture, "scene" if line == 0 else "")
+        axes[line, 0].set_ylabel(name, fontsize=8)
+        for column, (row, cells) in enumerate(columns.items(), 1):
+            image, ratio = cells[name]
+            _show(axes[line, column], image, _title(row) if line == 0 else "")
+            axes[line, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
+    return figure
+
+
+@styled
+def deep_figure(found: Deep) -> Figure:
+    """A scene in depth: above what the sensors saw, below what was restored; in front the scene and its depth."""
+    figure = new_figure(1.9 * (len(found.seen) + 1), 4.3)
+    axes = figure.subplots(2, len(found.seen) + 1, squeeze=False)
+    _show(axes[0, 0], found.picture, "scene")
+    shades = axes[1, 0].imshow(found.dioptres, cmap="cividis")
+    axes[1, 0].set(xticks=[], yticks=[])
+    axes[1, 0].set_title("depth", fontsize=7.5)
+    bar = figure.colorbar(shades, ax=axes[1, 0], location="bottom", fraction=0.06, pad=0.04)
+    marks = [mark for mark in (0, 0.5, 1, 1.5, 2) if found.dioptres.min() <= mark <= found.dioptres.max()]
+    bar.set_ticks(marks, labels=["∞" if mark == 0 else f"{1 / mark:.2g} m" for mark in marks], fontsize=6.5)
+    for column, name in enumerate(found.seen, 1):
+        _show(axes[0, column], found.seen[name], _title(name))
+        image, ratio = found.restored[name]
+        _show(axes[1, column], image, "")
+        axes[1, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
+    axes[0, 1].set_ylabel("sensor", fontsize=8)
+    axes[1, 1].set_ylabel("restored", fontsize=8)
+    return figure
+
+
+def _show(axes: Axes, picture: np.ndarray, title: str) -> None:
+    show_image(axes, np.clip(picture, 0, 1), title)
+
+
+def _title(name: str) -> str:
+    return ROWS[name].title.replace(", ", ",\n")
+
+
+def look(name: str, rows: Sequence[str]) -> dict:
+    if name in _LEARNED:
+        style = ("-", "--", ":")[_LEARNED.index(name)]
+        return {"color": FIELD_COLOURS[2], "lw": 2, "ls": style, "marker": "o", "ms": 3.5}
+    colours = [colour for colour in FIELD_COLOURS if colour != FIELD_COLOURS[2]]
+    number = [row for row in rows if row not in _LEARNED].index(name)
+    style = ("-", "--", ":")[number // len(colours) % 3]
+    return {"color": colours[number % len(colours)], "lw": 1.2, "ls": style}
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Table(Result):
+    """Quality by content and row."""
+
+    found: dict[str, dict[str, Quality]]
+
+    def document(self) -> dict:
+        return {"rows": plain(records(self.found))}
+
+    def rows(self, content: str) -> Iterator[tuple]:
+        """Of each row its record, its quality, and PSNR by filter and as published, gains over the Fresnel lens beside
+        them: of pooled errors, then as the mean of the PSNRs of pictures."""
+        base = ROWS["fresnel"].published
+        for record in records({content: self.found[content]}):
+            columns = [(f"{mean}{filter}", f"{mean}gain_{filter}") for mean in ("", "mean_") for filter in FILTERS]
+            published = record["published"]
+            yield (
+                record,
+                self.found[content][record["row"]],
+                *(
+                    f"{record[one]:.2f}" + ("" if record[gain] is None else f" ({record[gain]:+.2f})")
+                    for one, gain in columns
+                ),
+                f"{published:.2f} ({published - base:+.2f})" if published else "",
+            )
+
+    def __str__(self) -> str:
+        text = []
+        for content in self.found:
+            text.append(
+                f"{content}: PSNR of restored pictures, dB (gain over the Fresnel lens); errors pooled over "
+                "pictures, then the mean of their PSNRs"
+            )
+            text.append(
+                f"{'':>32}" + 2 * f" {'Wiener':>14} {'invariant':>14}" + f" {'spread':>7} {'Sitzmann 2018':>14}"
+            )
+            for record, _, *cells, published in self.rows(content):
+                title, spread = ROWS[record["row"]].title, record["spread_blind"]
+                shown = "".join(f" {cell:>14}" for cell in cells)
+                text.append(f"{title:>32}{shown} {spread:>7.2f} {published:>14}")
+            text.append("")
+        return "\n".join(text)
+
+    def markdown(self, content: str) -> str:
+        means = ("Wiener, 1 m", "depth-invariant", "Wiener, mean of PSNRs", "depth-invariant, mean of PSNRs")
+        header = ("element", *means, "worst", "spread", "light in window", "Sitzmann 2018")
+        lines = []
+        for record, own, *psnrs, published in self.rows(content):
+            base = record["row"] == "fresnel"
+            cells = [cell.partition(" ")[0] if base else cell for cell in psnrs]
+            numbers = (record["worst_blind"], record["spread_blind"], min(min(row) for row in own.energy))
+            cells += [*(f"{number:.2f}" for number in numbers), published or "–"]
+            lines.append([ROWS[record["row"]].title, *cells])
+        return grid(header, lines)
+
+
+def edof(arguments: argparse.Namespace) -> Table:
+    """Every row on every content; the page where --docs asks for it."""
+    for option, given in (("rows", arguments.rows), ("also", arguments.also)):
+        unknown = sorted(set(given or ()) - set(ROWS))
+        if unknown:
+            meant = did_you_mean(unknown[0], ROWS)
+            raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(ROWS)}{meant}")
+    usual = (name for name, row in ROWS.items() if not row.is_extra)
+    rows, world = [*(arguments.rows or usual), *(arguments.also or ())], WaveCameraConfig()
+    contents, train = contents_of(arguments)
+    learned = _learned(arguments, rows, world, train)
+    elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
+    found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
+    if arguments.docs:
+        drawn = _figures(found, elements, world, arguments.seed or 0)
+        named = [name for name in CAPTIONS if name in drawn]
+        single = {title_of(name): own[0] for name, own in elements.items() if name in learned and len(own) == 1}
+        parts = _parts(Table(found), contents, world, _command(arguments), named, single)
+        rows = {"table.csv": csv(records(found), floats=lambda number: round(number, 3))}
+        publish(Path(arguments.docs) / "wave_edof.md", "wave", parts, tables=rows, figures=drawn)
+    return Table(found)
+
+
+def contents_of(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
+    """All contents of the table, and the pictures that elements are learned from: sharp leaves."""
+    leaves = argparse.Namespace(**vars(arguments) | {"data": None})
+    parts = {name: split(training_pictures(leaves, name)) for name in progress(LEAVES, "dead leaf")}
+    if arguments.data:
+        parts["pictures"] = split(training_pictures(arguments, "sharp leaves"))
+    contents = [
+        Content(name, *(periodic(part, WIDE) for part in both), both[1].classes) for name, both in parts.items()
+    ]
+    return contents, parts["sharp leaves"][0]
+
+
+def _learned(
+    arguments: argparse.Namespace, rows: Sequence[str], world: WaveCameraConfig, train: Pictures
+) -> dict[str, tuple[Element, ...]]:
+    """The learned ones of the rows."""
+    common = {name: getattr(arguments, name) for name in ("steps", "starts", "seed")}
+    asked = {name: row.learning for name, row in ROWS.items() if row.learning and name in rows}
+    if asked and not arguments.folder:
+        say("learned elements are not kept: -o FOLDER keeps them")
+    found = {}
+    with tempfile.TemporaryDirectory() as unkept, torch.no_grad():
+        for name, learning in asked.items():
+            folder = Path(arguments.folder or unkept) / name
+            with torch.enable_grad():
+                camera = learn(DesignSettings.of(common, **learning), world, train, folder, ROWS[name].title)
+            found[name] = camera.variables()
+    return found
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    options = [f"--{name} {' '.join(given)}" for name in ("rows", "also") if (given := getattr(arguments, name))]
+    own = DesignSettings.of({name: getattr(arguments, name) for name in ("steps", "starts", "seed")})
+    options += [*picture_words(arguments, LIMIT), *words(own, wave_design.ROWS)]
+    return " ".join(["python docs/experiments/wave_edof.py", *options, "-o FOLDER --docs docs"])
+
+
+def _figures(found, elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, seed: int) -> dict:
+    """Figures of the page, by file name. Only dead leaves are shown."""
+
+    first = next(iter(found.values()))
+    made = {"depth.png": depth_figure(found, world)}
+    if "fresnel" in first:
+        made["gain.png"] = gain_figure(found)
+    for name in ("learned", "learned-smooth"):
+        if name in elements:
+            made[f"{name}.png"] = Judged(elements[name], world, kernels(elements[name], world), first[name]).plot()
+    shown = {name: elements[name] for name in _SHOWN if name in elements}
+    made["scene.png"] = scene_figure(*flat(shown, world, seed=seed))
+    made["deep.png"] = deep_figure(deep(shown, world, seed=seed))
+    return made
+
+
+def heights_of(elements: Mapping[str, Element]) -> str:
+    """A sentence on the heights of elements inside their aperture, by title."""
+    ranges = {title: height_range(element) for title, element in elements.items()}
+    listed = "; ".join(f"{title} {1e3 * (high - low):.3g} µm" for title, (low, high) in ranges.items())
+    return f"Heights, largest less smallest inside the aperture: {listed}."
+
+
+def _parts(
+    table: Table,
+    given: Sequence[Content],
+    world: WaveCameraConfig,
+    command: str,
+    figures: Sequence[str],
+    learned: Mapping[str, Element],
+) -> list[str]:
+    depths = ", ".join(map(depth_text, world.depths))
+    colours = ", ".join(f"{1e3 * w:.0f}" for w in world.wavelengths)
+    judged = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
+    others = ", ".join(str(len(one.train)) for one in given)
+    contents = [(f"## {name[0].upper()}{name[1:]}", table.markdown(name)) for name in table.found]
+    return [
+        "# Extended depth of field with one phase element",
+        f"    {command}",
+        f"Aperture {2 * world.radius:g} mm, sensor at {world.sensor_distance:g} mm, {colours} nm, objects at {depths}; "
+        f"pixels of {1e3 * world.pixel:g} µm, kernels of {world.size} × {world.size} pixels, light beyond them spread "
+        f"evenly as haze; noise of standard deviation {world.noise:g}. All lenses are made for "
+        f"{world.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
+        f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
+        *(part for parts in contents for part in parts),
+        "PSNR in dB, mean over depths, of errors pooled over pictures and as the mean of the PSNRs of single pictures; "
+        "in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the best less the worst, both "
+        "behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et al., SIGGRAPH 2018, of other "
+        "pictures. "
+        "All figures: [table.csv](wave/table.csv).",
+        *([heights_of(learned)] if learned else []),
+        *(picture(f"wave/{name}", CAPTIONS[name]) for name in figures),
+    ]
+
+
+def pictures_of(kind: str) -> str:
+    """The name of pictures of a kind, dead leaves or "pictures"."""
+    return kind if kind == "pictures" else f"pictures of {kind}"
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these (default: all but those of --also)")
+    parser.add_argument(
+        "--also",
+        metavar="ROW",
+        nargs="+",
+        help="further rows: learned-images (--loss images --filter towards), learned-adadelta (the same by Adadelta), "
+        "learned-zernike (22 polynomials, no symmetry, by Adadelta)",
+    )
+    defaults = defaults_of(DesignSettings)
+    add_options(parser, defaults, wave_design.ROWS, "steps", "starts")
+    add_options(picture_options(parser, PICTURES, limit=LIMIT), defaults, wave_design.ROWS, "seed")
+    output_folder(parser, "folder of designed elements")
+    documents(parser, "wave_edof.md and wave/")
+    json(parser)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
+    arguments = parser.parse_args(argv)
+    present(edof(arguments), arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,579 @@
+"""Modulation of diffraction from few rays: a pupil over itself, sheared, by quadrature.
+
+    OTF(ν) = ∬ √(J₊ J₋) exp 2πi (W₊ - W₋) ds / ∬ J ds,    ± at s ± ν/2
+
+Over directions s = n (L, M)/λ in 1/mm, with W the wave in waves and J = |∂p/∂s| the light of an entrance pupil |p| ≤ 1
+that is lit evenly. W and p are polynomials of s that fit the rays of a few rings by least squares. The part that both
+pupils cover is cut into lines along the shear from rim to rim, with Gaussian rules along and across: their error falls
+exponentially with their points, where cells of a grid err by their share at the rim.
+
+Derivatives are exact of what is computed: backward from the OTFs to the polynomials, by torch, and by the normal
+equations from these to the rays, whose derivatives by the variables come from the trace.
+
+Source: Hopkins, Proc. Phys. Soc. B 70, 1957 (the sheared pupil); Golub & Pereyra 1973 (derivative of a fit).
+
+A pupil and its wave as polynomials of directions, where a few hundred rays determine them.
+
+The exit pupil as a regular grid of directions, whose autocorrelation is the optical transfer function.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.analysis.setting import refuse_dark
+from raytrace.budget import forewarn, piece
+from raytrace.maths import zernike
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_legendre, gauss_rings
+from raytrace.maths.value import value
+from raytrace.psf_models.dft import TooManyPoints, phasor
+from raytrace.system.apertures import stands_inside
+from raytrace.system.lens import name_of_field
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.scene import Scene, beam_share
+from raytrace.tracing.wavefront import Wavefront, wavefront_of
+
+_PROBE = 10, 40
+_DEGREES = (14, 18, 22)  # tried in this order
+_MISSED = 1e-4  # waves that the polynomial may miss, at any of the rays that it is not fitted to
+MARGIN = 1.06  # the square of directions reaches that much beyond the outermost ray of the probe
+
+
+@value
+class Beam:
+    """The rays of a few rings of the pupil, and the square of direction cosines (u, v) = ((L, M) - middle)/half.
+
+    middle, half: (2, 1, F, W), half with the margin; waves_per: (W,) n/λ, 1/mm.
+    """
+
+    wavefront: Wavefront
+    middle: Tensor
+    half: Tensor
+    waves_per: Tensor
+
+    @property
+    def blur(self) -> Tensor:
+        """Farthest landing (1, F, W) mm of a usable ray from the chief ray's point."""
+        front = self.wavefront
+        return torch.where(front.usable, torch.linalg.vector_norm(front.landing, dim=0), 0.0).amax(-1)
+
+    @property
+    def cutoffs(self) -> Tensor:
+        """Highest frequencies (2, F, W) 1/mm that pass along x and y, the widths of the beam's directions n L/λ."""
+        return (2 / MARGIN * self.half * self.waves_per)[:, 0]
+
+
+def beam_of(scene: Scene) -> Beam:
+    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    front = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
+    directions = front.direction[:2]
+    low = torch.where(front.usable, directions, torch.inf).amin(-1)
+    high = torch.where(front.usable, directions, -torch.inf).amax(-1)
+    return Beam(front, (low + high) / 2, MARGIN * (high - low) / 2, 1e3 * front.index / front.wavelength)
+
+
+def polynomials_of(scene: Scene, beam: Beam) -> Tensor | None:
+    """Coefficients (3, F, W, N, N) of u^i v^j of the pupil point p_x, p_y and of the wave, in waves.
+
+    None where a ray fails or is clipped, where an aperture may stop light within the beam, and where no degree of
+    _DEGREES brings the rays between the fitted ones within _MISSED.
+    """
+    if any(stands_inside(aperture) for surface in scene.lens.surfaces for aperture in surface.apertures):
+        return None
+    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    for degree in _DEGREES:
+        rings, arms = degree // 2 + 3, 2 * degree + 8
+        points, weights = gauss_rings(rings, arms, **like)
+        rim = points[:, -arms:]
+        points = torch.cat([points, (1 - 1e-9) * rim / torch.hypot(*rim)], 1)
+        root = torch.cat([weights, torch.full_like(rim[0], 0.5) * weights.min()]).sqrt()
+        others = gauss_rings(rings + 1, arms + 3, **like)[0]
+        traced = wavefront_of(scene, torch.cat([points, others], 1))
+        if not bool(traced.valid.all()):
+            return None
+        u, v = (traced.direction[:2] - beam.middle[..., None])[:, 0] / beam.half[:, 0, ..., None]
+        powers = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
+        raised = [torch.stack([part**k for k in range(degree + 1)], -1) for part in (u, v)]
+        basis = raised[0][..., [i for i, _ in powers]] * raised[1][..., [j for _, j in powers]]
+        waves = (traced.opd / (1e-3 * traced.wavelength)[:, None])[0]
+        wanted = torch.stack([*(part.expand_as(waves) for part in torch.cat([points, others], 1)), waves], -1)
+        fitted = len(root)
+        q, r = torch.linalg.qr(root[:, None] * basis[..., :fitted, :])
+        found = torch.linalg.solve_triangular(r, q.mT @ (root[:, None] * wanted[..., :fitted, :]), upper=True)
+        missed = (wanted - basis @ found)[..., fitted:, 2].detach().abs().amax()
+        if float(missed) <= _MISSED:
+            table = found.new_zeros(3, *found.shape[:2], degree + 1, degree + 1)
+            at = tuple(torch.tensor(part, device=found.device) for part in zip(*powers, strict=True))
+            return _filled(table, at, found)
+    return None
+
+
+def _filled(table: Tensor, at: tuple[Tensor, Tensor], found: Tensor) -> Tensor:
+    """Coefficients (F, W, J, 3) at their powers in a table (3, F, W, N, N)."""
+    place = at[0] * table.shape[-1] + at[1]
+    return table.flatten(-2).index_copy(-1, place, found.movedim(-1, 0)).unflatten(-1, table.shape[-2:])
+
+
+def on_grid(polynomial: Tensor, line: Tensor) -> Tensor:
+    """A polynomial (..., N, N) of u^i v^j on the grid (..., V, U) of a line (P,) of both."""
+    powers = torch.stack([line**k for k in range(polynomial.shape[-1])], -1)
+    return powers @ polynomial.mT @ powers.T
+
+
+_DEGREE, _TERMS = 10, 66  # of the Zernike map from directions to the pupil
+_LEAST, _MOST = 128, 1280  # points across the grid
+_TRACED_BYTES, _CELL_BYTES = 480, 96  # of a cell that is traced, and of others
+_TRACED = 160  # points across a grid up to which every cell is traced
+_SURFACE_SECONDS = 4e-7  # a ray and surface, one core: 4 million rays through 12 surfaces took 17 to 24 s
+
+
+@value
+class ExitPupil:
+    """The wave of every field and wavelength over a regular grid of direction cosines (L, M).
+
+    amplitude: (F, W, N, N) complex, rows along M; energy: (F, W) Σ |A|², cells on the rim by their share.
+    step: (2, F, W) spatial frequency in 1/mm by which neighbours differ, n ΔL/λ and n ΔM/λ.
+    centre: (2, F, W) mm, the chief ray's point; centroid: (2, F, W) mm of the rays; light: (F, W) transmitted share.
+    """
+
+    amplitude: Tensor
+    energy: Tensor
+    step: Tensor
+    centre: Tensor
+    centroid: Tensor
+    light: Tensor
+
+
+def exit_pupil(
+    scene: Scene, *, size: int | None = None, least: int = _LEAST, seconds: float | None = None
+) -> ExitPupil:
+    """The wave on a regular grid of directions, whose rays are found by a Zernike map from directions to the pupil.
+
+    Light is spread evenly over the entrance pupil: |A|² = |∂p/∂(L, M)|. A cell that the rim of the pupil crosses counts
+    by its share, so that the grid errs by O(1/N²); one at the rim of another aperture counts or does not.
+    Every cell is traced on a grid up to 160 across. On a finer one the wave is a polynomial of directions where it
+    misses no ray by more than 1e-4 waves and no ray fails or is clipped, see `polynomials_of`.
+    size: N points across, by default as many as keep blurs from overlapping, and `least`. Raises TooManyPoints where
+    that is too many, or where the trace is predicted to take more than `seconds`; None: a long one is warned of.
+    """
+    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    beam = beam_of(scene)
+    probe, middle, half = beam.wavefront, beam.middle, beam.half
+    enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
+    refuse_dark(scene.lens, scene.fields, enough[0], "wave on the sensor")
+    narrow = (beam_share(scene)[0, :, 0] == 0) | (half == 0).any(0).any(-1)[0]
+    if bool(narrow.any()):
+        name = name_of_field(scene.fields[:, int(narrow.to(torch.int8).argmax())])
+        raise ValueError(f"the beam of field {name} has no width: its vignetting factors leave nothing of the pupil")
+    if size is None:
+        size = max(least, 64 * math.ceil(points_needed(beam) / 64))
+    if size > _MOST:
+        raise TooManyPoints(
+            f"the blur needs {size} points across the pupil, more than {_MOST}: focus the lens, or use geometric rays"
+        )
+    normal = (probe.direction[:2] - middle[..., None]) / half[..., None]
+    turn = _to_disc(normal.detach(), probe.usable) if is_bent(scene.lens) else None
+    basis = zernike.polynomials(_orders(_DEGREE), *_on_disc(turn, *normal)).movedim(0, -1)
+    root = safe_sqrt(torch.where(probe.usable, probe.weights, 0.0))[..., None]
+    map_to_pupil = torch.linalg.lstsq(root * basis, root * probe.pupil.T).solution  # (1, F, W, J, 2)
+    nodes, values, slopes = _interpolation(size, _DEGREE, like)
+    at_nodes = _at_nodes(map_to_pupil, _DEGREE, turn, nodes)
+    pupil, by_l, by_m = (
+        rows @ at_nodes @ columns.T for rows, columns in ((values, values), (values, slopes), (slopes, values))
+    )
+    line = (2 * torch.arange(size, **like) + 1 - size) / size
+    inside = line * line + (line * line)[:, None] <= 1
+    own = None
+    if turn is not None:
+        u, v = _on_disc(turn[..., None], line.expand(size, -1), line[:, None].expand(-1, size))
+        own = u * u + v * v <= 1
+        inside = own.any(2).any(1)[0]
+        own = own[..., inside]
+    parts, each = [pupil, by_l, by_m], _TRACED_BYTES
+    if size > _TRACED:
+        polynomials = polynomials_of(scene, beam)
+        if polynomials is None:
+            _afford_time(scene, int(inside.sum()) * probe.opd[..., 0].numel(), seconds)
+        else:
+            parts.append(on_grid(polynomials[2], line)[None, None])
+            each = _CELL_BYTES
+    together = piece(each * probe.opd[..., 0].numel())
+    cells = [
+        _cells(scene, *some, size=size)
+        for some in zip(*(part[..., inside].split(together, -1) for part in parts), strict=True)
+    ]
+    field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
+    field, light = (part if own is None else torch.where(own, part, 0.0) for part in (field, light))
+    amplitude = field.new_zeros(*field.shape[1:3], size, size)
+    amplitude[..., inside] = field[0]
+    energy = torch.where(probe.valid, probe.energy, 0.0)
+    total = energy.sum(-1)
+    offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
+    return ExitPupil(
+        amplitude=amplitude,
+        energy=light.sum(-1)[0],
+        step=(2 / size * half * beam.waves_per)[:, 0],
+        centre=probe.centre[:2, 0],
+        centroid=(probe.centre[:2] + offset)[:, 0],
+        light=total[0],
+    )
+
+
+def points_needed(beam: Beam) -> float:
+    """Points across the pupil that keep the blurs of a beam from overlapping: not differentiated."""
+    return 4 * float((beam.blur * beam.half.amax(0) * beam.waves_per).max().detach())
+
+
+def _afford_time(scene: Scene, rays: int, seconds: float | None) -> None:
+    """Raise TooManyPoints where a trace takes more than `seconds`; warn TakesLong of a long one without these."""
+    aimed = 4 if scene.lens.ray_aiming == "real" else 1
+    needed = rays * len(scene.lens.surfaces) * aimed * _SURFACE_SECONDS
+    what = f"the blur needs a grid of {rays:,} rays"
+    if seconds is None:
+        forewarn(needed, what, helps="use geometric rays")
+    elif needed > seconds:
+        raise TooManyPoints(f"{what}, {needed:.0f} s: focus the lens, or use geometric rays")
+
+
+def _orders(degree: int) -> list[zernike.Order]:
+    return [zernike.noll(j) for j in range(1, (degree + 1) * (degree + 2) // 2 + 1)]
+
+
+def _at_nodes(coefficients: Tensor, degree: int, turn: Tensor | None, nodes: Tensor) -> Tensor:
+    """Polynomials (C, 1, F, W, K, K) of coefficients (1, F, W, J, C) at nodes (K,) of both directions."""
+    y, x = torch.meshgrid(nodes, nodes, indexing="ij")
+    if turn is None:
+        return torch.einsum("jyx,...jc->c...yx", zernike.polynomials(_orders(degree), x, y), coefficients)
+    terms = zernike.polynomials(_orders(degree), *_on_disc(turn[..., None], x, y))
+    return torch.einsum("j...yx,...jc->c...yx", terms, coefficients)
+
+
+def _to_disc(normal: Tensor, usable: Tensor) -> Tensor:
+    """Matrices (2, 2, ..., 1) that make the directions (2, ..., P), an ellipse that may be askew in its box, a disc.
+
+    The root of their covariance, by which the outermost come to lie within the margin.
+    """
+    count = usable.sum(-1)
+    x, y = torch.where(usable, normal, 0.0)
+    xx, xy, yy = ((a * b).sum(-1) / count for a, b in ((x, x), (x, y), (y, y)))
+    across = safe_sqrt(yy - xy * xy / xx)
+    zero = torch.zeros_like(xx)
+    matrix = torch.stack(
+        [torch.stack([1 / safe_sqrt(xx), zero]), torch.stack([-xy / xx, torch.ones_like(xx)]) / across]
+    )
+    u, v = _on_disc(matrix[..., None], x, y)
+    farthest = torch.hypot(u, v).amax(-1)
+    return (matrix / (MARGIN * farthest))[..., None]
+
+
+def _on_disc(turn: Tensor | None, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    if turn is None:
+        return x, y
+    (xx, xy), (yx, yy) = turn
+    return xx * x + xy * y, yx * x + yy * y
+
+
+def _interpolation(size: int, degree: int, like: dict) -> tuple[Tensor, Tensor, Tensor]:
+    """Chebyshev nodes (K,), and matrices (N, K) that give a polynomial of them, and its slope, on the line of a grid.
+
+    A polynomial of directions is one in each of them: two small products instead of all its terms in every cell.
+    """
+    count = degree + 1
+    k = torch.arange(count, **like)
+    angle = math.pi * (k + 0.5) / count
+    terms = (2 - (k == 0).to(k.dtype)) / count * torch.cos(angle[:, None] * k)  # from values at nodes to coefficients
+    theta = torch.acos((2 * torch.arange(size, **like) + 1 - size) / size)[:, None]
+    slopes = k * torch.sin(k * theta) / torch.sin(theta)
+    return torch.cos(angle), torch.cos(k * theta) @ terms.T, slopes @ terms.T
+
+
+def _cells(
+    scene: Scene, pupil: Tensor, by_l: Tensor, by_m: Tensor, waves: Tensor | None = None, *, size: int
+) -> tuple[Tensor, Tensor]:
+    """The wave (1, F, W, P) in cells of `size` across at points of the pupil (2, 1, F, W, P), and its |A|².
+
+    by_l, by_m: derivatives of the points by directions scaled to the disc; waves: (1, 1, F, W, P), traced if None.
+    """
+    radius = safe_sqrt((pupil * pupil).sum(0))
+    slope = safe_divide(safe_sqrt((pupil * by_l).sum(0) ** 2 + (pupil * by_m).sum(0) ** 2), radius)
+    share = (0.5 + safe_divide(1 - radius, 2 / size * slope)).clamp(0.0, 1.0)
+    share = torch.where(radius < 0.5, 1.0, share)
+    density = (by_l[0] * by_m[1] - by_l[1] * by_m[0]).abs()
+    beyond = radius > 1  # cells whose middle lies beyond the rim have the wave of the rim
+    at_rim = torch.nonzero((beyond & (share > 0)).flatten(0, -2).any(0))[:, 0]
+    if waves is None:
+        waves, valid = _traced(scene, pupil, radius)
+        share = torch.where(valid, share, 0.0)
+    elif len(at_rim):
+        rim, _ = _traced(scene, pupil[..., at_rim], radius[..., at_rim])
+        waves = torch.where(beyond, torch.zeros_like(waves[0]).index_copy(-1, at_rim, rim), waves[0])
+    else:
+        waves = waves[0]
+    return share * safe_sqrt(density) * phasor(waves), share * density
+
+
+def _traced(scene: Scene, pupil: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Waves (1, F, W, P) at points of the pupil, of those beyond the rim on it, and whether the rays are valid."""
+    traced = wavefront_of(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
+    return traced.opd / (1e-3 * traced.wavelength)[:, None], traced.valid
+
+
+_RIM = 1 - 1e-9  # rays of the rim, which rounding must not put outside
+_NEWTON = 12  # steps at the most
+_CLOSE = 1e-7  # of the pupil, from where one more step ends at rounding
+_WHOLE = 1.98  # of pupil radii: a shear that leaves nothing in common
+
+
+class Layout(NamedTuple):
+    """Rays of a beam: pupil points (2, R), their weights (R,), and powers (i, j) of s_x and s_y of the fit.
+
+    half: of a beam that is mirrored in the y axis its right half, by what is even in x, and p_x by what is odd.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    degree: int
+    half: bool
+
+    @property
+    def powers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of W and p_y, and of p_x: (K, 2) each."""
+        every = np.array([(i, n - i) for n in range(self.degree + 1) for i in range(n + 1)])
+        return tuple(every[every[:, 0] % 2 == odd] if self.half else every for odd in (0, 1))
+
+
+def layout_of(degree: int, *, half: bool) -> Layout:
+    """Rings of a Gaussian rule that a polynomial of a degree is orthogonal on, and one ring at the rim."""
+    rings, arms = degree // 2 + 1, 4 * (degree // 2 + 1)
+    points, weights = (part.numpy() for part in gauss_rings(rings, arms))
+    rim = points[:, -arms:] / np.hypot(*points[:, -arms:])
+    points, weights = np.concatenate([points, _RIM * rim], 1), np.append(weights, np.full(arms, 0.5 * weights.min()))
+    chosen = points[0] > 0 if half else slice(None)
+    return Layout(points[:, chosen], weights[chosen], degree, half)
+
+
+# -- polynomials of the rays -------------------------------------------------------------------------------------------
+
+
+class Fit:
+    """Polynomials (B, N, N) of W, p_x and p_y in directions, and how they follow what they fit.
+
+    s = middle + scale * (u, v), which puts the beam into a square; `middle` and `scale` (2, B) are choices, which
+    nothing depends on.
+    """
+
+    def __init__(self, layout: Layout, wave: np.ndarray, directions: np.ndarray):
+        """wave: (B, R) waves; directions: s (2, B, R) 1/mm."""
+        self.layout, self.wave = layout, wave
+        low, high = directions.min(-1), directions.max(-1)
+        self.middle, self.scale = 0.5 * (low + high), 0.5 * (high - low)
+        if layout.half:
+            self.middle[0], self.scale[0] = 0.0, np.abs(directions[0]).max(-1)
+        self.at = (directions - self.middle[..., None]) / self.scale[..., None]
+        even, odd = layout.powers
+        px, py = (np.broadcast_to(p, wave.shape) for p in layout.points)
+        root = np.sqrt(layout.weights)
+        self.parts = [_Part(powers, root, self.at, data) for powers, data in ((odd, px), (even, py), (even, wave))]
+
+    @property
+    def polynomials(self) -> np.ndarray:
+        """(3, B, N, N) coefficients of u^i v^j: p_x, p_y, W."""
+        return np.stack([part.table(self.layout.degree + 1) for part in self.parts])
+
+    @property
+    def missed(self) -> np.ndarray:
+        """RMS (B,) in waves of what the polynomials of W leave."""
+        return np.sqrt((self.layout.weights * self.parts[2].left ** 2).sum(-1) / self.layout.weights.sum())
+
+    def by_rays(self, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By waves (Q, B, R) and directions (2, Q, B, R), from derivatives (3, Q, B, N, N) by the polynomials."""
+        told = [part.back(slope) for part, slope in zip(self.parts, slopes, strict=True)]
+        return told[2][0], sum(at for _, at in told) / self.scale[:, None, :, None]
+
+
+class _Part:
+    """One polynomial: c = V⁺ d, over powers (K, 2), of data (B, R) at places (2, B, R) with roots of weights (R,)."""
+
+    def __init__(self, powers: np.ndarray, root: np.ndarray, at: np.ndarray, data: np.ndarray):
+        self.powers, self.root = powers, root
+        (self.basis, self.by_u), (along, by_along) = (_raised(at[k], powers[:, k]) for k in range(2))
+        self.by_v, self.by_u, self.basis = self.basis * by_along, self.by_u * along, self.basis * along
+        q, r = np.linalg.qr(root[:, None] * self.basis)
+        self.turn = np.linalg.inv(r)
+        self.inverse = self.turn @ (q.swapaxes(-1, -2) * root)
+        self.found = (self.inverse @ data[..., None])[..., 0]
+        self.left = data - (self.basis @ self.found[..., None])[..., 0]
+
+    def table(self, size: int) -> np.ndarray:
+        found = np.zeros((len(self.found), size, size))
+        found[:, self.powers[:, 0], self.powers[:, 1]] = self.found
+        return found
+
+    def back(self, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By the data (Q, B, R) and by the places (2, Q, B, R).
+
+        dc = V⁺ (dd - dV c) + (VᵀV)⁻¹ dVᵀ r, r = d - V c what is left
+        """
+        told = slope[..., self.powers[:, 0], self.powers[:, 1]][..., None, :]  # (Q, B, 1, K)
+        by_data = (told @ self.inverse)[..., 0, :]
+        inner = (told @ self.turn @ self.turn.swapaxes(-1, -2))[..., 0, :]
+        left = self.root**2 * self.left
+        by_places = []
+        for by in (self.by_u, self.by_v):
+            along, back = (by @ self.found[..., None])[..., 0], (by @ inner[..., None])[..., 0]
+            by_places.append(left * back - by_data * along)
+        return by_data, np.stack(by_places)
+
+
+def _raised(x: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x^k and its slope k x^(k-1), (..., K)."""
+    every = np.ones((*x.shape, powers.max() + 1))
+    for k in range(1, every.shape[-1]):
+        every[..., k] = every[..., k - 1] * x
+    return every[..., powers], powers * every[..., np.maximum(powers - 1, 0)]
+
+
+# -- the sheared pupil -------------------------------------------------------------------------------------------------
+
+
+def otf(polynomials: Tensor, shear: Tensor, points: int) -> Tensor:
+    """OTF (Q, B) complex of polynomials (3, Q, B, N, N), p_x, p_y and W, sheared along their last axis.
+
+    shear: (Q, B), in the units of their places; points: of the rules along and across.
+    """
+    with torch.no_grad():
+        corner, slope, found = _corners(polynomials[:2], shear)
+    dead = ~found
+    shear = torch.where(dead, 0.5, shear)
+    pupil = polynomials[:2]
+    ends = [_within(pupil, corner[0], corner[1] + side * shear) - 1 for side in (0.5, -0.5)]
+    (a, b), (c, d) = slope
+    across = corner[0] - torch.where(dead, 0.0, (d * ends[0] - b * ends[1]) / (a * d - b * c))
+    nodes, weights = (torch.from_numpy(part) for part in gauss_legendre(points))
+    angle = 0.5 * math.pi * nodes
+    low, high = across
+    half = 0.5 * (high - low)[..., None]
+    place = 0.5 * (high + low)[..., None] + half * torch.sin(angle)
+    width = half * 0.5 * math.pi * weights * torch.cos(angle)
+    line = _lines(polynomials, place)
+    bottom, top = (_rim(line[..., :2], place.detach(), side) for side in (-1.0, 1.0))
+    reach = 0.5 * (top - bottom - shear[..., None])
+    along = 0.5 * (top + bottom)[..., None] + reach[..., None] * nodes
+    area = width[..., None] * reach[..., None] * weights
+    (W1, J1), (W2, J2) = (_wave(line, along + side * shear[..., None, None]) for side in (0.5, -0.5))
+    light = area * safe_sqrt(J1 * J2) / math.pi
+    phase = 2 * math.pi * (W1 - W2)
+    told = torch.complex((light * torch.cos(phase)).sum((-1, -2)), (light * torch.sin(phase)).sum((-1, -2)))
+    return torch.where(dead, 0.0, told)
+
+
+def _wave(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """W and J at places (..., P) of lines (..., N, 5): p_x, p_y, W, and the slopes of p_x and p_y across."""
+    values, slopes = _along(line, at)
+    (x, y), (x_u, y_u) = slopes[..., :2].unbind(-1), values[..., 3:].unbind(-1)
+    return values[..., 2], (x_u * y - y_u * x).abs()
+
+
+def _lines(polynomials: Tensor, place: Tensor) -> Tensor:
+    """Polynomials (..., P, N, 5) along the lines at places (..., P) across, of p_x, p_y and W, and of p_x and p_y their
+    slopes across."""
+    at, count = place.detach(), polynomials.shape[-1]
+    powers = _powers(at, count)
+    first, second = _slope_of(powers), _slope_of(_slope_of(powers))
+    moved, fixed = (place - at)[..., None], polynomials.detach()
+    line = powers @ polynomials + moved * (first @ fixed)
+    steep = first @ polynomials[:2] + moved * (second @ fixed[:2])
+    return torch.cat([line, steep]).movedim(0, -1)
+
+
+def _powers(at: Tensor, count: int) -> Tensor:
+    """at^k (..., N)."""
+    found = at.new_ones(*at.shape, count)
+    for k in range(1, count):
+        torch.mul(found[..., k - 1], at, out=found[..., k])
+    return found
+
+
+def _slope_of(powers: Tensor) -> Tensor:
+    """k at^(k-1), of at^k; again, what follows from that."""
+    k = torch.arange(powers.shape[-1], dtype=powers.dtype)
+    return k * torch.roll(powers, 1, -1)
+
+
+def _along(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Values and slopes (..., P, C) of polynomials (..., N, C) at places (..., P), with derivatives by both."""
+    count, fixed = line.shape[-2], line.detach()
+    powers = _powers(at.detach(), count)
+    k = torch.arange(1, count, dtype=line.dtype)[:, None]
+    steep = k * line[..., 1:, :2]
+    values, slopes = powers @ line, powers[..., :-1] @ steep
+    if not at.requires_grad:
+        return values, slopes
+    moved = (at - at.detach())[..., None]
+    bend = powers[..., :-2] @ (k[:-1] * steep.detach()[..., 1:, :])
+    return values + moved * (powers[..., :-1] @ (k * fixed[..., 1:, :])), slopes + moved * bend
+
+
+def _rim(line: Tensor, place: Tensor, side: float) -> Tensor:
+    """Where lines (..., P, N, 2) at places (..., P) across reach |p|² = 1, on one side."""
+    fixed, at = line.detach(), side * (safe_sqrt((1 - place * place).clamp_min(0.0)) + 0.05)
+    for _ in range(_NEWTON):
+        powers = _powers(at, line.shape[-2])[..., None, :]
+        p, by = powers @ fixed, _slope_of(powers) @ fixed
+        slope = 2 * (p * by).sum((-1, -2))
+        slope = torch.where(slope == 0, 1.0, slope)
+        step = ((p * p).sum((-1, -2)) - 1) / slope
+        at = at - step
+        if float(step.abs().max()) < _CLOSE:
+            break
+    p = _powers(at, line.shape[-2])[..., None, :] @ line
+    return at - ((p * p).sum((-1, -2)) - 1) / slope
+
+
+def _corners(pupil: Tensor, shear: Tensor) -> tuple[Tensor, tuple, Tensor]:
+    """Where both rims meet: middles (2, 2, Q, B), across and along, of both corners; slopes of |p|² there by these, of
+    the pupil ahead and behind; and for which there are any."""
+    far = 0.5 * torch.clamp(shear, max=_WHOLE)
+    across = safe_sqrt(1 - far * far)
+    at = torch.stack([torch.stack([-across, across]), torch.zeros(2, *shear.shape, dtype=shear.dtype)])
+    for _ in range(_NEWTON):
+        told = [_slopes(pupil, at[0], at[1] + side * shear) for side in (0.5, -0.5)]
+        (F, a, b), (G, c, d) = told
+        det = a * d - b * c
+        det = torch.where(det == 0, 1.0, det)
+        step = torch.stack([d * (F - 1) - b * (G - 1), a * (G - 1) - c * (F - 1)]) / det
+        at = at - step.clamp(-0.2, 0.2)
+        if float(step.abs().max()) < _CLOSE:
+            break
+    found = (step.abs().amax((0, 1)) < _CLOSE) & (at[0, 1] > at[0, 0]) & (shear < _WHOLE)
+    at = torch.where(
+        found, at, torch.stack([torch.tensor([-0.5, 0.5]).double(), torch.zeros(2).double()])[..., None, None]
+    )
+    return at, ((a, b), (c, d)), found
+
+
+def _slopes(pupil: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """|p|² and its derivatives at places (C, Q, B)."""
+    (x, y), (xu, yu), (xv, yv) = (_at(pupil, *powers) for powers in _raised_at(u, v, pupil.shape[-1]))
+    return x * x + y * y, 2 * (x * xu + y * yu), 2 * (x * xv + y * yv)
+
+
+def _raised_at(u: Tensor, v: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
+    """Powers of both, and the slopes of those of either."""
+    U, V = _powers(u, count), _powers(v, count)
+    return [(U, V), (_slope_of(U), V), (U, _slope_of(V))]
+
+
+def _at(pupil: Tensor, U: Tensor, V: Tensor) -> Tensor:
+    """p (2, C, Q, B) at places by their powers (C, Q, B, N)."""
+    return ((U[..., None, :] @ pupil[:, None])[..., 0, :] * V).sum(-1)
+
+
+def _within(pupil: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """|p|² at fixed places (C, Q, B)."""
+    x, y = _at(pupil, _powers(u, pupil.shape[-1]), _powers(v, pupil.shape[-1]))
+    return x * x + y * y

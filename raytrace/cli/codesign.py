@@ -1,0 +1,183 @@
+"""`raytrace codesign`: its options. Imports no torch before it runs."""
+
+import argparse
+
+from raytrace.cli.options import (
+    catalog,
+    count,
+    field_point,
+    file_name,
+    folder_or_lens,
+    json,
+    output_folder,
+    positive,
+    positive_finite,
+    seed_number,
+    substitute,
+)
+from raytrace.cli.settings import SEED, add_options, defaults_of, documents, option, picture_options
+from raytrace.settings import AFTER_PARAXIAL, MODELS, CodesignSettings
+
+SUMMARY = "optimise a lens together with a restoration network"
+DESCRIPTION = """\
+Train the sensor distance (or any variables) of a lens together with a network that restores its images. Step 1 trains
+both with the PSFs of one model; step 2 freezes the lens and continues to train the network on PSFs of traced rays, for
+as many epochs. `compare` trains every model and seed and writes a page of tables and figures.
+
+Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
+(Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
+form: the expected mean square error of images behind the best linear filter, from their power spectrum.
+
+A run may be interrupted at any time: the same command resumes it bit-identically. Several processes share every batch:
+torchrun --nproc-per-node 2 -m raytrace codesign …"""
+EXAMPLES = """examples:
+  raytrace codesign double_gauss --loss spectral -o learned.zmx
+  raytrace codesign double_gauss --model gaussian --data pictures -o run
+  raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o from_closed_form
+  raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
+  raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
+  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
+  raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study
+  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only"""
+
+#: The options by the field of `CodesignSettings`.
+ROWS = {
+    "model": option("PSF model of step 1", "MODEL", choices=MODELS),
+    "vary": option("variables: sensor (default), thickness:5,6 curvature:1-4 conic:3, of surfaces", "WHAT", nargs="+"),
+    "bounds": option("of variables: sensor:57.5,58 curvature_3:-0.04,0 (mm, 1/mm)", "NAME:LOW,HIGH", nargs="+"),
+    "hold": option(
+        "constraint that the last variable with power is solved for: efl (the file's focal length) or efl=100",
+        "NAME=VALUE",
+        nargs="+",
+    ),
+    "glass_thickness": option(
+        "centre thickness of elements: minimum, or minimum and maximum (default 1/50 of the largest diameter)",
+        "MIN[:MAX]",
+    ),
+    "air_thickness": option(
+        "of air between elements (default 1/2000 of the largest diameter); edges may touch", "MIN[:MAX]"
+    ),
+    "edge": option(
+        "minimum edge thickness of elements (default 1/100); a violation is a penalty in mm²",
+        "MIN",
+        type=positive_finite,
+    ),
+    "start": option(
+        "initial sensor distance: paraxial (default; the image of --focus-distance), rms (its least RMS spot), "
+        "spectral (the optimum of the closed form), gaussian (that of Gaussian DRT), or a distance",
+        "PLACE",
+    ),
+    "focus_distance": option("object distance of --start (default 25000); inf allowed", "MM", type=positive),
+    "f_number": option("other than the file's", "N", type=positive_finite),
+    "wavelengths": option("the first is primary (default 0.53)", "UM", name="wavelength"),
+    "wavelength_weights": option("of --wavelength (default 1 each)", "W"),
+    "near": option("nearest object", "MM"),
+    "far": option("furthest object", "MM"),
+    "spread": option(
+        "distribution of object distances z: uniform in z (uniform, default) or in 1/z (reciprocal)",
+        name="distances",
+        choices=("uniform", "reciprocal"),
+    ),
+    "fields": option("field points Y, in the file's kind of field (default 0)", "F", name="field", type=field_point),
+    "pixel": option("pixel pitch", "MM"),
+    "size": option("pixels across the window of the PSF"),
+    "normalise": option(
+        "PSFs sum to 1 over the entrance pupil (energy), or in each window (window, default)",
+        choices=("energy", "window"),
+    ),
+    "rho": option("of the paraxial model: σ over the radius of the blur", "R"),
+    "noise": option("standard deviation, for images from 0 to 1", "S"),
+    "tol": option("error bound of a PSF", "T"),
+    "rays": option("fixed rays of a traced PSF in step 1, instead of as many as --tol needs", type=count),
+    "drt_rays": option(
+        "fixed rays of every DRT PSF, in step 1, step 2 and its tests, instead of as many as --tol needs", type=count
+    ),
+    "sampling": option("pupil sampling of --rays and --drt-rays (default sobol)", choices=("sobol", "hexapolar")),
+    "vignetting": option(
+        "rays beyond the semi-diameters of the file: traced (none, default), or vignetted (semi-diameters)",
+        choices=("none", "semi-diameters"),
+    ),
+    "depth": option("layers, an even number, instead of the preset's (default 10 or 30)"),
+    "width": option("maps of a layer, instead of the preset's (default 32 or 64)"),
+    "epochs": option("of each step"),
+    "batch": option("patches of a training step"),
+    "seed": SEED,
+    "rate_network": option("Adam's, of weights", "R"),
+    "rate_optics": option("Adam's, of variables, in mm", "R"),
+    "decay": option(
+        "Adam's rates over a step: constant (none, default), or falling to 0 along half a cosine",
+        choices=("none", "cosine"),
+    ),
+    "precision": option(
+        "of the network; auto (default) uses the faster one on this machine and stores the choice in the run",
+        choices=("auto", "float32", "bfloat16"),
+    ),
+    "patch": option("pixels across a restored patch"),
+    "crops": option("patches of a picture in an epoch"),
+}
+_PICTURES = ("patch", "crops")
+_TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "decay", "precision")
+_SCENE = tuple(name for name in ROWS if name not in ("model", *_PICTURES, *_TRAINING))
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.usage = "raytrace codesign [compare] LENS [-o FOLDER] [options]"
+    parser.add_argument(
+        "words",
+        metavar="LENS",
+        type=file_name,
+        nargs="+",
+        help="lens file, or the name of a shipped lens; `compare` before it runs all models and seeds",
+    )
+    catalog(parser)
+    substitute(parser)
+    json(parser)
+    output_folder(
+        parser,
+        "folder of the run, or of all runs of compare; the optimised lens is lens.zmx in the folder of a run. A lens "
+        "file (.zmx, .csv) is written in addition to a folder of the same name without suffix",
+        type=folder_or_lens,
+    )
+    parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
+    defaults = defaults_of(CodesignSettings)
+    add_options(parser, defaults, ROWS, "model")
+    parser.add_argument(
+        "--loss",
+        choices=("image", "spectral"),
+        default="image",
+        help="image: L1 of restored images, by training (default); spectral: the closed form, without a network, "
+        "in seconds",
+    )
+    group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
+    add_options(group, defaults, ROWS, *_PICTURES)
+    scene = parser.add_argument_group("lens and scene")
+    add_options(scene, defaults, ROWS, *_SCENE)
+    scene.add_argument(
+        "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
+    )
+    training = parser.add_argument_group("network and training")
+    training.add_argument(
+        "--preset",
+        choices=("cpu", "paper"),
+        default="cpu",
+        help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
+    )
+    add_options(training, defaults, ROWS, *_TRAINING)
+    group = parser.add_argument_group("compare")
+    group.add_argument(
+        "--models",
+        metavar="MODEL",
+        choices=(*MODELS, AFTER_PARAXIAL),
+        nargs="+",
+        help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT started where "
+        "the paraxial run ended",
+    )
+    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
+    documents(group, "the page and of codesign/ (default: FOLDER)")
+    group.add_argument(
+        "--page", metavar="NAME", type=file_name, help="write NAME.md and NAME/ there (default codesign)"
+    )
+    group.add_argument("--report-only", action="store_true", help="train nothing, write the page of the stored runs")
+
+
+run = "cli.codesign_compare.run"

@@ -1,0 +1,76 @@
+"""Experiments of the documentation: a grid of cases, a keyed store that resumes, and a page with tables and figures.
+
+Scripts in `docs/experiments` use it; `raytrace codesign compare` writes its page by it.
+"""
+
+import io
+import itertools
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from raytrace.files import write_atomically, write_json, write_text
+from raytrace.imaging.training import DamagedRun, Run
+from raytrace.pages import write_page
+from raytrace.plotting.style import save
+from raytrace.stores import number, read_document
+
+_ADVICE = "remove it to compute it again"
+
+
+def cases(**axes: Sequence) -> Iterator[dict]:
+    """All combinations of values, by the name of their axis; the last axis changes fastest."""
+    return (dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values()))
+
+
+class Store:
+    """Results in a folder by key, computed only where they are missing.
+
+    about: what all of them depend on; the folder refuses another (`OtherSettings`).
+    """
+
+    def __init__(self, folder: Path, about: Mapping):
+        self.folder = Run(folder, about).folder
+
+    def number(self, key: str, compute: Callable[[], float]) -> float:
+        """A number. Raises DamagedRun."""
+        file = self.folder / f"{key}.json"
+        if not file.exists():
+            write_json(file, compute())
+        return read_document(file, number(infinite=True), DamagedRun, _ADVICE)
+
+    def arrays(self, key: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Arrays by name."""
+        file = self.folder / f"{key}.npz"
+        if not file.exists():
+            packed = io.BytesIO()
+            np.savez(packed, **compute())
+            write_atomically(file, lambda stream: stream.write(packed.getvalue()))
+        with np.load(file) as stored:
+            return {name: stored[name] for name in stored.files}
+
+
+def published(file: str | Path, docs: str | Path) -> str:
+    """A file as the command of a page spells it: relative to docs/ if it is in there, else as given, without the
+    folder if the path is absolute."""
+    path, root = Path(file), Path(docs).resolve()
+    if path.resolve().is_relative_to(root):
+        return (Path("docs") / path.resolve().relative_to(root)).as_posix()
+    return path.name if path.is_absolute() else path.as_posix()
+
+
+def publish(page: Path, folder: str, parts: Iterable[str], *, tables: Mapping[str, str], figures: Mapping) -> None:
+    """Write a page above the part that it keeps, and its tables (CSV) and figures (of matplotlib) by file name.
+
+    folder: of tables and figures, next to the page.
+    """
+    place = page.parent / folder
+    place.mkdir(parents=True, exist_ok=True)
+    for name, text in tables.items():
+        write_text(place / name, text)
+    for name, figure in figures.items():
+        save(figure, place / name)
+    write_page(page, parts)
+    print(f"raytrace: written: {page}", file=sys.stderr, flush=True)

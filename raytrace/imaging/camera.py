@@ -1,0 +1,180 @@
+"""Camera: a lens with variables, a sensor and a restoration network as one module.
+
+A training step of lens and network:
+
+    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet())
+    optimizer = torch.optim.Adam(camera.parameters(), 1e-3)
+    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
+    restored = camera(pictures, distances)                  # blurred, noisy, restored
+    loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    camera.variables.project()                              # onto the bounds, if there are any
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from raytrace.imaging.image import as_picture, blur
+from raytrace.imaging.sensor import add_noise
+from raytrace.imaging.variables import Variables
+from raytrace.maths.grid import Grid, grid
+from raytrace.psf_models import MODELS, NotConverged, psf
+from raytrace.system.lens import Lens, field_points
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.scene import Memo, chief_landing, scene
+from raytrace.words import named_value
+
+_LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
+
+
+class Camera(nn.Module):
+    """Simulated capture and restoration of images (B, H, W) in [0, 1], each at its own object distance.
+
+    variables: of the lens; network: (B, 1, h, w) -> the same; model: a PSF model.
+    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
+    on the axis by default.
+    pixels: the PSF window, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
+    noise: standard deviation of the sensor noise. tol: allowed error of the kernels: the order of the PSF model is
+    chosen once, for the lens at the first call (`plan`). rho: of the paraxial model.
+    network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
+    The object is planar and upright; image inversion and magnification are ignored.
+    Warns UnfilledStop once, for the lens at construction.
+    """
+
+    def __init__(
+        self,
+        variables: Variables,
+        network: nn.Module,
+        *,
+        model: str = "gaussian",
+        object_distances: tuple[float, float] = (1e4, 5e4),
+        fields: Tensor | Sequence | None = None,
+        pixels: Grid | None = None,
+        normalise: str = "window",
+        noise: float = 0.1,
+        tol: float = 1e-2,
+        rho: float = 0.5,
+        network_dtype: torch.dtype | None = None,
+    ):
+        super().__init__()
+        if not isinstance(getattr(variables, "lens", None), Lens):
+            found = named_value(variables)
+            raise TypeError(f"Camera: `variables` is {found}; expected the Variables of a lens: Variables(lens, …)")
+        self.variables, self.network, self.model = variables, network, model
+        self.range = object_distances
+        like = variables.lens.wavelengths
+        self.fields = like.new_zeros(2, 1) if fields is None else field_points(fields, like=variables.lens)
+        warn_of_filling(variables.lens, self.fields)
+        self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
+        self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
+        self._order: int | None = None
+        self._memo = Memo(object_distances=object_distances)
+
+    @property
+    def margin(self) -> int:
+        """Rows and columns by which the PSF window shrinks an image."""
+        return self.pixels.rows - 1
+
+    def use(self, model: str) -> None:
+        """Simulate with another PSF model."""
+        self.model, self._order = model, None
+
+    @torch.no_grad()
+    def plan(self) -> int:
+        """The order of the PSF model that meets the tolerance at the ends and the middle of the range."""
+        near, far = self.range
+        distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotConverged)  # the finest order is used
+            self._order = self._psf(distances, self.fields, tol=self.tol).order
+        return self._order
+
+    def kernels(self, object_distances: Tensor, field: int = 0) -> Tensor:
+        """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, around its chief ray."""
+        order = self.plan() if self._order is None else self._order
+        return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
+
+    def _psf(self, distances: Tensor, fields: Tensor, **work):
+        # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
+        # traced one by the distortion.
+        fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
+        lens, distances = self.variables(), distances.to(self.fields.dtype)
+        return psf(
+            lens,
+            self.model,
+            fields=fields,
+            object_distances=distances,
+            grid=self._window(lens, fields, distances),
+            normalise=self.normalise,
+            rho=self.rho,
+            memo=self._memo,
+            **work,
+        )
+
+    def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
+        """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""
+        if bool((fields == 0).all()):
+            return self.pixels
+        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], self._memo))[..., 0]
+        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
+
+    def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
+        """The noise-free sensor image, (B, H - margin, W - margin).
+
+        picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
+        Raises ValueError for other shapes, as of colour images, and other ranges, as 0 to 255.
+        """
+        picture = _grey(picture, object_distances)
+        return blur(picture, self.kernels(object_distances, field).to(picture.dtype))
+
+    def restore(self, image: Tensor) -> Tensor:
+        """The network's estimate (B, h, w) from a noisy image."""
+        with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
+            image = as_picture(image, "image")
+            like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
+            stack = image[:, None].to(like, memory_format=torch.channels_last)
+            return self.network(stack)[:, 0].to(image.dtype)
+
+    def forward(
+        self,
+        picture: Tensor,
+        object_distances: Tensor,
+        *,
+        field: int = 0,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise."""
+        image = self.image(picture, object_distances, field)
+        if noise is None:
+            return self.restore(add_noise(image, self.noise, generator=generator))
+        return self.restore(image + self.noise * noise)
+
+    def target(self, picture: Tensor) -> Tensor:
+        """The ideal output: the image without its margin."""
+        picture = as_picture(picture)
+        rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
+        bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns
+        return picture[..., rows : picture.shape[-2] - bottom, columns : picture.shape[-1] - right]
+
+
+def _grey(picture: Tensor, object_distances: Tensor) -> Tensor:
+    """Pictures (B, H, W) or (H, W) of object distances (B,) in [0, 1]."""
+    picture = as_picture(picture)
+    shape, count = tuple(picture.shape), len(object_distances)
+    if not (picture.dim() == 2 or (picture.dim() == 3 and (count == 1 or shape[0] in (1, count)))):
+        raise ValueError(
+            f"pictures of shape {shape} at {count} object distances: expected grey ones (B, H, W), one for each "
+            "distance; colours are a batch, as picture.flatten(0, 1) with distances.repeat_interleave(3)"
+        )
+    if (most := float(picture.detach().max())) > _LARGEST:
+        raise ValueError(
+            f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"
+        )
+    return picture

@@ -1,0 +1,269 @@
+"""Image formation: convolution of images with point spread functions, at one or several depths.
+
+Images are floating-point numbers in any unit; integers of 8 or 16 bits are scaled to 0 … 1 (`as_picture`).
+
+Kernels (..., h, w) are centred on their middle pixel (h//2, w//2). On a `Grid` of even size the centre lies half a
+pixel before it, so that the kernel shifts an image by half a pixel; deconvolution with the same kernel removes the
+shift, and so does origin="grid".
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import broadcast_shape, safe_divide
+
+#: Extension beyond the borders of an image: "zero"; "reflect", its mirror image; "taper", a blend of the mirror images
+#: at opposite borders, so that the periodic continuation has no jump.
+EXTENSIONS = ("zero", "reflect", "taper")
+BOUNDARIES = ("valid", "circular", *EXTENSIONS)
+COMPOSITIONS = ("masked", "sum", "occlusion")
+_ORIGINS = ("pixel", "grid")
+#: White of integer pictures.
+_WHITE = {torch.uint8: 255, torch.uint16: 65535}
+
+
+def as_picture(picture: Tensor | np.ndarray, what: str = "picture") -> Tensor:
+    """An image as floating-point numbers; integers of 8 or 16 bits are divided by their largest value.
+
+    Raises ValueError for other integers, whose white level is unknown, and for complex numbers.
+    """
+    picture = torch.as_tensor(picture)
+    if picture.is_floating_point():
+        return picture
+    if picture.dtype not in _WHITE:
+        raise ValueError(
+            f"a {what} of {str(picture.dtype).removeprefix('torch.')}: its white is unknown; expected floating-point "
+            "numbers, or uint8 or uint16; convert it, as picture.float() / 255"
+        )
+    return picture.to(torch.get_default_dtype()) / _WHITE[picture.dtype]
+
+
+def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: str = "pixel") -> Tensor:
+    """Convolution, by default over the region where the whole kernel lies inside the image; by FFT.
+
+        y_ij = Σ_ab h_ab x_(i + h//2 - a, j + w//2 - b)
+
+    picture: (..., H, W); kernel: (..., h, w); leading axes broadcast. boundary: "valid" returns (..., H - h + 1,
+    W - w + 1), the region `visible`. All others return (..., H, W): "circular" assumes a periodic image, `EXTENSIONS`
+    extend it. origin: "pixel", or "grid": the centre of an even kernel is (h - 1)/2 and its half-pixel shift is removed
+    (not for "valid", where the shift would wrap around). Raises ValueError for a kernel larger than a valid or circular
+    image, and for axes that do not broadcast.
+    """
+    picture = as_picture(picture)
+    _check_choice(boundary, BOUNDARIES, "boundary")
+    _check_kernel(kernel)
+    check_axes(picture=picture, kernel=kernel)
+    size, spot = picture.shape[-2:], kernel.shape[-2:]
+    _check_origin(boundary, origin, spot)
+    # An extension holds the reach of the kernel on both sides.
+    shape = tuple(n + 2 * (m // 2) if boundary in EXTENSIONS else n for n, m in zip(size, spot, strict=True))
+    check_fit(spot, shape)
+    if boundary in EXTENSIONS:
+        picture = extend(picture, shape, boundary=boundary)
+    transfer = torch.fft.rfft2(kernel, s=shape)
+    if origin == "grid":
+        transfer = transfer * _half_pixels(kernel, shape)[:, : shape[1] // 2 + 1]
+    blurred = torch.fft.irfft2(torch.fft.rfft2(picture) * transfer, s=shape)
+    if boundary == "valid":
+        return blurred[..., spot[0] - 1 :, spot[1] - 1 :]
+    return torch.roll(blurred, (-(spot[0] // 2), -(spot[1] // 2)), (-2, -1))[..., : size[0], : size[1]]
+
+
+def blur_adjoint(image: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: str = "pixel") -> Tensor:
+    """The transpose of `blur`: ⟨blur(x), y⟩ = ⟨x, blur_adjoint(y)⟩: correlation, with extensions folded back.
+
+    image: (..., H, W) as returned by `blur` with this boundary; returns images, larger than `image` for "valid".
+    """
+    more = [n - 1 if boundary == "valid" else 0 for n in kernel.shape[-2:]]
+    batch = torch.broadcast_shapes(image.shape[:-2], kernel.shape[:-2])
+    picture = image.new_zeros(*batch, *(n + m for n, m in zip(image.shape[-2:], more, strict=True)))
+    _, transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)
+    return transpose(image.expand(*batch, *image.shape[-2:]))[0]
+
+
+def visible(picture: Tensor, spot: tuple[int, int]) -> Tensor:
+    """The region (..., H - h + 1, W - w + 1) of images that a "valid" blur returns; spot: (h, w) of the kernels."""
+    (rows, columns), (h, w) = picture.shape[-2:], spot
+    top, left = h - 1 - h // 2, w - 1 - w // 2
+    return picture[..., top : rows - h // 2, left : columns - w // 2]
+
+
+def transfer_functions(kernels: Tensor, size: int | tuple[int, int], *, origin: str = "pixel") -> Tensor:
+    """H (..., rows, columns), Fourier transforms of kernels (..., h, w) on images of that size, ordered as by `fft2`.
+
+    origin: as for `blur`, which multiplies by them for boundary "circular". At origin "grid" an even kernel is 0 at the
+    Nyquist frequency, where a half-pixel shift is undefined.
+    """
+    shape = (size, size) if isinstance(size, int) else (size[0], size[1])
+    _check_choice(origin, _ORIGINS, "origin")
+    h, w = kernels.shape[-2:]
+    check_fit((h, w), shape)
+    padded = torch.nn.functional.pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
+    placed = torch.roll(padded, (-(h // 2), -(w // 2)), (-2, -1))
+    transfer = torch.fft.fft2(placed)
+    return transfer if origin == "pixel" else transfer * _half_pixels(kernels, shape)
+
+
+def extend(picture: Tensor, shape: tuple[int, int], *, boundary: str) -> Tensor:
+    """Images (..., H, W) extended to `shape`, one period of the continuation.
+
+    The first half of the added rows and columns continues the last one, the second half precedes the first one.
+    boundary: one of `EXTENSIONS`; mirror images repeat the border pixel, as often as needed.
+    """
+    _check_choice(boundary, EXTENSIONS, "boundary")
+    rows, columns = picture.shape[-2:]
+    check_fit((rows, columns), shape, "a picture", "a period")
+    if boundary == "zero":
+        return torch.nn.functional.pad(picture, (0, shape[1] - columns, 0, shape[0] - rows))
+    return _extend_axis(_extend_axis(picture, shape[0], -2, boundary), shape[1], -1, boundary)
+
+
+def depth_masks(depth: Tensor, planes: Tensor, *, softness: float = 0.0, feather: float = 0.0) -> Tensor:
+    """Weights (..., D, H, W) of every pixel of a depth map (..., H, W) in layers at `planes` (D,); they sum to one.
+
+        m_d = s((z - b_d)/w) - s((z - b_(d+1))/w),   b_d midway between planes d - 1 and d,   s(t) = 1/(1 + e^-t)
+
+    planes: ascending and finite, in the unit of the depth map; reciprocal distances (0 at infinity) order the layers
+    from far to near, as `blur_layers` requires. softness: w, in the same unit; 0 assigns every pixel to the nearest
+    plane. feather: standard deviation in pixels of a Gaussian blur of the masks.
+    """
+    if planes.dim() != 1 or not bool((planes[1:] > planes[:-1]).all() & torch.isfinite(planes).all()):
+        raise ValueError(
+            f"planes {planes.tolist()}: expected finite, ascending ones (1/distance where one is infinite)"
+        )
+    beyond = depth[..., None, :, :] - (0.5 * (planes[1:] + planes[:-1]))[:, None, None]
+    above = torch.sigmoid(beyond / softness) if softness > 0 else (beyond > 0).to(beyond.dtype)
+    all_of_it = torch.ones_like(depth)[..., None, :, :]
+    masks = torch.cat([all_of_it, above], -3) - torch.cat([above, torch.zeros_like(all_of_it)], -3)
+    if not feather > 0:
+        return masks
+    reach = math.ceil(4 * feather)
+    x = torch.arange(-reach, reach + 1, dtype=masks.dtype, device=masks.device)
+    line = torch.exp(-0.5 * (x / feather) ** 2)
+    return blur(masks, (line[:, None] * line) / line.sum() ** 2, boundary="reflect")
+
+
+def blur_layers(
+    picture: Tensor,
+    masks: Tensor,
+    kernels: Tensor,
+    *,
+    composition: str = "occlusion",
+    boundary: str = "valid",
+) -> Tensor:
+    """The image of a layered colour scene, each layer blurred by its own kernels.
+
+        masked:     y = Σ_d m_d (h_d ∗ x)          each pixel as if the whole scene were at its depth
+        sum:        y = Σ_d h_d ∗ (m_d x)          no occlusion
+        occlusion:  y = Y_D/A_D,   Y_d = (1 - a_d) Y_(d-1) + h_d ∗ (m_d x),   a_d = h_d ∗ m_d,  A likewise from a
+
+    With occlusion a blurred near layer covers the layers behind; division by the coverage A fills in the parts of them
+    that the image does not show (after Ikoma et al., 2021). A uniform image stays uniform with "masked" and
+    "occlusion". picture: (..., C, H, W); masks: (..., D, H, W) from far to near, summing to one; kernels: (..., D, C,
+    h, w). boundary: as for `blur`. Raises ValueError for other shapes.
+    """
+    picture = as_picture(picture)
+    _check_kernel(kernels)
+    for what, tensor, axes in (
+        ("picture", picture, "C, H, W"),
+        ("masks", masks, "D, H, W"),
+        ("kernels", kernels, "D, C, h, w"),
+    ):
+        if tensor.dim() < axes.count(",") + 1:
+            raise ValueError(f"{what} of shape {tuple(tensor.shape)}: expected (..., {axes})")
+    colours, of_kernels = picture.shape[-3], kernels.shape[-3]
+    if colours != of_kernels and 1 not in (colours, of_kernels):
+        raise ValueError(f"a picture of {colours} colours and kernels of {of_kernels}: expected one each")
+    masks = masks if masks.is_floating_point() else masks.to(kernels.dtype)  # shares of 0 and 1
+    _check_choice(composition, COMPOSITIONS, "composition")
+    if masks.shape[-3] != kernels.shape[-4] and kernels.shape[-4] != 1:
+        raise ValueError(f"{masks.shape[-3]} masks and kernels of {kernels.shape[-4]} depths: expected one each")
+    layers, scene = masks[..., :, None, :, :], picture[..., None, :, :, :]
+    if composition == "masked":
+        shown = visible(layers, kernels.shape[-2:]) if boundary == "valid" else layers
+        return (shown * blur(scene, kernels, boundary=boundary)).sum(-4)
+    light = blur(layers * scene, kernels, boundary=boundary)
+    if composition == "sum":
+        return light.sum(-4)
+    # Coverage by normalised kernels: a kernel of energy below 1 darkens its layer without making it transparent.
+    cover = blur(layers, safe_divide(kernels, kernels.sum((-2, -1), keepdim=True)), boundary=boundary)
+    total, covered = light[..., 0, :, :, :], cover[..., 0, :, :, :]
+    for near_light, near_cover in zip(light.unbind(-4)[1:], cover.unbind(-4)[1:], strict=True):
+        total = (1 - near_cover) * total + near_light
+        covered = (1 - near_cover) * covered + near_cover
+    # Where nothing covers, the FFT leaves ±1e-16: neither light nor a division by it.
+    floor = 1e3 * torch.finfo(covered.dtype).eps
+    return safe_divide(total, torch.where(covered > floor, covered, 0.0))
+
+
+def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tensor:
+    """Mirror images behind an axis up to `length`, blending from that of its end to that of its start."""
+    count = picture.shape[axis]
+    missing = length - count
+    if missing == 0:
+        return picture
+    place = torch.arange(missing, device=picture.device)
+    share = ((place + 0.5) / missing).to(picture.dtype)
+    # Cosine: no kink at the borders.
+    fade = 0.5 - 0.5 * torch.cos(math.pi * share) if boundary == "taper" else (share > 0.5).to(picture.dtype)
+    fade = fade[:, None] if axis == -2 else fade
+    last, first = (picture.index_select(axis, _mirror(k, count)) for k in (count + place, place - missing))
+    return torch.cat([picture, last + fade * (first - last)], axis)
+
+
+def _mirror(place: Tensor, count: int) -> Tensor:
+    """Index of the pixel at position `place` of the mirrored continuation of `count` pixels: … 1 0 | 0 1 2 | 2 1 …"""
+    folded = place % (2 * count)
+    return torch.minimum(folded, 2 * count - 1 - folded)
+
+
+def _half_pixels(kernel: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Phases exp(-iπf) (rows, columns) that shift kernels by half a pixel along every axis of even size."""
+    phases = []
+    for count, size in zip(shape, kernel.shape[-2:], strict=True):
+        frequency = torch.fft.fftfreq(count, dtype=kernel.dtype, device=kernel.device)
+        # At ½ the phase must be real: half the sum of exp(-iπ/2) and its conjugate, 0.
+        shift = torch.polar((frequency.abs() < 0.5).to(frequency.dtype), -math.pi * frequency)
+        phases.append(torch.ones_like(frequency) if size % 2 else shift)
+    return phases[0][:, None] * phases[1]
+
+
+def check_axes(**tensors: Tensor) -> None:
+    """Raise ValueError unless the axes before (rows, columns) of images, kernels or filters broadcast."""
+    try:
+        broadcast_shape(*(tensor.shape[:-2] for tensor in tensors.values()))
+    except ValueError:
+        shapes = " and ".join(f"a {name} of shape {tuple(tensor.shape)}" for name, tensor in tensors.items())
+        raise ValueError(
+            f"{shapes}: the axes before (rows, columns) do not broadcast; expected equal numbers, or 1"
+        ) from None
+
+
+def _check_kernel(kernel: Tensor) -> None:
+    if not kernel.is_floating_point():
+        kind = str(kernel.dtype).removeprefix("torch.")
+        raise ValueError(f"a kernel of {kind}: expected floating-point numbers, the share of the light in each pixel")
+
+
+def _check_choice(choice: str, known: tuple[str, ...], what: str) -> None:
+    if choice not in known:
+        raise ValueError(f"{what} {choice!r}: expected {', '.join(known)}")
+
+
+def check_fit(small, large, what: str = "a kernel", where: str = "a picture") -> None:
+    """Raise ValueError unless `small` (rows, columns) fit into `large`."""
+    (h, w), (rows, columns) = small, large
+    if h > rows or w > columns:
+        raise ValueError(f"{what} of {h} × {w} pixels on {where} of {rows} × {columns}: expected a larger one")
+
+
+def _check_origin(boundary: str, origin: str, spot) -> None:
+    _check_choice(origin, _ORIGINS, "origin")
+    if boundary == "valid" and origin == "grid" and (spot[0] % 2 == 0 or spot[1] % 2 == 0):
+        raise ValueError(
+            f"origin 'grid' with a kernel of {spot[0]} × {spot[1]} pixels and boundary 'valid': half a pixel's shift "
+            "reaches across the whole picture; expected odd sizes, or another boundary"
+        )

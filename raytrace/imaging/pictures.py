@@ -1,0 +1,171 @@
+"""Pictures to train on: folders of photographs, and dead-leaves images.
+
+Every draw is keyed by whole numbers (seed, epoch, sample), never by the order of calls: a sample is the same on one
+process or on many, in a first run or in a resumed one.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from raytrace.io.pictures import SUFFIXES, PictureError, read_grey
+
+_SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # what a draw is for: the last number of its key
+
+
+#: Bare pixels of dead leaves from which on looking at each pixel is faster than at each leaf.
+_FEW_BARE = 1000
+
+
+class NoPictures(PictureError):
+    """A folder without pictures, or with pictures that are all too small."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """Grey pictures, each (H, W) of 8 bits, and the name of each."""
+
+    samples: tuple[np.ndarray, ...]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Of each picture its folder: pictures of one are alike. Where there is but one, each is its own class."""
+        folders = tuple(str(Path(name).parent) for name in self.names)
+        return folders if len(set(folders)) > 1 else self.names
+
+
+def digest(samples: Sequence[np.ndarray]) -> str:
+    """How many pictures, and a hash of all their pixels: what a run is known by that learns from them."""
+    found = hashlib.blake2b(digest_size=8)
+    for sample in samples:
+        found.update(repr(sample.shape).encode())
+        found.update(np.ascontiguousarray(sample))
+    return f"{len(samples)}, blake2 {found.hexdigest()}"
+
+
+def pictures_of(kind: str) -> str:
+    """What pictures are called that are of a kind, one of leaves or "pictures"."""
+    return kind if kind == "pictures" else f"pictures of {kind}"
+
+
+def draws(*key: int) -> np.random.Generator:
+    """Random numbers of a key of whole numbers ≥ 0, independent of those of every other key."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+
+
+def files(folder: str | Path, most: int | None = None) -> list[Path]:
+    """All pictures under a folder, sorted by path, or `most` of them, evenly from all.
+
+    Raises NoPictures for one without any.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise NoPictures(f"{folder}: no such folder; expected one with pictures in it, in any subfolders")
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not found:
+        raise NoPictures(f"{folder}: no pictures found; expected {', '.join(SUFFIXES)} files in it or below")
+    count = min(most or len(found), len(found))
+    return [found[i * len(found) // count] for i in range(count)]
+
+
+def read(paths: Sequence[str | Path], *, least: int, bar: Callable[[Iterable], Iterable] = iter) -> Pictures:
+    """Pictures of at least `least` × `least` pixels; smaller ones are left out.
+
+    bar: wraps the paths, to show one. Raises PictureError naming a file that is none, NoPictures if none is left.
+    """
+    samples = [(read_grey(path), str(path)) for path in bar(paths)]
+    kept = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
+    if not kept:
+        raise NoPictures(f"none of {len(samples)} pictures has {least} × {least} pixels, a patch and its margin")
+    return Pictures(*zip(*kept, strict=True))
+
+
+def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pictures, Pictures]:
+    """Pictures to train on and pictures to test on. Whole ones: crops of one texture never stand on both sides."""
+    if len(pictures) < 2:
+        raise NoPictures(f"{len(pictures)} picture cannot be split into training and test ones: give two at least")
+    order = draws(seed, _SPLIT).permutation(len(pictures))
+    count = min(max(1, round(share * len(order))), len(order) - 1)
+    return tuple(
+        Pictures(tuple(pictures.samples[i] for i in part), tuple(pictures.names[i] for i in part))
+        for part in (np.sort(order[:count]), np.sort(order[count:]))
+    )
+
+
+def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float = 1.0) -> Pictures:
+    """Opaque discs of radii ∝ r⁻³ over one another until nothing shows through: natural statistics without a file.
+
+    smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang (Int. J. Comput. Vis. 41,
+    2001): occlusion alone gives the spectra of natural pictures.
+    """
+    return Pictures(
+        tuple(_leaves(size, draws(seed, number, _LEAVES), smallest) for number in range(count)),
+        tuple(f"dead leaves {number}" for number in range(count)),
+    )
+
+
+def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarray:
+    picture, bare = np.zeros((size, size), np.uint8), np.ones((size, size), bool)
+    while bare.any():
+        lay = _leaf_by_leaf if bare.sum() > _FEW_BARE else _pixel_by_pixel
+        lay(picture, bare, *_leaf_batch(size, random, smallest))
+    return picture
+
+
+def _leaf_by_leaf(picture: np.ndarray, bare: np.ndarray, *leaves: np.ndarray) -> None:
+    """Every leaf, the topmost first, covers what is bare."""
+    size, places = len(picture), np.arange(len(picture))
+    for radius, x, y, shade in zip(*(each.tolist() for each in leaves), strict=True):
+        rows = slice(max(0, int(y - radius)), min(size, int(y + radius) + 2))
+        columns = slice(max(0, int(x - radius)), min(size, int(x + radius) + 2))
+        open_here = bare[rows, columns]
+        if open_here.any():
+            covered = (places[columns] - x) ** 2 + ((places[rows] - y) ** 2)[:, None] <= radius * radius
+            covered &= open_here
+            picture[rows, columns][covered] = shade
+            open_here &= ~covered
+
+
+def _pixel_by_pixel(picture: np.ndarray, bare: np.ndarray, *leaves: np.ndarray) -> None:
+    """The same picture: every bare pixel is of the first leaf that covers it."""
+    rows, columns = np.nonzero(bare)
+    for radius, x, y, shade in zip(*(np.split(each, 16) for each in leaves), strict=True):
+        covers = (columns[:, None] - x) ** 2 + (rows[:, None] - y) ** 2 <= radius * radius
+        covered = covers.any(1)
+        picture[rows[covered], columns[covered]] = shade[covers[covered].argmax(1)]
+        bare[rows[covered], columns[covered]] = False
+        rows, columns = rows[~covered], columns[~covered]
+
+
+def _leaf_batch(size: int, random: np.random.Generator, smallest: float) -> tuple[np.ndarray, ...]:
+    """Radius, place and shade of the next leaves, the topmost first; of density ∝ r⁻³, so that 1/r² is even."""
+    count, largest = 4096, size / 2
+    radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, count))
+    x, y = random.uniform(-1, 1, (2, count)) * (size / 2 + radius) + size / 2
+    return radius, x, y, random.integers(0, 256, count)
+
+
+def crop(pictures: Pictures, sample: int, *, epoch: int, size: int, crops: int = 4, seed: int = 0) -> np.ndarray:
+    """Patch (size, size) in [0, 1] of a sample of an epoch of `crops` patches a picture, turned and mirrored by chance.
+
+    sample: 0 … crops · len(pictures) - 1; the pictures come in an order of the epoch's own.
+    """
+    number = int(order(len(pictures) * crops, epoch=epoch, seed=seed)[sample]) // crops
+    picture, random = pictures.samples[number], draws(seed, epoch, sample, _CROP)
+    row, column = (int(random.integers(0, extent - size + 1)) for extent in picture.shape)
+    patch = np.rot90(picture[row : row + size, column : column + size], int(random.integers(4)))
+    return (patch.T if random.integers(2) else patch).astype(np.float32) / 255
+
+
+@functools.lru_cache(maxsize=4)
+def order(count: int, *, epoch: int, seed: int = 0) -> np.ndarray:
+    """The order of `count` samples in an epoch."""
+    return draws(seed, epoch, count, _ORDER).permutation(count)

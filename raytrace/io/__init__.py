@@ -1,0 +1,336 @@
+"""Lens files: the suffix of a file selects its format; reading gives a Lens, writing brings every number back exactly.
+
+    io/source.py        text, numbers, records, errors with file, line and surface
+    io/report.py        requested glass substitutes, the report of every keyword
+    io/materials.py     glasses by name
+    io/assembly.py      a neutral draft of a lens, checked once for all readers
+    io/zemax, codev, oslo, ray_optics, table        a format each: keyword tables, reader, writer
+    io/frames.py, ray_tables.py, pictures.py        pandas tables, tables of rays, images
+
+A new format is a row of FORMATS and a folder with a reader: text -> records with places -> LensDraft -> `assemble`.
+Tests: tests/test_formats.py for all formats, and a file for each format.
+"""
+
+import dataclasses
+import os
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from raytrace.files import shipped, write_atomically
+from raytrace.io.codev import read as codev_read
+from raytrace.io.codev import write as codev_write
+from raytrace.io.oslo import read as oslo_read
+from raytrace.io.ray_optics import read as ray_optics_read
+from raytrace.io.report import NONE, Draft, Substitutes, Varied, operand_uses, substitutes_of
+from raytrace.io.report import BadSubstitute as BadSubstitute
+from raytrace.io.report import ImportReport as ImportReport
+from raytrace.io.source import LensFileError as LensFileError
+from raytrace.io.source import LensFileWarning as LensFileWarning
+from raytrace.io.source import Place, decode, read_content, read_text, shown
+from raytrace.io.source import UnsupportedSurface as UnsupportedSurface
+from raytrace.io.table import read as table_read
+from raytrace.io.table import write as table_write
+from raytrace.io.zemax import archive as zemax_archive
+from raytrace.io.zemax import read as zemax_read
+from raytrace.io.zemax import write as zemax_write
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import check_unit
+from raytrace.maths.result import Result
+from raytrace.maths.value import value
+from raytrace.system.configurations import count
+from raytrace.system.lens import Lens, check_media
+from raytrace.system.lens import check as check_lens
+from raytrace.system.optimization_data import OptimizationData
+from raytrace.words import calling_level, named_value
+
+#: Substitutes for glasses of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown glass.
+Substitute = Mapping[str, str] | str | Sequence[str] | None
+
+
+class Format(NamedTuple):
+    """A format of lens files.
+
+    name: in the report; parse: (content, file, report, catalogs) -> Lens; write: (lens, file, catalogs) -> content,
+    None for a format that is only read; load: path -> content, text or bytes; configurations: whether a file may hold
+    several, of which `parse` takes the number.
+    """
+
+    name: str
+    parse: Callable[..., Lens]
+    write: Callable[..., bytes] | None = None
+    load: Callable[[Path], str | bytes] = read_text
+    configurations: bool = False
+
+    def read(
+        self,
+        content: str | bytes,
+        file: str,
+        *,
+        catalogs: Sequence[Path] = (),
+        strict: bool = False,
+        substitutes: Substitutes = NONE,
+        **options,
+    ) -> tuple[Lens, ImportReport]:
+        """The lens of a content and the report of its import.
+
+        file: its name, for messages and for the catalogs in its folder. catalogs: further glass catalogs (.agf).
+        strict: every warning is an error. Raises LensFileError, UnsupportedSurface and UnknownGlass.
+        """
+        report = Draft(file, self.name, substitutes)
+        lens = self.parse(content, file, report, tuple(catalogs), **options)
+        return lens, report.finished(strict=strict)
+
+
+_TEXT_TABLE = Format("table", table_read.read, partial(table_write.write, separator="\t"))
+
+#: The formats by suffix, in lower case.
+FORMATS = {
+    ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True),
+    ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
+    ".seq": Format("seq", codev_read.read, codev_write.write),
+    ".len": Format("len", oslo_read.read),
+    ".roa": Format("roa", ray_optics_read.read, load=read_content),
+    ".csv": Format("table", table_read.read, table_write.write),
+    ".tsv": _TEXT_TABLE,
+    ".txt": _TEXT_TABLE,
+}
+
+#: The suffixes of formats that are written too.
+WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.write)
+
+#: The folder of the lenses that come with the package.
+_LENSES = shipped("lenses")
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_lens(
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+    substitute: Substitute = None,
+) -> Lens:
+    """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), .roa (ray-optics), or a
+    table.
+
+    path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
+    as `raytrace.materials.catalogs.find_glass` does; a catalog that the file names is found in its folder, or in it.
+    strict: raise where the file holds an unknown keyword or an assumption is needed, instead of one LensFileWarning.
+    configuration: of a multi-configuration file, from 1; by default the one that was active when it was saved.
+    `lens.configurations` are all of them. substitute: glasses in place of those of the file, each reported in a
+    warning: {"SSK4": "SSK4A"}, or "nearest" for every unknown glass, by the nd and Vd of the file (`io.report`).
+    Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface; and
+    BadSubstitute.
+    """
+    lens, report = read_lens_with_report(
+        path, catalogs=catalogs, strict=strict, configuration=configuration, substitute=substitute
+    )
+    if report.warnings:
+        warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=calling_level())
+    return lens
+
+
+def as_lens(lens: Lens | str | os.PathLike, verb: str) -> Lens:
+    """A lens unchanged, or that of a path or of a shipped name. Raises TypeError, naming the function, for others."""
+    if isinstance(lens, Lens):
+        return lens
+    if isinstance(lens, (str, os.PathLike)):
+        return read_lens(lens)
+    hint = "; it has one, as its `lens`" if isinstance(getattr(lens, "lens", None), Lens) else ""
+    expected = "a Lens, the path of a lens file or the name of a shipped lens"
+    raise TypeError(f"{verb}: `lens` is {named_value(lens)}; expected {expected}{hint}")
+
+
+def read_lens_with_report(
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+    substitute: Substitute = None,
+    evaluated: Collection[str] | None = None,
+) -> tuple[Lens, ImportReport]:
+    """As `read_lens`, with the report of every keyword; its warnings are in it, and not issued.
+
+    evaluated: the names of merit operands that are evaluated, as distinct from those that are only known.
+    """
+    path = Path(path)
+    if not path.exists():
+        path = shipped_lens(path) or path
+    form, file = _format(path), str(path)
+    options = {"configuration": configuration} if form.configurations else {}
+    substitutes = substitutes_of(substitute)
+    lens, report = form.read(
+        form.load(path), file, catalogs=catalogs, strict=strict, substitutes=substitutes, **options
+    )
+    if configuration is not None and configuration != lens.current_configuration:
+        message = f"has no configuration {configuration}; a file of this format holds one"
+        raise LensFileError(message, Place(file))
+    varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
+    data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
+    report = dataclasses.replace(
+        report,
+        surfaces=len(lens.surfaces),
+        stop_surface=lens.stop,
+        primary_wavelength=lens.primary_wavelength,
+        wavelengths=tuple(lens.wavelengths.tolist()),
+        ray_aiming=lens.ray_aiming,
+        configurations=tuple(varied),
+        variables=tuple(map(str, data.variables)),
+        solves=tuple(map(str, data.solves)),
+        kept=tuple(map(str, data.kept)),
+        operands=operand_uses(data.merit, evaluated),
+        tolerances=len(data.tolerances),
+    )
+    return lens, report
+
+
+def shipped_lens(name: str | os.PathLike) -> Path | None:
+    """The file of a shipped lens, with or without its folder and .zmx; None if there is none."""
+    path = Path(name)
+    if not path.name or path.parent not in (Path(), Path("lenses"), Path("lenses/examples")):
+        return None
+    candidates = [_LENSES / part / file for part in ("", "examples") for file in (path.name, f"{path.name}.zmx")]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
+    suffix = path.suffix.lower()
+    if suffix not in known:
+        message = f"the suffix {path.suffix!r} is that of no format" if suffix else "has no suffix to select its format"
+        message = f"a {suffix} file is read, but not written" if suffix in FORMATS else f"{message} of lens files"
+        raise LensFileError(f"{message}; expected one of {', '.join(known)}", Place(str(path)))
+    return FORMATS[suffix]
+
+
+# -- checking and conversion ------------------------------------------------------------------------------------------
+
+
+def check(
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+    substitute: Substitute = None,
+    evaluated: Collection[str] | None = None,
+) -> ImportReport:
+    """The report of a lens file: keywords that were read and left out, the source of each glass, notes and warnings.
+
+    strict: raise where something was assumed. configuration: that which must be traceable. evaluated: as for
+    `read_lens_with_report`. Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
+    """
+    return checked(path, catalogs, strict, configuration, substitute, evaluated)[1]
+
+
+def checked(
+    path, catalogs, strict: bool, configuration: int | None, substitute: Substitute, evaluated
+) -> tuple[Lens, ImportReport]:
+    """The lens of `check` and the report."""
+    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    lens, report = read_lens_with_report(path, **options, evaluated=evaluated)
+    try:
+        check_lens(lens)
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
+    check_media(lens, lens.wavelengths, where=str(path))
+    return lens, report
+
+
+@value
+class Conversion(Result):
+    """A lens file written in another format."""
+
+    source: str
+    target: str
+    surfaces: int
+
+    def document(self) -> dict:
+        return {"input": self.source, "output": self.target, "surfaces": self.surfaces}
+
+    def __str__(self) -> str:
+        return f"{self.target}: {self.surfaces} surfaces from {self.source}"
+
+
+def convert(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+    substitute: Substitute = None,
+) -> Conversion:
+    """Read a lens file and write it in the format of the suffix of `target`; as `read_lens` and `write_lens`."""
+    lens, report = read_lens_with_report(
+        source, catalogs=catalogs, strict=strict, configuration=configuration, substitute=substitute
+    )
+    for warning in report.warnings:
+        warnings.warn(warning, LensFileWarning, stacklevel=calling_level())
+    write_lens(lens, target, catalogs=catalogs)
+    return Conversion(report.file, str(target), len(lens.surfaces))
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
+    """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
+
+    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
+    cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
+    and other data that the file does not bring back.
+    """
+    path = Path(path)
+    try:
+        check_unit(lens.wavelengths, believed=lens.wavelengths)  # refuses wavelengths that are not above 0
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
+    form = _format(path, WRITTEN)
+    content = form.write(lens, str(path), catalogs=tuple(catalogs))
+    changed = _changes(lens, content, form, path, catalogs)
+    if changed:
+        message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
+        warnings.warn(message, LensFileWarning, stacklevel=calling_level())
+    try:
+        write_atomically(path, lambda file: file.write(content))
+    except OSError as error:
+        raise LensFileError(error.strerror or str(error), Place(str(path))) from error
+
+
+def _changes(lens: Lens, content: bytes, form: Format, path: Path, catalogs: Sequence[Path]) -> list[str]:
+    """The texts and optimisation data that the content does not bring back. Raises LensFileError if it is not read."""
+    try:
+        again, _ = form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)
+    except UnknownGlass:  # of a catalog that is unavailable
+        return []
+    except LensFileError as error:
+        reason = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
+        message = f"the file would not be read again: {reason}"
+        raise LensFileError(message, Place(str(path), None, error.surface)) from error
+    pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
+    pairs += [(f"the catalog {name}", name, "") for name in lens.catalogs if name not in again.catalogs]
+    surfaces = zip(lens.surfaces, again.surfaces, strict=True)
+    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(surfaces)]
+    if count(lens.operands) != count(again.operands):
+        pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
+    else:
+        pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
+    data, read_again = lens.optimization_data, again.optimization_data
+    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
+        if read_again is not None:
+            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
+            both = zip(data.variables, read_again.variables, strict=False)
+            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
+            if unbound and free[0] == free[1]:
+                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
+                read_again = dataclasses.replace(read_again, variables=data.variables)
+        if read_again != data:
+            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
+    return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

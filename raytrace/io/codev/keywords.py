@@ -1,0 +1,386 @@
+"""The commands of a CODE V sequence (.seq), a row each, and a text sorted by them: the system and the surfaces.
+
+A sequence is a stream of commands: `;` separates two of them on a line, `&` at the end of a line continues it in the
+next, `!` begins a comment, texts are in ' or ". A command has three letters, in either case; it may be followed by its
+object: a surface (SO, SI, Sk), a field (Fk), a wavelength (Wk), a zoom position (Zk).
+"""
+
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
+from raytrace.io.source import MAX_SURFACES, Block, LensFileError, Place, Record, UnsupportedSurface, is_number, shown
+
+#: Commands of x and y of the field points, by the kind of field.
+FIELD_KINDS = {
+    "angle": ("XAN", "YAN"),
+    "object_height": ("XOB", "YOB"),
+    "paraxial_image_height": ("XIM", "YIM"),
+    "real_image_height": ("XRI", "YRI"),
+}
+
+#: Coefficients of an asphere, of r⁴, r⁶, … r²⁰.
+LETTERS = "ABCDEFGHJ"
+
+#: Shape of an aperture by the commands of its sizes.
+APERTURES = {"circular": ("CIR",), "rectangular": ("REX", "REY"), "elliptic": ("ELX", "ELY")}
+APERTURE_WORDS = (*(word for words in APERTURES.values() for word in words), "ADX", "ADY", "ARO")
+
+#: Label of an obscuration that makes a ring of the clear circle of its surface.
+RING = "RING"
+
+#: Data that CODE V has no command for are in comments, `!raytrace catalogs SCHOTT OHARA`.
+OWN = "!RAYTRACE"
+_OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
+
+#: Decentres and tilts by the numbers of a pose; those about x and y are left-handed, their sign turns.
+POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
+LEFT_HANDED = ("ADE", "BDE")
+
+#: Types of decentres and tilts: the axes return, bend as a mirror does, or turn back behind the surface.
+POSE_TYPES = ("DAR", "BEN", "REV")
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+SYSTEM_READ = _words(
+    "RDM LEN TIT EPD FNO NAO DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM PUX PUY PUI"
+) | {word for pair in FIELD_KINDS.values() for word in pair}
+SURFACE_READ = _words("CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF DIF HOR HWL HCT HCO") | {
+    *LETTERS,
+    *APERTURE_WORDS,
+    *POSE_WORDS.values(),
+    *POSE_TYPES,
+}
+
+
+def _by_word(rows: dict[str, str]) -> dict[str, str]:
+    return {word: reason for reason, words in rows.items() for word in words.split()}
+
+
+#: Commands that are known and left out, with the reason.
+LEFT_OUT = _by_word(
+    {
+        "initials of the designer": "INI",
+        "identity of the program": "UID",
+        "colour or style of a drawing": "CLS DOR",
+        "substrate of a mirror, for drawing": "CUM THM",
+        "value kept by the program for its error function": "DER",
+        "pick-up: the stored value is read": "PIK",
+        "variable or coupling of the optimisation": "CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC"
+        " CDC HCC CUC",
+        "tolerance": "DLT DLN DLV DLF DLR DLX DLY DLZ DLA DLB DLG DLC DLS TRX TRY TRR BTX BTY DSX DSY DSZ DSR BSX BSY"
+        " BSZ TIR CYD CYN IRR HOM ROL CMP SWV",
+        "coatings refract no rays": "MFL COA CWL",
+        "polarisation": "POL",
+        "thermal expansion": "TCE",
+        "how the program finds the rays of a wide field": "WID",
+        "listing, drawing or analysis: changes no lens": "LIS SUR VIE DRA MTF PSF SPO RIM FIE WAV FIR THO FOO RSI SIN"
+        " PMA OUT SAV EXI",
+    }
+)
+
+#: Commands that are known and not modelled: a file with one of them is refused.
+REFUSED = _by_word(
+    {
+        "centre of a tilt off the vertex": "XOD YOD ZOD",
+        "return to an earlier surface": "RET",
+        "global coordinates": "GLB",
+        "toroid or cylinder": "CYL YTO XTO AAS CUX RDX KX KY AR BR CR DR AP BP CP DP",
+        "special surface": "SPS SCO UDS SPL ZRN",
+        "diffractive surface": "HOE GRT GRO GRS GRX GRY GRZ HV1 HV2 HX1 HX2 HY1 HY2 HZ1 HZ2",
+        "gradient index": "GRI GRN GRC",
+        "thermal gradient": "THG",
+        "non-sequential surfaces": "NSS NSC",
+        "array": "ARR",
+        "lens module": "MOD MCO",
+        "birefringent medium": "BIR OAX OAY OAZ",
+        "numerical aperture in image space": "NA",
+        "telecentric object space": "TEL",
+        "afocal image space": "AFC AFI",
+        "glass of one side of a surface": "GL1 GL2",
+        "surface deformed by a file": "INT ISF",
+        "command that puts in, takes out or turns round surfaces": "INS DEL FLY SCA COP MOV",
+        "optimisation": "AUT",
+        "another file": "IN RES RUN",
+        "macro": "LCL GBL NUM STR FOR WHI IF ELS UNT FCT EVA WRI GOT LBL RFD RFS",
+    }
+)
+_KNOWN = SYSTEM_READ | SURFACE_READ | LEFT_OUT.keys() | REFUSED.keys()
+
+_SURFACE = re.compile(r"S(O|I|\d{1,6})", re.ASCII | re.IGNORECASE)
+_ZOOM = re.compile(r"Z(\d{1,6})", re.ASCII | re.IGNORECASE)
+_OF = re.compile(r"([FW]\d{1,6}|S(O|I|\d{1,6})|L['\"].*|CLR|OBS|EDG|HOL)", re.ASCII | re.IGNORECASE)
+_PIECE = re.compile(r"'[^']*'|\"[^\"]*\"|[^'\"!;]+|[!;'\"]")
+_WORD = re.compile(r"[Ll]?'[^']*'|[Ll]?\"[^\"]*\"|[^\s'\"]+")
+
+
+# -- text to commands -------------------------------------------------------------------------------------------------
+
+
+def commands(text: str, file: str) -> Iterator[Record]:
+    """The commands of a text, each with the line it begins in; and the comments of this package."""
+    waiting, start = "", 0
+    for line_number, line in enumerate(text.split("\n"), 1):
+        place = Place(file, line_number)
+        if line.lstrip().upper().startswith(OWN) and not waiting:
+            _, *words = line.split(None, 2)
+            yield Record(OWN, tuple(words), words[-1] if len(words) > 1 else "", place, False)
+            continue
+        held, start = _uncommented(line, place), start if waiting else line_number
+        if held.rstrip().endswith("&"):
+            waiting += held.rstrip()[:-1]
+            continue
+        yield from _parted(waiting + held, Place(file, start))
+        waiting = ""
+    if waiting:
+        raise LensFileError("the last line ends in &, which continues it: file cut off?", Place(file, start))
+
+
+def _uncommented(line: str, place: Place) -> str:
+    held = ""
+    for piece in _PIECE.findall(line):
+        if piece == "!":
+            break
+        if piece in "'\"":
+            raise LensFileError(f"a text that begins with {piece} does not end on its line", place)
+        held += piece
+    return held
+
+
+def _parted(line: str, place: Place) -> Iterator[Record]:
+    texts = [""]
+    for piece in _PIECE.findall(line):
+        if piece == ";":
+            texts.append("")
+        else:
+            texts[-1] += piece
+    for text in texts:
+        words = _WORD.findall(text)
+        if words:
+            yield Record(_keyword(words[0]), tuple(words[1:]), text, place, False)
+
+
+def _keyword(word: str) -> str:
+    """The command of a word; words longer than three letters may be cut to them."""
+    capitals = word.upper()
+    if capitals in _KNOWN or _SURFACE.fullmatch(capitals):
+        return capitals
+    return capitals[:3] if capitals.isalpha() and capitals[:3] in _KNOWN else capitals
+
+
+def unquoted(word: str) -> str:
+    """A word without the quotes around it."""
+    return word[1:-1] if len(word) > 1 and word[0] == word[-1] and word[0] in "'\"" else word
+
+
+# -- commands to blocks -----------------------------------------------------------------------------------------------
+
+
+class Sections(NamedTuple):
+    """A file sorted: the system, one block per surface, private glasses by name, comments of this package."""
+
+    system: Block
+    surfaces: list[Block]
+    private: dict[str, Record]
+    own: list[Record]
+
+
+class Stream:
+    """The commands so far; they are read in their order, as CODE V does."""
+
+    def __init__(self, file: str, report: Draft):
+        self.file, self.report = file, report
+        self.system, self.surfaces = Block(Place(file)), []
+        self.private: dict[str, Record] = {}
+        self.own: list[Record] = []
+        self.pointer: Block | None = None
+        self.slope: str | None = None  # whether S gives radii (RDY) or curvatures (CUY)
+        self.in_catalog = self.has_image = False
+
+    def take(self, record: Record) -> None:
+        """Sort one command in."""
+        if record.keyword == OWN:
+            self._take_own(record)
+        elif self.in_catalog and record.keyword not in ("PWL", "END"):
+            self._take_glass(record)
+        elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
+            raise LensFileError("variables of macros (^) are not followed; export the lens as numbers", record.place)
+        elif zoom := next((match for word in record.words[:2] if (match := _ZOOM.fullmatch(word))), None):
+            self._take_zoomed(record, zoom)
+        else:
+            self._take_command(record)
+
+    def _take_own(self, record: Record) -> None:
+        word = record.words[0].upper() if record.words else ""
+        status = READ if word in _OWN_WORDS else UNKNOWN
+        self.report.met(f"{OWN.lower()} {word.lower()[:40]}", status, record.place)
+        self.own.append(record._replace(keyword=word, place=self._place(record)))
+
+    def _take_glass(self, record: Record) -> None:
+        name = unquoted(_WORD.match(record.text.strip())[0])
+        held = self.system.records.get("PWL")
+        waves = held[-1].words if held else ()
+        self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves))
+        self.report.met("PRV", READ, record.place)
+
+    def _take_zoomed(self, record: Record, zoom: re.Match) -> None:
+        words = tuple(word for word in record.words if word != zoom[0])
+        if int(zoom[1]) == 1 and record.keyword in SYSTEM_READ | SURFACE_READ:
+            self._take_command(record._replace(words=words))
+        else:
+            self.report.met(record.keyword[:40], IGNORED, record.place, "of another zoom position, or left out")
+
+    def _take_command(self, record: Record) -> None:
+        word = record.keyword
+        if word in REFUSED and not _has_no_effect(record):
+            place = self._place(record)
+            raise UnsupportedSurface(f"{word} ({REFUSED[word]}) is not modelled", place)
+        if word in _HANDLED or _SURFACE.fullmatch(word):
+            self.report.met("S" if _SURFACE.fullmatch(word) else word, READ, self._place(record))
+            _HANDLED.get(word, Stream._surface)(self, record)
+        elif word in SYSTEM_READ:
+            self.report.met(word, READ, record.place)
+            self.system.records.setdefault(word, []).append(record)
+        elif word in SURFACE_READ:
+            self._of_surface(record)
+        else:
+            reason = "0, or switched off" if word in REFUSED else LEFT_OUT.get(word, "")
+            self.report.met(word[:40], IGNORED if reason else UNKNOWN, self._place(record), reason)
+
+    def _place(self, record: Record) -> Place:
+        return record.place if self.pointer is None else record.place._replace(surface=self.pointer.place.surface)
+
+    # -- surfaces
+
+    def _surface(self, record: Record) -> None:
+        """S, SO, SI, Sk: the next surface or an earlier one, and its first numbers."""
+        name = record.keyword[1:]
+        number = {"O": 0, "I": None, "": None}.get(name, int(name) if name.isdigit() else None)
+        count = len(self.surfaces)
+        if name == "I" and self.has_image:
+            number = count - 1
+        if number is None or number == count:
+            self._append(record, "image" if name == "I" else "object" if name == "O" else "surface")
+        elif number < count:
+            self.pointer = self.surfaces[number]
+        else:
+            raise LensFileError(f"S{number} where S{count} should follow; lines lost or reordered?", record.place)
+        self._first_numbers(record._replace(place=self._place(record)))
+
+    def _append(self, record: Record, role: str) -> None:
+        count = len(self.surfaces)
+        if count >= MAX_SURFACES:
+            raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", record.place)
+        if self.has_image:
+            raise LensFileError("a surface after SI, the image", record.place)
+        if (count == 0) != (role == "object"):
+            raise LensFileError(f"{record.keyword} as surface {count}; a lens begins with SO, the object", record.place)
+        self.has_image = role == "image"
+        self.pointer = Block(record.place._replace(surface=count))
+        self.surfaces.append(self.pointer)
+
+    def _first_numbers(self, record: Record) -> None:
+        """Radius or curvature, thickness, glass, and refract or reflect: as commands of their own."""
+        words, place = record.words, record.place
+        if len(words) == 1 or len(words) > 4:
+            message = f"{record.keyword} with {len(words)} words, expected radius, thickness and glass"
+            raise LensFileError(message, place)
+        if (
+            self.slope is None
+            and words
+            and is_number(words[0])
+            and not _has_no_effect(record._replace(words=words[:1]))
+        ):
+            message = "its first number may be a radius (RDM) or a curvature (RDM N), which is not specified before"
+            raise LensFileError(f"{message}; add one of them", place)
+        mirror = len(words) > 2 and unquoted(words[2]).upper() == "REFL"
+        keywords = (self.slope or "RDY", "THI", "RMD" if mirror else "GLA", "RMD")
+        for word, keyword in zip(words, keywords, strict=False):
+            slot = "CUY" if keyword == "RDY" else keyword
+            self.pointer.records.setdefault(slot, []).append(record._replace(keyword=keyword, words=(word,)))
+
+    def _of_surface(self, record: Record) -> None:
+        """A command of the surface it names, else of the current one."""
+        block, words = self.pointer, record.words
+        if words and _SURFACE.fullmatch(words[0]):
+            block, words = self._named(words[0], record.place), words[1:]
+        if block is None:
+            raise LensFileError(f"{record.keyword} before the first surface (SO)", record.place)
+        record = record._replace(words=words, place=record.place._replace(surface=block.place.surface))
+        word = record.keyword
+        if word in ("CUY", "RDY", "THI") and words and not is_number(words[0]):
+            return self.report.met(word, IGNORED, record.place, "solve: the stored value is read")
+        self.report.met(word, READ, record.place)
+        slot = "CUY" if word == "RDY" else "TYPE" if word in ("SPH", "CON", "ASP") else word
+        slot = "APERTURE" if word in APERTURE_WORDS else "POSE" if word in POSE_TYPES else slot
+        block.records.setdefault(slot, []).append(record)
+        return None
+
+    def _named(self, word: str, place: Place) -> Block:
+        name = word[1:].upper()
+        number = 0 if name == "O" else len(self.surfaces) - 1 if name == "I" and self.has_image else -1
+        number = int(name) if name.isdigit() else number
+        if not 0 <= number < len(self.surfaces):
+            raise LensFileError(f"{shown(word)} is no surface so far; there are {len(self.surfaces)}", place)
+        return self.surfaces[number]
+
+    # -- commands that act at once
+
+    def _radius_mode(self, record: Record) -> None:
+        self.slope = "CUY" if record.words and record.words[0][:1] in "Nn" else "RDY"
+
+    def _new_lens(self, record: Record) -> None:
+        if self.surfaces:
+            raise LensFileError("LEN after the surfaces of a lens: a file of several lenses; split it", record.place)
+
+    def _catalog(self, record: Record) -> None:
+        self.in_catalog = record.keyword == "PRV"
+
+    def _zoom(self, record: Record) -> None:
+        """The first of the zoom positions: the first of the values of a command that is zoomed."""
+        if not record.words or is_number(record.words[0]):
+            self.system.records.setdefault("ZOO", []).append(record)
+            return
+        keyword = _keyword(record.words[0])
+        of = [word for word in record.words[1:] if _OF.fullmatch(word)]
+        values = [word for word in record.words[1:] if not _OF.fullmatch(word)]
+        if keyword in (SYSTEM_READ | SURFACE_READ) - _HANDLED.keys() and values:
+            self._take_command(record._replace(keyword=keyword, words=(*of, values[0])))
+        elif keyword in REFUSED:
+            self._take_command(record._replace(keyword=keyword, words=(*of, *values[:1])))
+
+
+_HANDLED = {
+    "S": Stream._surface,
+    "RDM": Stream._radius_mode,
+    "LEN": Stream._new_lens,
+    "PRV": Stream._catalog,
+    "END": Stream._catalog,
+    "ZOO": Stream._zoom,
+}
+
+
+def _has_no_effect(record: Record) -> bool:
+    """Whether a decentre or a like number is 0, or a feature that is not modelled is switched off."""
+    if [word.upper() for word in record.words] in (["N"], ["NO"]):
+        return True
+    numbers = [word for word in record.words if is_number(word)]
+    return bool(numbers) and not any(float(re.sub("[dD]", "e", word)) for word in numbers)
+
+
+def sections(text: str, file: str, report: Draft) -> Sections:
+    """The commands of a text sorted, each of them reported."""
+    stream = Stream(file, report)
+    for record in commands(text, file):
+        stream.take(record)
+    if stream.in_catalog:
+        raise LensFileError("PRV (private glasses) without END: file cut off?", Place(file))
+    if not stream.surfaces:
+        raise LensFileError("no surface (SO, S, SI); is it a sequence of CODE V (.seq)?", Place(file))
+    if not stream.has_image:
+        raise LensFileError(f"{len(stream.surfaces)} surfaces and no SI, the image: file cut off?", Place(file))
+    return Sections(stream.system, stream.surfaces, stream.private, stream.own)

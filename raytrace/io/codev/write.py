@@ -1,0 +1,279 @@
+"""Write a lens as a sequence of CODE V (.seq), every number with the digits that bring it back exactly."""
+
+import dataclasses
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.io.codev import glass as codev_glass
+from raytrace.io.codev.keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
+from raytrace.io.codev.surfaces import INFINITY, phase_lines
+from raytrace.io.source import LensFileError, Place, exact, exact_list, one_line, quoted, refuse_sag_terms, word
+from raytrace.materials.glass import Glass
+from raytrace.system.apertures import Aperture
+from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.phases import RadialPhase
+from raytrace.system.poses import Pose, undone
+from raytrace.system.shapes import EVEN, KINDS
+from raytrace.system.surface import Surface
+
+#: Commands of the system aperture.
+_APERTURES = {"entrance_pupil_diameter": "EPD", "image_f_number": "FNO", "object_na": "NAO"}
+
+_TILTS = ("tilt_x", "tilt_y", "tilt_z")
+
+#: Characters of a line, after which a list continues in the next.
+_LINE = 72
+
+
+def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
+    """The content of a .seq file of the lens, in mm, its surfaces by their curvatures.
+
+    file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
+    Raises LensFileError for data that a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰,
+    apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
+    """
+    place, private = Place(file), {}
+    surfaces = []
+    for number, surface in enumerate(lens.surfaces):
+        surfaces += _surface(lens, number, surface, private, catalogs, Place(file, None, number))
+    lines = [*_system(lens, private, place), *surfaces, "GO"]
+    return ("\n".join(line for line in lines if line) + "\n").encode()
+
+
+def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
+    fields = lens.fields
+    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
+        raise LensFileError(
+            "a temperature or pressure, which a .seq file does not hold here; write a table (.csv)", place
+        )
+    if fields.telecentric:
+        raise LensFileError("a telecentric object space, which a .seq file does not hold here", place)
+    waves = [codev_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
+    x, y = FIELD_KINDS[fields.kind]
+    return [
+        "RDM N;LEN",
+        *_own(lens, private, place),
+        f"TITLE {_quoted(lens.name, 'the title', place)}" if lens.name else "",
+        _aperture(lens.aperture, lens.surfaces[0], place),
+        "DIM M",
+        _listed("WL", waves),
+        f"REF {lens.primary_wavelength}",
+        _listed("WTW", _weights(lens.wavelength_weights, "weight of a wavelength", place)),
+        _listed(x, exact_list(fields.x, "field", place)),
+        _listed(y, exact_list(fields.y, "field", place)),
+        _listed("WTF", _weights(fields.weight, "weight of a field", place)),
+        *_vignetting(lens, place),
+        *map(_wrapped, codev_glass.private_lines(private, waves, place)),
+    ]
+
+
+def _weights(numbers: Tensor, quantity: str, place: Place) -> list[str]:
+    """Whole numbers without a point."""
+    return [weight.removesuffix(".0") for weight in exact_list(numbers, quantity, place)]
+
+
+def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
+    """Data that CODE V has no command for, in comments."""
+    own = OWN.lower()
+    unnamed = [key for key, glass in private.items() if not glass.name]
+    return [
+        *(f"{own} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
+        f"{own} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{own} catalogs",
+        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
+        f"{own} unnamed {' '.join(unnamed)}" if unnamed else "",
+    ]
+
+
+def _quoted(text: str, quantity: str, place: Place) -> str:
+    """A text in quotes, of the kind that is not in it."""
+    line = one_line(text, quantity, place)
+    mark = next((mark for mark in "'\"" if mark not in line), None)
+    if mark is None:
+        raise LensFileError(f"{quantity} holds both kinds of quotes, of which a .seq file needs one around it", place)
+    return f"{mark}{line}{mark}"
+
+
+def _listed(keyword: str, words: Sequence[str]) -> str:
+    return _wrapped(f"{keyword} {' '.join(words)}")
+
+
+def _wrapped(line: str) -> str:
+    """A command over as many lines as it needs, all but the last ending in &."""
+    lines = [""]
+    for part in line.split(" "):
+        if lines[-1] and len(lines[-1]) + len(part) > _LINE:
+            lines.append("")
+        lines[-1] += f" {part}"
+    return " &\n".join([lines[0].strip(), *lines[1:]])
+
+
+def _aperture(aperture: SystemAperture, first: Surface, place: Place) -> str:
+    keyword = _APERTURES.get(aperture.kind)
+    if keyword is None or (keyword == "FNO" and not bool(torch.isinf(first.thickness).all())):
+        at = " of an object at a finite distance" if keyword else ""
+        message = f"the aperture {aperture.kind.replace('_', ' ')}{at}, which a .seq file does not hold"
+        raise LensFileError(f"{message}; set `entrance_pupil_diameter` instead", place)
+    return f"{keyword} {exact(aperture.value, 'system aperture', place)}"
+
+
+def _vignetting(lens: Lens, place: Place) -> list[str]:
+    """VUX = C - D, VLX = C + D: the shortest digits that bring both back, else all of them."""
+    if lens.fields.vignetting is None:
+        return []
+    DX, DY, CX, CY, angle = (exact_list(row, "vignetting factor", place) for row in lens.fields.vignetting)
+    if any(map(float, angle)):
+        raise LensFileError("vignetting factors with an angle (VAN), which a .seq file does not hold", place)
+    lines = []
+    for axis, decentres, compressions in (("X", DX, CX), ("Y", DY, CY)):
+        pairs = [_cut(float(d), float(c)) for d, c in zip(decentres, compressions, strict=True)]
+        lines += [_listed(f"V{side}{axis}", [pair[k] for pair in pairs]) for k, side in enumerate("UL")]
+    return lines
+
+
+def _cut(decentre: float, compression: float) -> tuple[str, str]:
+    """The fractions cut off above and below, whose half sum and half difference are these numbers bit for bit."""
+    short = repr(compression - decentre), repr(compression + decentre)
+    high, low = map(Fraction, short)
+    if float((low - high) / 2) == decentre and float((low + high) / 2) == compression:
+        return short
+    high, low = Fraction(compression) - Fraction(decentre), Fraction(compression) + Fraction(decentre)
+    return _decimal(high), _decimal(low)
+
+
+def _decimal(number: Fraction) -> str:
+    """All digits of a fraction whose denominator is a power of two."""
+    power = number.denominator.bit_length() - 1
+    digits = str(abs(number.numerator) * 5**power).rjust(power + 1, "0")
+    sign = "-" if number < 0 else ""
+    return f"{sign}{digits[: len(digits) - power]}.{digits[len(digits) - power :] or 0}"
+
+
+# -- surfaces ---------------------------------------------------------------------------------------------------------
+
+
+def _surface(
+    lens: Lens, number: int, surface: Surface, private: dict[str, Glass], user: Sequence[Path], place: Place
+) -> list[str]:
+    is_round = isinstance(surface.phase, RadialPhase)
+    rest = dataclasses.replace(surface, before=None, after=None, is_break=False)
+    refuse_sag_terms(dataclasses.replace(rest, phase=None) if is_round else rest, place)
+    last = len(lens.surfaces) - 1
+    name = {0: "SO", last: "SI"}.get(number, "S")
+    curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
+    glass = codev_glass.word(_medium(lens, number), private, user, place)
+    label = _quoted(surface.comment, "the comment", place) if surface.comment.strip() else ""
+    return [
+        f"{name} {curvature} {_thickness(surface, number == last, place)} {glass}".rstrip(),
+        "  STO" if number == lens.stop else "",
+        f"  SLB {label}" if label else "",
+        f"  {OWN.lower()} break" if surface.is_break else "",
+        *_poses(surface, place),
+        *_shape(surface, place),
+        *(phase_lines(surface.phase, float(lens.primary), place) if is_round else []),
+        *_apertures(surface.apertures, place),
+        "" if surface.semi_diameter is None else f"  CIR EDG {exact(surface.semi_diameter, 'semi-diameter', place)}",
+    ]
+
+
+def _medium(lens: Lens, number: int) -> Glass:
+    """The medium behind a surface, MIRROR for a mirror: behind a coordinate break the one before it."""
+    while lens.surfaces[number].is_break:
+        number -= 1
+        while number and lens.surfaces[number].is_mirror:
+            number -= 1
+    return lens.surfaces[number].glass
+
+
+def _poses(surface: Surface, place: Place) -> list[str]:
+    """Decentres and tilts, and their type."""
+    pose, behind = surface.before, surface.after
+    if surface.is_break and behind is None and pose is not None and pose.tilts_first:
+        pose, behind = None, pose
+    if pose is None and behind is None:
+        return []
+    if pose is None and behind.tilts_first:
+        return [*_pose(undone(behind), place), "  REV"]
+    if pose is not None and not pose.tilts_first:
+        if behind is None:
+            return _pose(pose, place)
+        if _same(behind, undone(pose)):
+            return [*_pose(pose, place), "  DAR"]
+        tilts = [name for name in _TILTS if getattr(pose, name) is not None]
+        if surface.is_mirror and len(tilts) == 1 and _same(behind, Pose(**{tilts[0]: getattr(pose, tilts[0])})):
+            return [*_pose(pose, place), "  BEN"]
+    message = "poses before and behind the surface, which a .seq file has no command for"
+    raise LensFileError(f"{message}; put them into coordinate breaks", place)
+
+
+def _pose(pose: Pose, place: Place) -> list[str]:
+    numbers = ((word, getattr(pose, name)) for name, word in POSE_WORDS.items())
+    return [
+        f"  {word} {exact(-number if word in LEFT_HANDED else number, 'decentre or tilt', place)}"
+        for word, number in numbers
+        if number is not None
+    ]
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    """Whether two poses have the same numbers and the same order."""
+    for name in POSE_WORDS:
+        x, y = getattr(a, name), getattr(b, name)
+        if (x is None) != (y is None) or (x is not None and not torch.equal(x, y)):
+            return False
+    return a.tilts_first == b.tilts_first
+
+
+def _thickness(surface: Surface, is_image: bool, place: Place) -> str:
+    thickness = surface.thickness
+    if place.surface == 0 and thickness.ndim == 0 and float(thickness) == torch.inf:
+        return "0.1e14"
+    text = exact(thickness, "thickness", place)
+    if is_image and float(text):
+        raise LensFileError(f"the image has thickness {text}, which a .seq file takes for a defocus", place)
+    if place.surface == 0 and abs(float(text)) >= INFINITY:
+        raise LensFileError(f"the object is {text} mm away, which CODE V takes for infinity; make it inf", place)
+    return text
+
+
+def _shape(surface: Surface, place: Place) -> list[str]:
+    conic = [] if surface.conic is None else [f"  K {exact(surface.conic, 'conic constant', place)}"]
+    if surface.coefficients is None:
+        return ["  CON", *conic] if conic else []
+    if surface.kind != EVEN:
+        raise LensFileError(f"a .seq file has no type for an {KINDS[surface.kind].name}; write a table (.csv)", place)
+    square, *terms = exact_list(surface.coefficients, "aspheric terms", place)
+    if float(square) or len(terms) > len(LETTERS):
+        excess = f"a term of r² ({square})" if float(square) else f"terms to r^{2 * len(terms) + 2}"
+        raise LensFileError(f"{excess}; an asphere of a .seq file has r⁴ to r²⁰: write a table (.csv)", place)
+    return ["  ASP", *conic, *(f"  {letter} {term}" for letter, term in zip(LETTERS, terms, strict=False))]
+
+
+def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
+    lines = []
+    if sum(not aperture.obscures for aperture in apertures) > 1:
+        message = (
+            "several clear apertures on one surface, of which a .seq file has one; put the others on dummy surfaces"
+        )
+        raise LensFileError(message, place)
+    for k, aperture in enumerate(apertures, 1):
+        if aperture.shape not in APERTURES:
+            raise LensFileError(f"a {aperture.shape} as aperture, which a .seq file does not hold", place)
+        if aperture.shape == "circular" and aperture.extent[0] and (aperture.obscures or len(apertures) > 1):
+            message = "a ring that obscures, or together with another aperture, which a .seq file does not hold"
+            raise LensFileError(message, place)
+        of = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
+        sizes, circle = aperture.extent, aperture.shape == "circular"
+        lines += _one_aperture(aperture, sizes[1:] if circle else sizes, of, place)
+        lines += _one_aperture(aperture, sizes[:1], f" OBS L'{RING}'", place) if circle and sizes[0] else []
+    return lines
+
+
+def _one_aperture(aperture: Aperture, sizes: Sequence[float], of: str, place: Place) -> list[str]:
+    numbers = [exact(size, "size of the aperture", place) for size in sizes]
+    centre = [exact(number, "decentre of the aperture", place) for number in aperture.centre]
+    lines = [f"  {word}{of} {size}" for word, size in zip(APERTURES[aperture.shape], numbers, strict=True)]
+    return lines + [f"  AD{axis}{of} {number}" for axis, number in zip("XY", centre, strict=True) if float(number)]

@@ -1,0 +1,320 @@
+"""The text of a lens file: its encoding, the numbers, texts and records in it, and errors with file, line and surface.
+
+Numbers and texts are written such that reading brings the same 64-bit numbers and the same characters back.
+"""
+
+import json
+import os
+import re
+import stat
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.files import encoding
+from raytrace.system.surface import Surface, is_freeform, is_posed
+from raytrace.words import named
+
+#: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
+MAX_BYTES = 16 * 2**20
+MAX_SURFACES = 1000
+MAX_LINES = 200_000
+MAX_LINE = 100_000
+
+#: More characters than any number needs.
+_DIGITS = 400
+
+_NOT_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f\ufffd]")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,4})?", re.ASCII)
+_INFINITE = re.compile(r"[+-]?(inf|infinity|infinite|∞|1\.#inf)", re.ASCII | re.IGNORECASE)
+
+#: Millimetres in a unit of length.
+MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1e3, "METER": 1e3}
+
+
+# -- places and errors ------------------------------------------------------------------------------------------------
+
+
+class Place(NamedTuple):
+    """A position in a lens file: file name, line from 1, surface from 0; None where they do not apply."""
+
+    file: str
+    line: int | None = None
+    surface: int | None = None
+
+    def __str__(self) -> str:
+        place = self.file if self.line is None else f"{self.file}:{self.line}"
+        return place if self.surface is None else f"{place}, surface {self.surface}"
+
+
+class LensFileError(ValueError):
+    """A lens file that cannot be read or written. The message is one line: place, finding, expectation, remedy.
+
+    file, line, surface: the position in the file; None where that does not apply.
+    """
+
+    def __init__(self, message: str, place: Place):
+        super().__init__(" ".join(f"{place}: {message}".split()))
+        self.file, self.line, self.surface = place
+
+
+class UnsupportedSurface(LensFileError):
+    """A surface of a type that is not modelled; it is never dropped and never read as another type."""
+
+
+class LensFileWarning(UserWarning):
+    """A lens file was read, but something in it was left out or assumed."""
+
+
+def shown(text: str) -> str:
+    """An extract of a file as an error quotes it: at most 40 characters."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+# -- bytes to text ----------------------------------------------------------------------------------------------------
+
+
+def read_text(path: Path) -> str:
+    """The text of a lens file: UTF-16 (either order, with or without mark), UTF-8, else Latin-1.
+
+    Raises LensFileError for a file that is missing, not a regular file, larger than MAX_BYTES, or not text.
+    """
+    return decode(read_content(path), Place(str(path)))
+
+
+def read_content(path: Path, most: int = MAX_BYTES) -> bytes:
+    """The bytes of a file. Raises LensFileError if it is missing, not a regular file or larger than `most`."""
+    place = Place(str(path))
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            raise LensFileError("is not a regular file; give the path of a lens file", place)
+        if status.st_size > most:
+            size = f"{status.st_size / 1e6:.0f} MB"
+            raise LensFileError(f"is {size} long, more than any lens file ({most / 1e6:.0f} MB); not read", place)
+        with open(path, "rb") as file:
+            return file.read(most + 1)
+    except OSError as error:
+        raise LensFileError(f"cannot be read: {error.strerror or error}", place) from error
+    except ValueError as error:
+        if isinstance(error, LensFileError):
+            raise
+        raise LensFileError(f"cannot be opened: {error}", place) from error
+
+
+def decode(content: bytes, place: Place) -> str:
+    """Bytes to text by the rules of `read_text`, with \\n as line end."""
+    if not content.strip():
+        raise LensFileError("is empty", place)
+    codec = encoding(content)
+    try:
+        text = content.decode(codec)
+    except UnicodeDecodeError as error:
+        message = f"is not valid {codec.upper()} at byte {error.start}: damaged or cut off; save it again as UTF-8"
+        raise LensFileError(message, place) from error
+    text = text.removeprefix("\ufeff").rstrip("\x1a\x00 \t\r\n") + "\n"
+    if strange := _NOT_TEXT.search(text):
+        line = text.count("\n", 0, strange.start()) + 1
+        message = f"holds the character U+{ord(strange[0]):04X}: binary, or of an unknown encoding; save it as UTF-8"
+        raise LensFileError(message, place._replace(line=line))
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")
+    if len(lines) > MAX_LINES or max(map(len, lines)) > MAX_LINE:
+        size = f"{len(lines)} lines, the longest of {max(map(len, lines))} characters"
+        raise LensFileError(f"{size}; more than any lens file ({MAX_LINES}, {MAX_LINE})", place)
+    return text
+
+
+# -- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def number(text: str, quantity: str, place: Place) -> float:
+    """A finite decimal number, Fortran's D exponent included. Raises LensFileError for anything else."""
+    if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
+        raise LensFileError(f"{quantity} is {shown(text)}, expected a finite number", place)
+    result = plain(text)
+    if result in (float("inf"), float("-inf")):
+        raise LensFileError(f"{quantity} is {shown(text)}, too large for a 64-bit number", place)
+    return result
+
+
+def integer(text: str, quantity: str, place: Place) -> int:
+    """A whole number below a million in size, written with or without a decimal point."""
+    result = number(text, quantity, place)
+    if result != int(result) or abs(result) >= 1e6:
+        raise LensFileError(f"{quantity} is {shown(text)}, expected a whole number", place)
+    return int(result)
+
+
+def is_number(text: str) -> bool:
+    """True if `number` would accept the text."""
+    return len(text) <= _DIGITS and bool(_NUMBER.fullmatch(text)) and abs(plain(text)) != float("inf")
+
+
+def plain(text: str) -> float:
+    """The number of a text that `is_number` accepts."""
+    return float(text.replace("D", "e").replace("d", "e"))
+
+
+def is_infinite(text: str) -> bool:
+    """True for the spellings of infinity in lens files."""
+    return bool(_INFINITE.fullmatch(text))
+
+
+def double(numbers: float | list) -> Tensor:
+    """One or more numbers of a file as a 64-bit tensor."""
+    return torch.as_tensor(numbers, dtype=torch.float64)
+
+
+def exact(number: Tensor | float, quantity: str, place: Place) -> str:
+    """The shortest decimal (at most 17 digits) that reads back as the same 64-bit number.
+
+    Raises LensFileError for a batch of numbers, nan and infinity.
+    """
+    return exact_list(torch.as_tensor(number, dtype=torch.float64), quantity, place, axes=0)[0]
+
+
+def exact_list(numbers: Tensor, quantity: str, place: Place, *, axes: int = 1) -> list[str]:
+    """`exact` of every number of a one-dimensional tensor."""
+    if numbers.ndim != axes:
+        shape = tuple(numbers.shape)
+        raise LensFileError(f"{quantity} has the shape {shape}; a file holds one lens: write one of them", place)
+    values = numbers.detach().double().reshape(-1)
+    for value in values[~torch.isfinite(values)].tolist():
+        raise LensFileError(f"{quantity} is {value}; only finite numbers can be written", place)
+    return [repr(value) for value in values.tolist()]
+
+
+def thickness(number: Tensor, infinity: str, place: Place) -> str:
+    """A thickness as text; only the distance of the object may be infinite."""
+    if place.surface == 0 and number.ndim == 0 and float(number) == torch.inf:
+        return infinity
+    return exact(number, "thickness", place)
+
+
+def refuse_sag_terms(surface: Surface, place: Place) -> None:
+    """Raise LensFileError for a surface that formats of conics and rotationally symmetric terms do not hold."""
+    if surface.sag_terms is not None:
+        feature = f"has sag terms of {named(surface.sag_terms)}"
+    elif is_freeform(surface):
+        feature = f"is {surface.kind}"
+    elif surface.phase is not None:
+        feature = f"has a phase ({named(surface.phase)})"
+    elif is_posed(surface):
+        feature = "is tilted or decentred"
+    else:
+        return
+    raise LensFileError(f"the surface {feature}, which this format does not hold; a .zmx file holds most kinds", place)
+
+
+# -- texts: unchanged where that reads back, else quoted and escaped as in JSON ---------------------------------------
+
+#: Blanks that no reader strips inside a text, though Python calls them not printable.
+BLANKS = "\u00a0\u3000"
+
+
+def quoted(text: str) -> str:
+    """A text for a cell or a header line: itself, or in quotes with \\n, \\t, \\" and \\u escapes."""
+    unchanged = text == text.strip() and text and is_printable(text) and text[-1] not in ",;" and not _is_quoted(text)
+    return text if unchanged else _escaped(text)
+
+
+def plain_text(text: str) -> str:
+    """The text that `quoted` wrote; any other text without the blanks around it."""
+    text = text.strip()
+    if _is_quoted(text):
+        try:
+            content = json.loads(text)
+        except ValueError:
+            return text
+        return content if isinstance(content, str) else text
+    return text
+
+
+def is_printable(text: str) -> bool:
+    """True for a text without control characters, line separators and characters that no encoding holds."""
+    return "\ufffd" not in text and text.translate(dict.fromkeys(map(ord, BLANKS), " ")).isprintable()
+
+
+def words(text: str) -> list[str]:
+    """Words between blanks, commas or semicolons; those in quotes as `quoted` writes them."""
+    return [plain_text(word) for word in re.findall(r'"(?:[^"\\]|\\.)*"|[^\s,;]+', text)]
+
+
+def word(text: str) -> str:
+    """A text as one of `words`."""
+    return text if words(text) == [text] and is_printable(text) and '"' not in text else _escaped(text)
+
+
+def _escaped(text: str) -> str:
+    return "".join(c if is_printable(c) else json.dumps(c)[1:-1] for c in json.dumps(text, ensure_ascii=False))
+
+
+def _is_quoted(text: str) -> bool:
+    return len(text) > 1 and text[0] == text[-1] == '"'
+
+
+def one_line(text: str, quantity: str, place: Place) -> str:
+    """A text without its surrounding blanks. Raises LensFileError if it does not fit on one line of a file."""
+    if not is_printable(text.replace("\t", " ")):
+        raise LensFileError(f"{quantity} holds a line break or a control character, and cannot be written", place)
+    return text.strip()
+
+
+# -- records ----------------------------------------------------------------------------------------------------------
+
+
+class Record(NamedTuple):
+    """One line or command: its keyword, the words after it, and the raw text after the keyword and one space."""
+
+    keyword: str
+    words: tuple[str, ...]
+    text: str
+    place: Place
+    indented: bool = False
+
+    def number(self, position: int, quantity: str, default: float | None = None) -> float:
+        """The finite number at a position (0 is the first after the keyword), or `default` where the line ends."""
+        if position < len(self.words):
+            return number(self.words[position], f"{self.keyword}: {quantity}", self.place)
+        if default is None:
+            raise LensFileError(f"{self.keyword} has {len(self.words)} values; {quantity} is missing", self.place)
+        return default
+
+    def integer(self, position: int, quantity: str, default: int | None = None) -> int:
+        """The whole number at a position, or `default` where the line ends."""
+        if position >= len(self.words) and default is not None:
+            return default
+        self.number(position, quantity)
+        return integer(self.words[position], f"{self.keyword}: {quantity}", self.place)
+
+
+class Block:
+    """The records of the system or of one surface, by keyword."""
+
+    def __init__(self, place: Place):
+        self.place = place
+        self.records: dict[str, list[Record]] = {}
+
+    def all(self, *keywords: str) -> list[Record]:
+        """Every record of these keywords, in the order of the file."""
+        chosen = [record for keyword in keywords for record in self.records.get(keyword, ())]
+        return sorted(chosen, key=lambda record: record.place.line)
+
+    def last(self, *keywords: str) -> Record | None:
+        """The last record of the first of these keywords that is present."""
+        for keyword in keywords:
+            if keyword in self.records:
+                return self.records[keyword][-1]
+        return None
+
+
+def warn_of_repeats(blocks: list[Block], once, report) -> None:
+    """Warn of a keyword that occurs again in a block, for which `once` is true."""
+    for block in blocks:
+        for keyword, repeated in block.records.items():
+            if len(repeated) > 1 and once(keyword):
+                first, last = repeated[0].place.line, repeated[-1].place
+                report.warn(f"{keyword} occurs again (first in line {first}); the last is used", last)

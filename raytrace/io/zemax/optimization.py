@@ -1,0 +1,695 @@
+"""Optimisation data of a .zmx file: variables, solves and pickups, merit function and tolerances; read and written.
+
+The solves of a surface are stored with its numbers, which are the solved ones:
+
+    CURV value code a b     code 1: variable; else a row of CURVATURE_SOLVES
+    VDSZ least most         the thickness is variable; else a row of THICKNESS_SOLVES
+    VCON / VPAR n           the conic, parameter n is variable; XDAT n value 1: datum n
+    PPAR n surface factor offset    parameter n is a pickup
+    GLAS name code surface nd Vd ΔPgF v v v    code 2: a pickup, 3: may be substituted; v 1: variable, of a model glass
+    DIAM value code         0: automatic, 1: fixed, 2: a pickup, 3: the largest of all configurations
+
+CURV 2, 4, 8, 11, MAZH (paraxial, and by a real ray), PZUP, TOLE and EDGE reproduce the numbers that OpticStudio stored.
+Codes that are not followed are kept with their numbers. A number of a configuration has a status, 1 variable or 2
+pickup, which overrides the surface's variable or solve.
+
+Merit function and tolerances follow the last surface, a row a line. Merit function files (.MF) have two more numbers
+before the target.
+
+    TRAC 0 1 0 0 3.35710687E-1 0 0 7.27220522E-2 0 0        operand, two whole numbers, four numbers, target, weight …
+    BLNK Operands for field 1.
+    TOL TTHI   1   2 -2.0E-1 2.0E-1   0 0 0                 operand, two whole numbers, least and largest change …
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+from raytrace.io.report import IGNORED, READ, Draft
+from raytrace.io.source import Block, LensFileError, Place, Record, double, is_number, one_line, plain, read_text
+from raytrace.io.zemax.configurations import cell_of
+from raytrace.io.zemax.keywords import BLANK, SYSTEM_IGNORED, TAIL_REASON, Sections, records
+from raytrace.io.zemax.surfaces import (
+    FIRST_TERM,
+    INVERSE,
+    Named,
+    Numbers,
+    SurfaceType,
+    in_millimetres,
+    numbers_of,
+    type_name,
+    type_of,
+    types,
+)
+from raytrace.system.configurations import Operand, part, with_part
+from raytrace.system.configurations import Path as LensPath
+from raytrace.system.dimensions import DIMENSION
+from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.parameter_paths import parameter_paths
+from raytrace.system.surface import Surface
+
+
+class SolveRow(NamedTuple):
+    """A solve: its kind, the power of length in each of its numbers, and whether it is followed.
+
+    from_surface: whether the first word is the number of a surface.
+    """
+
+    kind: str
+    powers: tuple[int, ...] = ()
+    followed: bool = False
+    from_surface: bool = False
+
+
+#: Solves of the curvature by the code of CURV. Those without powers have not been met in a file.
+CURVATURE_SOLVES = {
+    2: SolveRow("marginal_angle", (0,), followed=True),
+    3: SolveRow("chief_angle", (0,)),
+    5: SolveRow("marginal_normal"),
+    6: SolveRow("chief_normal"),
+    7: SolveRow("aplanatic"),
+    8: SolveRow("power", (-1,), followed=True),
+    9: SolveRow("concentric_with_surface", (0,)),
+    10: SolveRow("concentric_with_radius", (1,)),
+    11: SolveRow("f_number", (0,), followed=True),
+}
+_CURVATURE_PICKUP = 4
+
+#: Solves of the thickness by their keywords; PZUP is a pickup.
+THICKNESS_SOLVES = {
+    "MAZH": SolveRow("marginal_height", (1, 0), followed=True),
+    "TOLE": SolveRow("position", (1,), from_surface=True, followed=True),
+    "EDGE": SolveRow("edge_thickness", (1, 1), followed=True),
+}
+_FOLLOWED = ("pickup", *(r.kind for r in (*CURVATURE_SOLVES.values(), *THICKNESS_SOLVES.values()) if r.followed))
+
+#: Rules by the code of DIAM, by the code of GLAS, and by the status of a number of a configuration.
+_FIXED, _SEMI_DIAMETER_RULES = 1, {2: "pickup", 3: "maximum"}
+_MODEL, _GLASS_RULES = 1, {2: "pickup", 3: "substitute"}
+_VARIABLE, _CONFIGURATION_RULES = 1, {2: "pickup", 4: "thermal"}
+
+#: Quantities of a model glass, by the position of the word of GLAS that makes them variable.
+_GLASS_NUMBERS = {6: "index", 7: "abbe_number", 8: "partial_dispersion"}
+
+#: Bounds of this size or larger are open.
+_BOUNDLESS = 1e10
+
+
+# -- the solves of a surface, read ------------------------------------------------------------------------------------
+
+
+class TypedSurface(NamedTuple):
+    """A surface with its records, its type and the numbers of that."""
+
+    block: Block
+    surface: Surface
+    row: SurfaceType
+    numbers: Numbers
+    millimetres: float
+
+    @property
+    def number(self) -> int:
+        return self.block.place.surface
+
+    def names(self, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
+        return self.row.names(self.surface, self.numbers, keyword, j)
+
+    def code(self, keyword: str) -> int:
+        record = self.block.last(keyword)
+        return record.integer(1, "code", 0) if record else 0
+
+    def numbered(self, keyword: str) -> list[tuple[int, Record]]:
+        """The records of a keyword in the order of their numbers."""
+        return sorted(((r.integer(0, "number"), r) for r in self.block.all(keyword)), key=lambda pair: pair[0])
+
+    def solve(self, quantity: str, kind: str, numbers: Iterable[float] = (), source: int = 0) -> Solve:
+        return Solve(self.number, quantity, kind, tuple(numbers), source=source)
+
+    def has(self, quantity: str, record: Record, report: Draft) -> bool:
+        if quantity not in self.row.holds:
+            message = f"a surface that is {self.row.name} has no {quantity}; left out"
+            report.note(f"{record.place}: {record.keyword}: {message}")
+        return quantity in self.row.holds
+
+
+def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft) -> Iterator[Vary | Solve]:
+    """In the order of evaluation: parameters, curvature, thickness; then conic, extra data, glass, semi-diameter."""
+    for j, record in typed.numbered("PPAR"):
+        yield from _parameter_pickup(typed, j, record, surfaces)
+    yield from _curvature_rules(typed, report)
+    yield from _thickness_rules(typed)
+    if (record := typed.block.last("VCON")) and typed.has("conic", record, report):
+        yield Vary(typed.number, "conic")
+    for keyword, (j, record) in (
+        *(("PARM", pair) for pair in typed.numbered("VPAR")),
+        *(("XDAT", pair) for pair in typed.numbered("XDAT") if pair[1].integer(2, "code", 0)),
+    ):
+        if keyword == "XDAT" and record.integer(2, "code") != _VARIABLE:
+            yield typed.solve(f"XDAT {j}", f"code {record.integer(2, 'code')}", _solve_numbers(record, 3))
+            continue
+        named, _ = typed.names(keyword, j)
+        if named:
+            yield Vary(typed.number, named[0].name)
+            yield from _followers(typed, named)
+        else:
+            yield typed.solve(f"{keyword} {j}", "variable")
+    yield from _glass_rules(typed)
+    code = typed.code("DIAM")
+    if code in _SEMI_DIAMETER_RULES:
+        source = typed.block.last("DIAM").integer(2, "surface", 0)
+        yield typed.solve("semi_diameter", _SEMI_DIAMETER_RULES[code], source=source)
+    elif code not in (0, _FIXED):
+        yield typed.solve("semi_diameter", f"code {code}")
+
+
+def _solve_numbers(record: Record, first: int) -> list[float]:
+    """The numbers of a solve, from a word on, without a name in quotation marks."""
+    return [record.number(k, "number of a solve") for k in range(first, len(record.words)) if record.words[k][0] != '"']
+
+
+def _scaled(numbers: list[float], row: SolveRow, millimetres: float) -> list[float]:
+    """The numbers of a solve in mm: as many as it has, and further numbers that are not 0."""
+    count = len(row.powers)
+    padded = [*numbers, *([0.0] * (count - len(numbers)))]
+    while len(padded) > count and not padded[-1]:
+        padded.pop()
+    return [in_millimetres(n, p, millimetres) for n, p in zip(padded, row.powers, strict=False)] + padded[count:]
+
+
+def _with_offset(numbers: list[float], power: int | None, millimetres: float) -> list[float]:
+    """Surface, factor, offset and further numbers, with the offset in mm."""
+    power = 1 if power is INVERSE else power
+    return [in_millimetres(n, power, millimetres) if k == 2 else n for k, n in enumerate(numbers)]
+
+
+def _source(numbers: list[float], before: int) -> int | None:
+    """The surface that a pickup looks back to; None where the first number is no earlier surface."""
+    is_surface = bool(numbers) and numbers[0] == int(numbers[0]) and 0 <= numbers[0] < before
+    return int(numbers[0]) if is_surface else None
+
+
+def _curvature_rules(typed: TypedSurface, report: Draft) -> Iterator[Vary | Solve]:
+    record, code = typed.block.last("CURV"), typed.code("CURV")
+    if not record or not code or not typed.has("curvature", record, report):
+        return
+    if code == _VARIABLE:
+        yield Vary(typed.number, "curvature")
+        return
+    numbers = _solve_numbers(record, 2)
+    source = _source(numbers, typed.number)
+    if code == _CURVATURE_PICKUP and source is not None and not any(numbers[2:]):
+        scale = numbers[1] if len(numbers) > 1 else 1.0
+        yield Solve(typed.number, "curvature", "pickup", source=source, scale=scale)
+        return
+    row = CURVATURE_SOLVES.get(code, SolveRow(f"code {code}"))
+    yield typed.solve("curvature", row.kind, _scaled(numbers, row, typed.millimetres))
+
+
+def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
+    millimetres = typed.millimetres
+    for keyword, row in THICKNESS_SOLVES.items():
+        if record := typed.block.last(keyword):
+            numbers = _scaled(_solve_numbers(record, 0)[row.from_surface :], row, millimetres)
+            source = record.integer(0, "surface") if row.from_surface else 0
+            yield typed.solve("thickness", row.kind, numbers, source=source)
+    if record := typed.block.last("PZUP"):
+        source = _source([record.number(0, "surface")], typed.number)
+        scale, offset = record.number(1, "factor", 1.0), record.number(2, "offset", 0.0)
+        if source is None or record.number(3, "column", 0.0):
+            yield typed.solve("thickness", "PZUP", _with_offset(_solve_numbers(record, 0), 1, millimetres))
+        else:
+            pickup = {"source": source, "scale": scale, "offset": offset * millimetres}
+            yield Solve(typed.number, "thickness", "pickup", **pickup)
+    if record := typed.block.last("VDSZ"):
+        if math.isinf(float(typed.surface.thickness)):
+            yield typed.solve("thickness", "variable")
+            return
+        least, most = (record.number(k, "bound", 0.0) for k in (0, 1))
+        is_open = least >= most or (least <= -_BOUNDLESS and most >= _BOUNDLESS)
+        ends = (math.copysign(math.inf, n) if abs(n) >= _BOUNDLESS else n * millimetres for n in (least, most))
+        yield Vary(typed.number, "thickness", bounds=() if is_open else tuple(ends))
+
+
+def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
+    numbers = _solve_numbers(record, 1)
+    source = _source(numbers, typed.number)
+    own, _ = typed.names("PARM", j)
+    there, _ = surfaces[source].names("PARM", j) if source is not None else ((), None)
+    power = typed.row.parameters[j].power if j in typed.row.parameters else 0
+    is_linear = own and there and power is not INVERSE and own[0].factor == there[0].factor == 1
+    if not is_linear or any(numbers[3:]) or len(numbers) < 2:
+        yield typed.solve(f"PARM {j}", "PPAR", _with_offset(numbers, power or 0, typed.millimetres))
+        return
+    offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power, typed.millimetres)
+    other = there[0].name if there[0].name != own[0].name else ""
+    pickup = {"source": source, "scale": numbers[1], "offset": offset, "quantity_of_source": other}
+    yield Solve(typed.number, own[0].name, "pickup", **pickup)
+    yield from _followers(typed, own)
+
+
+def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> Iterator[Solve]:
+    """The further numbers of the lens that a number of the file gives, as pickups of the first."""
+    first = named[0]
+    for other in named[1:]:
+        pickup = {"source": typed.number, "scale": other.factor / first.factor, "quantity_of_source": first.name}
+        yield Solve(typed.number, other.name, "pickup", **pickup)
+
+
+def _glass_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
+    record, code = typed.block.last("GLAS"), typed.code("GLAS")
+    if not record or not code:
+        return
+    if code == _MODEL:
+        for k, name in _GLASS_NUMBERS.items():
+            if record.number(k, "status", 0.0) == _VARIABLE:
+                yield Vary(typed.number, name)
+    elif code in _GLASS_RULES:
+        source = record.integer(2, "surface", 0) if _GLASS_RULES[code] == "pickup" else 0
+        yield typed.solve("glass", _GLASS_RULES[code], source=source)
+    else:
+        yield typed.solve("glass", f"code {code}")
+
+
+# -- the optimisation data of a file, read ----------------------------------------------------------------------------
+
+
+def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens:
+    """The lens with its optimisation data, None where the file has none; every variable is modelled."""
+    surfaces = []
+    for block, surface in zip(sections.surfaces, lens.surfaces, strict=True):
+        row = types()[type_name(block)]
+        surfaces.append(TypedSurface(block, surface, row, numbers_of(block, row, millimetres), millimetres))
+    head = sections.system.last("MNUM")
+    start = head.place.line if head and head.place.line > sections.surfaces[-1].place.line else math.inf
+    tail = [record for record in sections.tail if record.place.line < start]
+    set_by_operands = {operand.paths[0].path for operand in lens.operands if operand.paths}
+
+    def is_overridden(rule: Vary | Solve) -> bool:
+        """Whether a variable of a surface is a number of the configurations, whose status holds."""
+        path = _path_of(lens.surfaces[rule.surface], rule.quantity) if isinstance(rule, Vary) else None
+        return path is not None and ("surfaces", rule.surface, *path) in set_by_operands
+
+    rules = [rule for typed in surfaces for rule in _rules(typed, surfaces, report) if not is_overridden(rule)]
+    configured = list(_configuration_rules(sections, lens))
+    variables = tuple(rule for rule in (*rules, *configured) if isinstance(rule, Vary))
+    solves = [rule for rule in (*rules, *configured) if isinstance(rule, Solve)]
+    for solve in solves:
+        if not all(map(math.isfinite, (*solve.numbers, solve.scale, solve.offset))):
+            message = f"a solve of the {solve.quantity}: a number is too large once converted to mm"
+            raise LensFileError(message, surfaces[min(solve.surface, len(surfaces) - 1)].block.place)
+    kept = tuple(solve for solve in solves if not _is_followed(solve))
+    for solve in kept:
+        report.note(f"kept, and not followed when the lens is optimised: {solve}")
+    merit, tolerances = merit_rows(tail, report), _tolerances(tail, report)
+    margin = sections.system.last("SDMA")
+    percent, length = (margin.number(k, "margin of semi-diameters", 0.0) if margin else 0.0 for k in (0, 2))
+    data = OptimizationData(
+        variables,
+        tuple(solve for solve in solves if _is_followed(solve)),
+        merit,
+        unit=millimetres if merit or tolerances or configured else 1.0,
+        tolerances=tolerances,
+        semi_diameters=tuple(
+            k for k, typed in enumerate(surfaces) if typed.surface.semi_diameter and typed.code("DIAM") == _FIXED
+        ),
+        semi_diameter_margin=(percent, length * millimetres),
+        kept=kept,
+    )
+    sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
+    lens = _with_variables_modelled(lens, surfaces, data)
+    return dataclasses.replace(lens, optimization_data=None if data == OptimizationData(semi_diameters=sized) else data)
+
+
+def _is_followed(solve: Solve) -> bool:
+    if solve.operand is None:
+        return solve.quantity != "semi_diameter" and solve.kind in _FOLLOWED
+    # a pickup between configurations: of a quantity whose unit is known, or that needs none
+    is_linear = solve.quantity in ("thickness", "curvature", "conic") or (not solve.offset and solve.quantity.islower())
+    return solve.kind == "pickup" and bool(solve.numbers) and is_linear
+
+
+def _path_of(surface: Surface, quantity: str) -> LensPath | None:
+    """The path of a quantity in a surface; None where the surface does not have it."""
+    if quantity == "thickness":
+        return ("thickness",)
+    place = parameter_paths(surface).get(quantity)
+    return place and (*place.path, *(() if place.entry is None else ((place.entry,),)))
+
+
+def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
+    """The lens with every number modelled that may change: variables, and solves and pickups of them."""
+    moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
+    for solve in data.solves:
+        if solve.operand is not None or solve.quantity == "glass":
+            continue
+        source = (solve.source, solve.quantity_of_source or solve.quantity)
+        if solve.kind != "pickup" or source in moving:
+            moving.add((solve.surface, solve.quantity))
+    changed = list(lens.surfaces)
+    for number, name in sorted(moving):
+        like = _like(surfaces[number], name)
+        path = _path_of(like, name)
+        if path is not None and part(changed[number], path) is None:
+            changed[number] = with_part(changed[number], path, double(0.0), like=like)
+    return dataclasses.replace(lens, surfaces=tuple(changed))
+
+
+def _like(typed: TypedSurface, name: str) -> Surface:
+    """A surface in which a quantity is modelled."""
+    if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
+        data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
+        for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
+            named, like = typed.names(keyword, j)
+            if name in [number.name for number in named]:
+                return like
+    return typed.surface
+
+
+def _configuration_rules(sections: Sections, lens: Lens) -> Iterator[Vary | Solve]:
+    """The variables and pickups in the table of configurations, by the operands of the lens."""
+    head = sections.system.last("MNUM")
+    if head is None or not lens.operands:
+        return
+    after = (record for record in sections.tail if record.place.line > head.place.line)
+    cells = [cell for record in after if (cell := cell_of(record))]
+    # the operand of the lens, if any, of every cell and of every row of the table
+    keys = [(operand.name, operand.number, operand.parameter) for operand in lens.operands]
+    of_cells: list[int | None] = []
+    of_rows: list[int | None] = []
+    before, behind = None, 0
+    for cell in cells:
+        if before is None or before.key != cell.key or before.configuration >= cell.configuration:
+            index = next((k for k in range(behind, len(keys)) if keys[k] == cell.key), None)
+            behind = behind if index is None else index + 1
+            of_rows.append(index)
+        of_cells.append(of_rows[-1])
+        before = cell
+    for cell, operand in zip(cells, of_cells, strict=True):
+        status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
+        if operand is None or not status or not 1 <= cell.configuration <= len(lens.operands[operand]):
+            continue
+        lens_places = lens.operands[operand].paths[:1]
+        name = _quantity_at(lens, lens_places[0].path) if lens_places else ""
+        where = {"configuration": cell.configuration, "operand": operand}
+        if status == _VARIABLE and name:
+            yield Vary(lens_places[0].path[1], name, **where)
+        elif status == _VARIABLE:
+            yield Solve(cell.number, cell.name, "variable", **where)
+        else:
+            numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
+            source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
+            is_row = row == int(row) and 0 < row <= len(of_rows) and of_rows[int(row) - 1] is not None
+            kind = _CONFIGURATION_RULES.get(status, f"status {status}")
+            followed = (float(of_rows[int(row) - 1]),) if is_row else ()
+            pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
+            yield Solve(cell.number, name or cell.name, kind, **pickup, **where)
+
+
+def _quantity_at(lens: Lens, path: tuple) -> str:
+    """The quantity of a surface by its path in the lens; "" of any other path."""
+    if len(path) < 3 or path[0] != "surfaces":
+        return ""
+    surface = lens.surfaces[path[1]]
+    return next((name for name in ("thickness", *parameter_paths(surface)) if _path_of(surface, name) == path[2:]), "")
+
+
+# -- the merit function and tolerances --------------------------------------------------------------------------------
+
+_TOLERANCES, _NO_TOLERANCE = ("TOL", "TCMM"), "TOFF"
+_TEXT = "BLNK"
+_OPERAND = re.compile(r"[A-Z][A-Z0-9]{3}")
+
+
+def merit_rows(lines: Iterable[Record], report: Draft, *, before_target: int = 0) -> tuple[Row, ...]:
+    """The rows of the lines that are of a merit function, lengths in the unit of the file; every line is reported.
+
+    before_target: count of numbers that precede the target, unlike in a .zmx file. Raises LensFileError for a malformed
+    number of a known operand.
+    """
+    rows, unknown = [], {}
+    for record in lines:
+        word = record.keyword
+        if word in _TOLERANCES:
+            continue
+        if word == _TEXT:
+            rows.append(Row(word, text=record.text.strip()))
+        elif word in DIMENSION or (word not in SYSTEM_IGNORED and _is_row(record)):
+            integers = tuple(record.integer(k, "whole number", 0) for k in (0, 1))
+            numbers = tuple(record.number(k, "argument", 0.0) for k in range(2, 6))
+            target, weight = (
+                record.number(6 + before_target + k, name, 0.0) for k, name in enumerate(("target", "weight"))
+            )
+            behind = record.words[8 + before_target :]
+            text = next((k for k, w in enumerate(behind) if not is_number(w)), len(behind))
+            further = (*record.words[6 : 6 + before_target], *behind[:text])
+            further = tuple(plain(w) for w in further if is_number(w))
+            rows.append(Row(word, integers, numbers, target, weight, " ".join(behind[text:]), further))
+            if word not in DIMENSION:
+                unknown.setdefault(word, record.place)
+        else:
+            report.met(word[:40], IGNORED, record.place, SYSTEM_IGNORED.get(word, TAIL_REASON))
+            continue
+        report.met(word, READ, record.place)
+    for word, place in unknown.items():
+        report.note(f"{place}: {word} is no known operand of a merit function; kept unchanged")
+    return tuple(rows)
+
+
+def _is_row(record: Record) -> bool:
+    """Whether a line with an unknown name has the form of a row."""
+    first = record.words[:9]
+    return bool(_OPERAND.fullmatch(record.keyword)) and len(first) > 7 and all(map(is_number, first))
+
+
+def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
+    """The lines of tolerances unchanged; none where the file only says that there are none."""
+    own = [record for record in lines if record.keyword in _TOLERANCES]
+    for record in own:
+        report.met(record.keyword, READ, record.place)
+    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in own):
+        return ()
+    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in own)
+
+
+def read_merit(path: str | PathLike) -> tuple[Row, ...]:
+    """The rows of a merit function file (.MF) of OpticStudio, in the unit of length of its lens.
+
+    `dataclasses.replace(lens.optimization_data, merit=rows)` are the optimisation data with them. Raises LensFileError.
+    """
+    name = str(path)
+    lines = [record for record in records(read_text(Path(path)), name) if record.keyword != "VERS"]
+    rows = merit_rows(lines, Draft(name, "mf"), before_target=2)
+    if not rows:
+        hint = "is it a merit function file of OpticStudio (.MF)?"
+        raise LensFileError(f"no operand of a merit function in {len(lines)} lines; {hint}", Place(name))
+    for record in lines:
+        if record.keyword not in (*_TOLERANCES, _TEXT) and record.keyword not in DIMENSION and not _is_row(record):
+            raise LensFileError(f"{record.keyword[:40]} is no line of a merit function", record.place)
+    return tuple(dataclasses.replace(row, further=row.further[2:]) for row in rows)
+
+
+def merit_lines(merit: Iterable[Row], place: Place) -> list[str]:
+    """The lines of a merit function. Raises LensFileError for a malformed row."""
+    lines = []
+    for row in merit:
+        if not isinstance(row.operand, str):  # a text in its place, so that rows below keep their numbers
+            name = one_line(row.name, "a name in the merit function", place)
+            lines.append(f"{_TEXT} {name}: a function of the lens, target {row.target:g}, weight {row.weight:g}")
+            continue
+        if not _OPERAND.fullmatch(row.operand):
+            raise LensFileError(f"{row.operand!r} is no name of an operand of four capital letters", place)
+        text = one_line(row.text, "a text of the merit function", place)
+        numbers = (*row.numbers, row.target, row.weight, *row.further)
+        if not all(map(math.isfinite, numbers)):
+            raise LensFileError(f"{row.operand}: only finite numbers can be written", place)
+        words = [] if row.operand == _TEXT else [*map(str, row.integers), *(repr(float(n)) for n in numbers)]
+        lines.append(" ".join([row.operand, *words, text]).rstrip())
+    return lines
+
+
+def tail_lines(data: OptimizationData | None, place: Place) -> list[str]:
+    """The lines of merit function and tolerances; TOFF where there are no tolerances."""
+    merit, tolerances = ((), ()) if data is None else (data.merit, data.tolerances)
+    lines = [one_line(line, "a tolerance", place) for line in tolerances]
+    return [*merit_lines(merit, place), *(lines or [f"TOL {_NO_TOLERANCE}   0   0 0 0   0 0 0 0 0"])]
+
+
+# -- the solves of a surface, written ---------------------------------------------------------------------------------
+
+Lines = list[str]
+
+
+def margin_line(data: OptimizationData | None) -> str:
+    """The line of SDMA."""
+    percent, length = (0.0, 0.0) if data is None else data.semi_diameter_margin
+    return f"SDMA {_spelled(percent)} 1 {_spelled(length)}"
+
+
+def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
+    """The lines of a surface with its variables, solves and pickups. Raises LensFileError for a rule without a line."""
+    data = lens.optimization_data
+    if data is None:
+        return lines
+    own = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
+    sizes = [rule for rule in own if rule.quantity == "semi_diameter"]
+    code, source = (_FIXED if number in data.semi_diameters else 0), 0
+    if not code and sizes:
+        code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
+    lines = _changed(lines, "DIAM", {2: str(code), 3: str(source)})
+    own = [rule for rule in own if rule.operand is None and rule.quantity != "semi_diameter"]
+    parameters = _parameters(lens.surfaces[number]) if own else {}
+    for rule in own:
+        if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
+            continue  # a further number of the lens that the same number of the file gives
+        if rule.quantity == "thickness":
+            lines = _behind(lines, "DISZ", _thickness_line(rule, place))
+        elif rule.quantity == "curvature":
+            lines = _with_curvature(lines, rule, place)
+        elif rule.quantity == "conic":
+            if not isinstance(rule, Vary):
+                raise _unheld(rule, place)
+            lines = _behind(lines, "CONI", "VCON")
+        elif isinstance(rule, Vary) and rule.quantity in _GLASS_NUMBERS.values():
+            lines = _changed(lines, "GLAS", {1 + k: "1" for k, name in _GLASS_NUMBERS.items() if name == rule.quantity})
+        elif rule.quantity == "glass":
+            words = {2: str(_code_of(rule.kind, _GLASS_RULES))}
+            if rule.kind == "pickup":
+                lines, words[3] = with_glass_line(lines), str(rule.source)
+            lines = _changed(lines, "GLAS", words)
+        else:
+            lines = _with_parameter(lines, rule, parameters, place)
+    return lines
+
+
+def _code_of(kind: str, codes: dict[int, str]) -> int:
+    """The code of a kind in a file: of an unknown kind, the number in its name."""
+    code = next((code for code, name in codes.items() if name == kind), None)
+    return int(kind.rpartition(" ")[2]) if code is None else code
+
+
+def _changed(lines: Lines, keyword: str, words: dict[int, str]) -> Lines:
+    """The lines of a surface with other words, counted from the keyword, in those of a keyword."""
+
+    def change(line: str) -> str:
+        old = line.split()
+        if old[0] != keyword:
+            return line
+        old += ["0"] * (max(words) + 1 - len(old))
+        return "  " + " ".join(words.get(k, word) for k, word in enumerate(old))
+
+    return [change(line) for line in lines]
+
+
+def _behind(lines: Lines, start: str, line: str) -> Lines:
+    """The lines with one inserted behind the one of that start, or at the end."""
+    at = next((k for k, other in enumerate(lines) if f"{other} ".startswith(f"  {start} ")), len(lines) - 1)
+    return [*lines[: at + 1], f"  {line}", *lines[at + 1 :]]
+
+
+def _thickness_line(rule: Vary | Solve, place: Place) -> str:
+    if isinstance(rule, Vary):
+        far = 1e3 * _BOUNDLESS  # mm: open in metres, too
+        ends = (max(-far, min(end, far)) for end in rule.bounds or (0.0, 0.0))
+        return f"VDSZ {' '.join(map(_spelled, ends))}"
+    if rule.kind == "variable":
+        return "VDSZ 0 0"
+    if rule.kind == "pickup":
+        return f"PZUP {rule.source} {rule.scale!r} {rule.offset!r} 0"
+    if rule.kind == "PZUP":
+        return " ".join(["PZUP", *map(_spelled, rule.numbers)])
+    for keyword, row in THICKNESS_SOLVES.items():
+        if row.kind == rule.kind:
+            return " ".join([keyword, *([str(rule.source)] if row.from_surface else []), *map(_spelled, rule.numbers)])
+    raise _unheld(rule, place)
+
+
+def _with_curvature(lines: Lines, rule: Vary | Solve, place: Place) -> Lines:
+    if isinstance(rule, Vary):
+        words = [str(_VARIABLE), "0", "0"]
+    elif rule.kind == "pickup":
+        words = [str(_CURVATURE_PICKUP), str(rule.source), repr(rule.scale)]
+        if rule.offset:
+            raise LensFileError("a pickup of a curvature with an offset; a .zmx file has none", place)
+    else:
+        code = _code_of(rule.kind, {code: row.kind for code, row in CURVATURE_SOLVES.items()})
+        words = [str(code), *map(_spelled, rule.numbers)]
+    words += ["0"] * (4 - len(words))
+    return _changed(lines, "CURV", dict(enumerate(words, 2)))
+
+
+def with_glass_line(lines: Lines) -> Lines:
+    """The lines of a surface with one for its medium, which a surface in air leaves out."""
+    if any(line.split()[0] == "GLAS" for line in lines):
+        return lines
+    return _behind(lines, "DISZ", f"GLAS {BLANK} 0 0 1.5 40 0 0 0 0 0 0")
+
+
+def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: Place) -> Lines:
+    keyword, _, j = rule.quantity.partition(" ")
+    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))
+    if not keyword:
+        raise _unheld(rule, place)
+    is_variable = isinstance(rule, Vary) or rule.kind == "variable"
+    if keyword == "XDAT":
+        further = [] if isinstance(rule, Vary) else [*map(_spelled, rule.numbers)]
+        words = {3: str(_VARIABLE if is_variable else _code_of(rule.kind, {}))} | dict(enumerate(further, 4))
+        start = f"  XDAT {j} "
+        return [_changed([line], "XDAT", words)[0] if line.startswith(start) else line for line in lines]
+    if is_variable:
+        line = f"VPAR {j}"
+    elif rule.kind == "pickup":
+        line = f"PPAR {j} {rule.source} {rule.scale!r} {rule.offset!r} 0"
+    else:
+        line = " ".join([f"PPAR {j}", *map(_spelled, rule.numbers)])
+    return _behind(lines, f"PARM {j}", line)
+
+
+def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
+    """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
+    row = types().get(type_of(surface) or "")
+    if row is None:
+        return {}
+    numbers, by_name = row.numbers(surface)._replace(size=surface.semi_diameter), {}
+    data = 0 if numbers.terms is None else len(numbers.terms)
+    for keyword, j in (*(("PARM", j) for j in row.parameters), *(("XDAT", FIRST_TERM + k) for k in range(data))):
+        for named in row.names(surface, numbers, keyword, j)[0]:
+            by_name.setdefault(named.name, (keyword, j))
+    return by_name
+
+
+def _unheld(rule: Vary | Solve, place: Place) -> LensFileError:
+    role = "variable" if isinstance(rule, Vary) else f"solve {rule.kind!r}"
+    return LensFileError(f"a {role} of the {rule.quantity}, which a .zmx file does not hold; leave it out", place)
+
+
+def _spelled(number: float) -> str:
+    """The shortest text that reads back as the number."""
+    return str(int(number)) if number == int(number) and abs(number) < 1e6 and repr(number) != "-0.0" else repr(number)
+
+
+def statuses(lens: Lens, written: Sequence[Operand]) -> dict[tuple[int, int], tuple[str, str]]:
+    """The status of a number and the words after its parameter, by the position of its operand and configuration.
+
+    written: the operands that are written, among them those of the lens.
+    """
+    if lens.optimization_data is None:
+        return {}
+    positions = {id(operand): k for k, operand in enumerate(written)}
+    at = [positions.get(id(operand)) for operand in lens.operands]
+    words = {}
+    for rule in (*lens.optimization_data.variables, *lens.optimization_data.solves, *lens.optimization_data.kept):
+        if rule.operand is None or rule.operand >= len(at) or at[rule.operand] is None:
+            continue
+        if isinstance(rule, Vary) or rule.kind == "variable":
+            status = str(_VARIABLE), "0 1 1 1.0 0.0 0"
+        else:
+            row = at[int(rule.numbers[0])] if rule.numbers else None
+            pickup = f"0 {rule.source} {0 if row is None else row + 1} {rule.scale!r} {rule.offset!r} 0"
+            status = str(_code_of(rule.kind, _CONFIGURATION_RULES)), pickup
+        words[at[rule.operand], rule.configuration] = status
+    return words

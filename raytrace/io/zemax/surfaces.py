@@ -1,0 +1,820 @@
+"""Surfaces of a .zmx file: the types that are modelled, a row each, and a surface read from its records.
+
+A row lists where the lens holds every number of the type, and the power of length in it:
+
+    PARM j value        a number of the type
+    XDAT 1 count, XDAT 2 radius, XDAT 3 …       further terms, and the radius that normalises them
+    SCBD w o p dx dy tx ty tz       decentre and tilt before (w = 1) and after (w = 2) the surface, o the order
+
+Reader, writer, unit conversion, variables and pickups use the same row. Lengths are in the file's unit and become mm.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from decimal import Context, Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.io.materials import by_figures, is_code, listed_glass
+from raytrace.io.report import Draft
+from raytrace.io.source import Block, LensFileError, Record, UnsupportedSurface, double, is_infinite, shown
+from raytrace.io.zemax.keywords import TYPE_NAMES, aperture_keywords, glass_source, is_blank
+from raytrace.materials.catalogs import Catalog
+from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
+from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.parameter_paths import ParameterPath, parameter_paths
+from raytrace.system.phases import (
+    Facets,
+    FringePhase,
+    Grating,
+    Hologram,
+    IdealLens,
+    PolynomialPhase,
+    RadialPhase,
+)
+from raytrace.system.poses import Pose, undone
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag
+from raytrace.system.shapes import EVEN, KINDS
+from raytrace.system.surface import Surface
+
+#: In place of a power of length: the lens holds the reciprocal of the length, and 0 for a length of 0.
+INVERSE = None
+
+#: The first XDAT that is a term.
+FIRST_TERM = 3
+
+
+# -- reciprocals, to the last bit -------------------------------------------------------------------------------------
+
+
+def inverse(text: str, millimetres: float) -> float:
+    """1/length in 1/mm of the text of a length, rounded once; 0 of a length of 0. OverflowError where it is too large.
+
+    All digits of the text count: not every 64-bit number is the rounded reciprocal of a 64-bit number.
+    """
+    length = Fraction(text.replace("D", "e").replace("d", "e")) * Fraction(repr(millimetres))
+    return float(1 / length) if length else 0.0
+
+
+def spelled_inverse(number: float) -> str:
+    """A length whose `inverse` in mm is the number: the shortest 64-bit one, or one of more digits."""
+    if not number:
+        return "0.0"
+    text = repr(float(1 / Fraction(number)))
+    return text if inverse(text, 1.0) == number else str(Context(prec=40).divide(Decimal(1), Decimal(number)))
+
+
+def in_millimetres(number: float, power: int, millimetres: float) -> float:
+    """A number of the file in powers of mm; of a negative power by one division, as curvatures are."""
+    return number * millimetres**power if power >= 0 else number / millimetres**-power
+
+
+# -- the rows of the types --------------------------------------------------------------------------------------------
+
+
+class Numbers(NamedTuple):
+    """PARM by number, and the terms of XDAT with their radius of normalisation; lengths in mm.
+
+    size: the surface's semi-diameter.
+    """
+
+    parameters: Mapping[int, float | Tensor]
+    terms: Tensor | None = None
+    radius: float | Tensor = 1.0
+    size: float | None = None
+
+    def at(self, j: int) -> float:
+        """PARM j, 0 if it is absent."""
+        return self.parameters.get(j, 0.0)
+
+
+def _place(path: str) -> ParameterPath:
+    """The place of "phase.power_x", "coefficients.0" or "phase.first.2" in a surface."""
+    *fields, last = path.split(".")
+    return ParameterPath(tuple(fields), int(last)) if last.isdigit() else ParameterPath((*fields, last))
+
+
+class Parameter(NamedTuple):
+    """A PARM: its place in the surface, and the power of length in it.
+
+    is_integer: a switch, which is no variable. followers: further places that hold factor times the number.
+    """
+
+    place: ParameterPath
+    power: int | None = 0
+    is_integer: bool = False
+    followers: Mapping[ParameterPath, float] = {}
+
+
+def _parameter(path: str, power: int | None = 0, is_integer: bool = False, **followers: float) -> Parameter:
+    return Parameter(
+        _place(path), power, is_integer, {_place(name.replace("__", ".")): f for name, f in followers.items()}
+    )
+
+
+class Named(NamedTuple):
+    """A number of the lens by its name in `parameter_paths`; it is factor times the number of the file in mm."""
+
+    name: str
+    factor: float
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceType:
+    """A TYPE.
+
+    name: OpticStudio's name; holds: fields of a surface's shape that the type has.
+    parameters: the PARM that are used; unused: PARM that are known and change no ray, with the reason.
+    kind: of the coefficients, a key of KINDS; least: how many of them are modelled even if 0, None: as many as given.
+    part: class of the added sag terms or phase. amplitudes: PARM that are all 0 where the sag terms vanish.
+    terms: power of length in the terms of XDAT, None if the type has none; most: their maximum number.
+    objection: numbers -> why they are out of range, or ""; beyond: numbers -> the feature that is not modelled, or "".
+    is_break: whether the type is a coordinate break; flat: whether a curvature is not modelled.
+    powers: the powers of r of the parameters, in words.
+    """
+
+    name: str
+    holds: tuple[str, ...] = ("curvature", "conic")
+    parameters: Mapping[int, Parameter] = dataclasses.field(default_factory=dict)
+    unused: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    kind: str = EVEN
+    least: int | None = 0
+    part: type | None = None
+    amplitudes: tuple[int, ...] = ()
+    terms: int | None = None
+    most: int = 0
+    objection: Callable[[Numbers], str] = lambda numbers: ""
+    beyond: Callable[[Numbers], str] = lambda numbers: ""
+    is_break: bool = False
+    flat: bool = False
+    powers: str = ""
+
+    @property
+    def terms_are_coefficients(self) -> bool:
+        """Whether the terms of XDAT are those of r², r⁴, …; the terms of a toroid are not modelled."""
+        return self.terms is not None and self.part is None and not self.parameters
+
+    def fields(self, numbers: Numbers) -> dict:
+        """The fields of `Surface`. Raises ValueError for numbers out of range."""
+        if objection := self.objection(numbers):
+            raise ValueError(objection)
+        values: dict[str, dict] = {"coefficients": {}, "sag_terms": {}, "phase": {}, "before": {}}
+        for j, parameter in self.parameters.items():
+            number = numbers.at(j)
+            for place in (parameter.place, *parameter.followers):
+                owner = values.get(place.path[0], {})  # "after" is the inverse of "before"
+                if place.entry is not None:
+                    owner.setdefault(place.path[-1], []).append(number)
+                else:
+                    owner[place.path[-1]] = int(number) if parameter.is_integer else number
+        pose = pose_of(values["before"])
+        fields = {"is_break": True, "before": pose} if self.is_break else {}
+        if pose is not None and not self.is_break:
+            fields |= {"before": pose, "after": undone(pose)}
+        return (
+            fields
+            | self._coefficients(values["coefficients"].get("coefficients", []), numbers)
+            | self._part(values["sag_terms"] | values["phase"], numbers)
+        )
+
+    def _coefficients(self, coefficients: list[float], numbers: Numbers) -> dict:
+        if self.terms_are_coefficients:  # a_i = α_i / R^2i
+            coefficients = [α / numbers.radius ** (2 * i) for i, α in enumerate(numbers.terms.tolist(), 1)]
+        if self.least is None:
+            count = max(numbers.parameters, default=len(coefficients))
+        else:
+            count = max([self.least, *(k for k, number in enumerate(coefficients, 1) if number)])
+        return {"kind": self.kind, "coefficients": double(coefficients[:count])} if coefficients[:count] else {}
+
+    def _part(self, values: dict, numbers: Numbers) -> dict:
+        has_terms = numbers.terms is not None and len(numbers.terms) > 0
+        if self.part is None or (
+            "phase" not in self.holds and not has_terms and not any(map(numbers.at, self.amplitudes))
+        ):
+            return {}
+        values = {name: number if isinstance(number, int) else double(number) for name, number in values.items()}
+        if self.terms is not None:
+            values |= {"coefficients": numbers.terms if has_terms else double([0.0]), "radius": double(numbers.radius)}
+        if self.part is IrregularSag:
+            values["radius"] = double(numbers.size)
+        return {"phase" if "phase" in self.holds else "sag_terms": self.part(**values)}
+
+    def numbers(self, surface: Surface) -> Numbers:
+        """`fields` inverted. Raises ValueError for numbers that the type cannot hold."""
+        sag, pose, parameters = surface.sag_terms, surface.before, {}
+        if self.is_break and pose is not None and pose.z is not None:
+            raise ValueError("a decentre along z; add it to the thickness before")
+        if isinstance(sag, IrregularSag):
+            if surface.semi_diameter is None or float(sag.radius) != surface.semi_diameter:
+                radii = f"a radius of {float(sag.radius)!r} mm and a semi-diameter of {surface.semi_diameter!r}"
+                raise ValueError(f"an irregular surface with {radii}: the file has one number for both")
+            pose = pose if poses_are_parameters(surface) else None
+        for j, parameter in self.parameters.items():
+            owner, *name = parameter.place.path
+            value = pose if owner == "before" else getattr(surface, owner)
+            for step in name:
+                value = 0.0 if value is None else getattr(value, step)
+            value = 0.0 if value is None and owner == "before" else value
+            if parameter.place.entry is not None:
+                if value is None or parameter.place.entry >= len(value):
+                    continue
+                value = value[parameter.place.entry]
+            parameters[j] = float(value) if parameter.is_integer else value
+        if self.terms is None or not (self.part or self.terms_are_coefficients):
+            return Numbers(parameters)
+        held = surface if self.part is None else surface.phase or sag
+        return Numbers(parameters, held.coefficients, 1.0 if self.part is None else held.radius)
+
+    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
+        """The numbers of the lens that PARM j, or XDAT j, gives, and a surface in which all of them are modelled.
+
+        Empty for a switch, and for numbers that the surface does not model.
+        """
+        modelled = 0.34375  # any number other than 0
+        if keyword == "PARM" and j in self.parameters:
+            parameter, numbers = self.parameters[j], numbers._replace(parameters={**numbers.parameters, j: modelled})
+            factors = {} if parameter.is_integer else {parameter.place: 1.0, **parameter.followers}
+        elif keyword == "XDAT" and numbers.terms is not None and 0 <= j - FIRST_TERM < len(numbers.terms):
+            entry, terms = j - FIRST_TERM, numbers.terms.clone()
+            terms[entry] = modelled
+            numbers = numbers._replace(terms=terms)
+            owner = "phase" if "phase" in self.holds else "sag_terms"
+            factors = {ParameterPath((owner, "coefficients"), entry): 1.0} if self.part else {}
+            if self.terms_are_coefficients:
+                factors = {ParameterPath(("coefficients",), entry): float(numbers.radius) ** (-2 * (entry + 1))}
+        else:
+            return (), surface
+        try:
+            like = dataclasses.replace(surface, **self.fields(numbers))
+        except ValueError:
+            return (), surface
+        names = {place: name for name, place in parameter_paths(like).items()}
+        return tuple(Named(names[place], factor) for place, factor in factors.items() if place in names), like
+
+
+def _coefficients(first: int, powers: Sequence[int | None]) -> dict[int, Parameter]:
+    """PARM that are coefficients, from `first` on, by the power of length of each."""
+    return {j: _parameter(f"coefficients.{k}", power) for k, (j, power) in enumerate(enumerate(powers, first))}
+
+
+_ROUND = ("curvature", "conic", "coefficients")
+_EVEN = _coefficients(1, [1 - 2 * j for j in range(1, 9)])
+_POLARISATION = dict.fromkeys(range(1, 9), "polarisation; its plane refracts as any other")
+
+
+def _unknown_mode(number: float) -> str:
+    return "" if number in (0, 1, 2, 3) else f"an OPD mode of {number:g}, expected 0, 1, 2 or 3"
+
+
+def _unknown_order(numbers: Numbers) -> str:
+    return "" if numbers.at(6) in (0, 1) else f"of order {numbers.at(6):g} (PARM 6; 0 and 1 are known)"
+
+
+def _unsized(numbers: Numbers) -> str:
+    if numbers.size is None and any(map(numbers.at, (5, 6, 7))):
+        return "no semi-diameter (DIAM), by which the terms of an irregular surface are normalised"
+    return ""
+
+
+def _no_focal_length(numbers: Numbers) -> str:
+    missing = "a focal length of 0 (PARM 1), expected one in the file's unit of length"
+    return _unknown_mode(numbers.at(2)) if numbers.at(1) else missing
+
+
+def _no_order(numbers: Numbers) -> str:
+    return (
+        "no order of diffraction (PARM 0); lines lost?" if 0 not in numbers.parameters and numbers.terms.any() else ""
+    )
+
+
+def _no_construction(numbers: Numbers) -> str:
+    if not any(map(numbers.at, (1, 2, 3))) or not any(map(numbers.at, (4, 5, 6))):
+        return "a construction point at the vertex (PARM 1 to 3, or 4 to 6), expected one away from it"
+    if numbers.at(7) <= 0:
+        return f"a construction wavelength of {numbers.at(7):g} µm (PARM 7), expected a positive one"
+    return ""
+
+
+@functools.cache
+def _round(name: str) -> SurfaceType:
+    """The type of a kind of rotationally symmetric terms: PARM j is a_j; without any it has as many zeros."""
+    kind = KINDS[name]
+    powers = [1 - kind.step * j for j in range(1, kind.parameters + 1)]
+    return SurfaceType(name, _ROUND, _coefficients(1, powers), kind=name, least=None, powers=kind.powers)
+
+
+def _diffractive(name: str, phase: type, most: int) -> SurfaceType:
+    """A phase of coefficients, radius and order (PARM 0), with even terms."""
+    parameters = {0: _parameter("phase.order"), **_EVEN}
+    return SurfaceType(name, (*_ROUND, "phase"), parameters, part=phase, terms=0, most=most, objection=_no_order)
+
+
+#: The types that are modelled, but those of rotationally symmetric terms, which have their rows in KINDS.
+_TYPES = {
+    "STANDARD": SurfaceType("standard"),
+    "XASPHERE": SurfaceType("extended asphere", _ROUND, least=None, terms=1, most=240),
+    "TILTSURF": SurfaceType(
+        "tilted",
+        ("sag_terms",),
+        {1: _parameter("sag_terms.tan_x"), 2: _parameter("sag_terms.tan_y")},
+        part=TiltSag,
+        amplitudes=(1, 2),
+    ),
+    "TOROIDAL": SurfaceType(
+        "toroidal",
+        _ROUND,
+        _coefficients(1, [INVERSE, *(3 - 2 * j for j in range(2, 9))]),
+        kind="toroidal",
+        least=1,
+        terms=1,
+        most=240,
+        beyond=lambda numbers: "with Zernike terms (XDAT 1)" if bool(numbers.terms.any()) else "",
+    ),
+    "BICONICX": SurfaceType("biconic", _ROUND, _coefficients(1, [INVERSE, 0]), kind="biconic", least=2),
+    "XPOLYNOM": SurfaceType(
+        "extended polynomial", ("curvature", "conic", "sag_terms"), part=PolynomialSag, terms=1, most=230
+    ),
+    "FZERNSAG": SurfaceType(
+        "Zernike fringe sag",
+        (*_ROUND, "sag_terms"),
+        {**_EVEN, 9: _parameter("sag_terms.centre_x", 1), 10: _parameter("sag_terms.centre_y", 1)},
+        unused={0: "whether the sag ends with its terms' disc; it continues"},
+        part=FringeSag,
+        terms=1,
+        most=37,
+    ),
+    "IRREGULA": SurfaceType(
+        "irregular",
+        ("curvature", "conic", "sag_terms"),
+        {
+            1: _parameter("before.x", 1, after__x=-1.0),
+            2: _parameter("before.y", 1, after__y=-1.0),
+            3: _parameter("before.tilt_x", 0, after__tilt_x=-1.0),
+            4: _parameter("before.tilt_y", 0, after__tilt_y=-1.0),
+            5: _parameter("sag_terms.spherical", 1),
+            6: _parameter("sag_terms.astigmatism", 1),
+            7: _parameter("sag_terms.coma", 1),
+            8: _parameter("sag_terms.angle"),
+        },
+        part=IrregularSag,
+        amplitudes=(5, 6, 7),
+        objection=_unsized,
+    ),
+    "COORDBRK": SurfaceType(
+        "coordinate break",
+        (),
+        {
+            1: _parameter("before.x", 1),
+            2: _parameter("before.y", 1),
+            3: _parameter("before.tilt_x"),
+            4: _parameter("before.tilt_y"),
+            5: _parameter("before.tilt_z"),
+            6: _parameter("before.tilts_first", is_integer=True),
+        },
+        beyond=_unknown_order,
+        is_break=True,
+    ),
+    "DGRATING": SurfaceType(
+        "diffraction grating",
+        ("curvature", "conic", "phase"),
+        {1: _parameter("phase.frequency"), 2: _parameter("phase.order")},
+        part=Grating,
+    ),
+    "PARAXIAL": SurfaceType(
+        "paraxial lens",
+        ("phase",),
+        {
+            1: _parameter("phase.power_x", INVERSE, phase__power_y=1.0),
+            2: _parameter("phase.opd_mode", is_integer=True),
+        },
+        part=IdealLens,
+        objection=_no_focal_length,
+    ),
+    "PARAX_XY": SurfaceType(
+        "paraxial XY",
+        ("phase",),
+        {
+            1: _parameter("phase.power_x", -1),
+            2: _parameter("phase.power_y", -1),
+            3: _parameter("phase.opd_mode", is_integer=True),
+        },
+        part=IdealLens,
+        objection=lambda numbers: _unknown_mode(numbers.at(3)),
+    ),
+    "BINARY_1": _diffractive("binary 1", PolynomialPhase, 230),
+    "BINARY_2": _diffractive("binary 2", RadialPhase, 240),
+    "FZERNPHA": _diffractive("Zernike fringe phase", FringePhase, 37),
+    "HOLOGRM2": SurfaceType(
+        "hologram 2",
+        ("phase",),
+        {
+            **{1 + k: _parameter(f"phase.first.{k}", 1) for k in range(3)},
+            **{4 + k: _parameter(f"phase.second.{k}", 1) for k in range(3)},
+            7: _parameter("phase.wavelength"),
+            8: _parameter("phase.order"),
+        },
+        part=Hologram,
+        objection=_no_construction,
+        flat=True,
+    ),
+    "FRESNELS": SurfaceType("Fresnel", (*_ROUND, "phase"), _EVEN, part=Facets),
+    "JONESMAT": SurfaceType("Jones matrix", (), unused=_POLARISATION),
+}
+
+
+def types() -> dict[str, SurfaceType]:
+    """Every type that is modelled, STANDARD first."""
+    symmetric = {kind.zemax: _round(kind.name) for kind in KINDS.values() if kind.zemax and kind.form is None}
+    return {"STANDARD": _TYPES["STANDARD"], **symmetric, **_TYPES}
+
+
+#: TYPE by the class of the sag terms or the phase of a surface; a kind of coefficients has its own in KINDS.
+_OF_PARTS = {row.part: kind for kind, row in _TYPES.items() if row.part is not None and kind != "PARAXIAL"}
+
+
+def type_of(surface: Surface) -> str | None:
+    """The TYPE that a surface is written as; None where a .zmx file has none."""
+    if surface.is_break:
+        return "COORDBRK"
+    if surface.phase is not None:
+        phase = surface.phase
+        ideal = isinstance(phase, IdealLens) and phase.power_x.dim() == 0
+        return "PARAXIAL" if ideal and float(phase.power_x) == float(phase.power_y) != 0 else _OF_PARTS.get(type(phase))
+    if surface.sag_terms is not None:
+        return _OF_PARTS.get(type(surface.sag_terms))
+    if surface.coefficients is None:
+        return "STANDARD"
+    kind = KINDS[surface.kind]
+    return "XASPHERE" if surface.kind == EVEN and len(surface.coefficients) > kind.parameters else kind.zemax
+
+
+# -- poses ------------------------------------------------------------------------------------------------------------
+
+
+def pose_of(numbers: Mapping[str, float]) -> Pose | None:
+    """The pose of decentres x, y in mm and tilts about x, y, z in degrees; numbers that are 0 are not modelled.
+
+    tilts_first: the order.
+    """
+    modelled = {name: double(number) for name, number in numbers.items() if number and name != "tilts_first"}
+    return Pose(**modelled, tilts_first=numbers.get("tilts_first", 0) != 0) if modelled else None
+
+
+def poses_are_parameters(surface: Surface) -> bool:
+    """Whether an irregular surface has a pose that its parameters hold: decentres, then tilts about x and y, undone
+    behind the surface."""
+    before, after = surface.before, surface.after
+    if not isinstance(surface.sag_terms, IrregularSag) or before is None or after is None:
+        return False
+    if before.tilts_first or before.z is not None or before.tilt_z is not None or not after.tilts_first:
+        return False
+    inverse_pose = undone(before)
+    for name in ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z"):
+        a, b = getattr(inverse_pose, name), getattr(after, name)
+        if (a is None) != (b is None) or (a is not None and not torch.equal(a, b)):
+            return False
+    return True
+
+
+def poses(block: Block, millimetres: float) -> dict[str, Pose]:
+    """The fields "before" and "after" of SCBD records, where they are not 0.
+
+    SCBD w o p dx dy tx ty tz: w 1 before, 2 after the surface; o the order, as of a coordinate break; p the method that
+    found the numbers, which are stored. SCBD 3 marks a coordinate return. Raises UnsupportedSurface for others.
+    """
+    fields = {}
+    for record in block.all("SCBD"):
+        where = record.integer(0, "side of the tilt", 0)
+        numbers = [record.number(k, "tilt or decentre", 0.0) for k in range(3, 8)]
+        if where == 3 or not any(numbers):
+            continue
+        order = record.number(1, "order")
+        if where not in (1, 2) or order not in (0, 1):
+            message = f"tilt or decentre of the surface (SCBD {where:g} of order {order:g}) is not modelled"
+            raise UnsupportedSurface(f"{message}; known are SCBD 1 and 2 of order 0 and 1", record.place)
+        x, y, tilt_x, tilt_y, tilt_z = numbers
+        fields["before" if where == 1 else "after"] = pose_of(
+            {"x": x * millimetres, "y": y * millimetres, "tilt_x": tilt_x, "tilt_y": tilt_y, "tilt_z": tilt_z}
+            | {"tilts_first": order}
+        )
+    return fields
+
+
+# -- PARM and XDAT of a surface ---------------------------------------------------------------------------------------
+
+
+def numbers_of(block: Block, row: SurfaceType, millimetres: float) -> Numbers:
+    """The numbers of a surface of a type, in mm; nothing of it is reported."""
+    parameters = {}
+    for record in block.all("PARM"):
+        j, value = record.integer(0, "number of the parameter"), record.number(1, "value")
+        if j not in row.parameters:
+            continue
+        power = row.parameters[j].power
+        try:
+            parameters[j] = (
+                in_millimetres(value, power, millimetres)
+                if power is not INVERSE
+                else inverse(record.words[1], millimetres)
+                if value
+                else 0.0
+            )
+        except OverflowError as error:
+            message = f"PARM {record.words[0]} is {shown(record.words[1])}, too small a length"
+            raise LensFileError(message, record.place) from error
+    size = semi_diameter(block, millimetres)
+    if row.terms is None:
+        return Numbers(parameters, size=size)
+    data = {record.integer(0, "number of the datum"): record for record in block.all("XDAT")}
+    count = term_count(block, row)
+    if not count:
+        return Numbers(parameters, double([]), size=size)
+    if 2 not in data:
+        raise LensFileError("no XDAT 2, the radius that the terms are normalised by; lines lost?", block.place)
+    radius = data[2].number(1, "radius of normalisation")
+    if radius <= 0:
+        message = f"XDAT 2 is {shown(data[2].words[1])}: the radius of normalisation, expected a positive length"
+        raise LensFileError(message, data[2].place)
+    values = [data[j].number(1, "value") if j in data else 0.0 for j in range(FIRST_TERM, FIRST_TERM + count)]
+    terms = [in_millimetres(value, row.terms, millimetres) for value in values]
+    return Numbers(parameters, double(terms), radius * millimetres, size)
+
+
+def term_count(block: Block, row: SurfaceType) -> int:
+    """XDAT 1, the number of terms."""
+    records = [record for record in block.all("XDAT") if record.integer(0, "number of the datum") == 1]
+    count = records[-1].integer(1, "number of terms") if records else 0
+    if not 0 <= count <= row.most:
+        message = f"XDAT 1 is {shown(records[-1].words[1])}: the number of terms of a surface that is {row.name}"
+        raise LensFileError(f"{message}, expected 0 to {row.most}", records[-1].place)
+    return count
+
+
+def _report_unused(block: Block, kind: str, row: SurfaceType, report: Draft) -> None:
+    """Report the numbers other than 0 that a surface of this type does not use, with the reason where it is known."""
+    for record in block.all("PARM"):
+        j = record.integer(0, "number of the parameter")
+        if j in row.parameters or not record.number(1, "value"):
+            continue
+        if j in row.unused:
+            report.note(f"{record.place}: PARM {j} of a {kind} surface is not used: {row.unused[j]}")
+        elif row.parameters or row.unused:
+            first, *_, last = sorted(row.parameters or row.unused) * 2
+            article = "an" if kind[0] in "AEIOU" else "a"
+            message = f"PARM {j}: {article} {kind} has parameters {first} to {last}{row.powers}; left out"
+            report.warn(message, record.place)
+        else:
+            report.note(f"{record.place}: PARM {j} is not used by a {kind} surface")
+    end = FIRST_TERM + term_count(block, row) if row.terms is not None else 0
+    for record in block.all("XDAT"):
+        j = record.integer(0, "number of the datum")
+        if row.terms is None and record.number(1, "value"):
+            report.note(f"{record.place}: XDAT {j} is not used by a {kind} surface")
+        elif row.terms is not None and j >= end and j > 2 and record.number(1, "value"):
+            report.warn(f"XDAT {j}: XDAT 1 says {end - FIRST_TERM} terms, to XDAT {end - 1}; left out", record.place)
+    for keyword, name in (("CURV", "curvature"), ("CONI", "conic")):
+        record = block.last(keyword)
+        if record and name not in row.holds and record.number(0, name):
+            report.note(f"{record.place}: {keyword} is not used by a {kind} surface")
+    for record in block.all("SCBD"):
+        if record.words[:1] == ("3",) and record.integer(1, "kind of coordinate return", 0) > 0:
+            report.note(f"{record.place}: coordinate return; its solved values, which the file stores, are read")
+
+
+# -- types that are not modelled --------------------------------------------------------------------------------------
+
+
+def refuse_unsupported(blocks: Sequence[Block]) -> None:
+    """Raise UnsupportedSurface for the first surface that is not modelled, and list the others."""
+    last = len(blocks) - 1
+    refused = [(block, reason) for k, block in enumerate(blocks) if (reason := _unsupported(block, k in (0, last)))]
+    if not refused:
+        return
+    block, reason = refused[0]
+    record = block.last("TYPE", "SURF")
+    others = [f"{other.place.surface} ({why.split()[1]})" for other, why in refused[1:7]]
+    more = " …" if len(refused) > 7 else ""
+    also = f"; neither are surfaces {', '.join(others)}{more}" if others else ""
+    message = f"{reason} is not modelled{also}; modelled are {_modelled()}"
+    raise UnsupportedSurface(message, record.place if record else block.place)
+
+
+def _unsupported(block: Block, at_end: bool) -> str:
+    """Why a surface is not modelled; at_end: whether it is the object or the image."""
+    kind = type_name(block)
+    row = types().get(kind)
+    if row is None:
+        return f"type {kind[:40]}" + (f" ({TYPE_NAMES[kind]})" if kind in TYPE_NAMES else "")
+    ignored = block.last("IGNR")
+    if ignored and ignored.words[:1] not in ((), ("0",)):
+        return f"type {kind} marked as to be ignored (IGNR)"
+    if at_end and (row.is_break or "phase" in row.holds):
+        return f"type {kind} ({row.name}) of the object or the image"
+    posed = any(poses(block, 1.0).values())
+    if block.place.surface == 0 and posed:
+        return f"type {kind} of the object with a tilt or decentre of the surface (SCBD)"
+    if row.is_break and posed:
+        return f"type {kind} ({row.name}) with a tilt or decentre of the surface (SCBD)"
+    if row.flat and any(_nonzero(block, keyword, keyword, 1.0) is not None for keyword in ("CURV", "CONI")):
+        return f"type {kind} ({row.name}) on a curved surface (CURV)"
+    numbers = numbers_of(block, row, 1.0)
+    if kind == "IRREGULA" and any(map(numbers.at, (1, 2, 3, 4))) and posed:
+        return f"type {kind} ({row.name}) with tilts of its own (PARM 1 to 4) and of the surface (SCBD)"
+    beyond = row.beyond(numbers)
+    return f"type {kind} ({row.name}) {beyond}" if beyond else ""
+
+
+def type_name(block: Block) -> str:
+    """The TYPE of a surface, STANDARD where it has none."""
+    record = block.last("TYPE")
+    if record is None:
+        return "STANDARD"
+    if not record.words:
+        raise LensFileError(f"TYPE without a name; expected {_modelled()}", record.place)
+    return record.words[0].upper()
+
+
+def _modelled() -> str:
+    *first, last = types()
+    return f"{', '.join(first)} and {last}"
+
+
+# -- a surface --------------------------------------------------------------------------------------------------------
+
+
+def build(
+    block: Block,
+    millimetres: float,
+    blocks: Sequence[Block],
+    *,
+    catalogs: Sequence[str | Catalog],
+    user: Sequence[Path],
+    report: Draft,
+) -> Surface:
+    """The surface of a block, its lengths in units of `millimetres`.
+
+    blocks: all surfaces of the file, from which a glass may be picked up.
+    GLAS names are looked up in `catalogs`, then `user` files; raises UnknownGlass as `find_glass` does.
+    """
+    thickness = block.last("DISZ")
+    if thickness is None:
+        raise LensFileError("surface has no DISZ (thickness): file cut off? A plane image has DISZ 0", block.place)
+    word = thickness.words[0] if thickness.words else ""
+    if is_infinite(word):
+        if block.place.surface != 0 or word.startswith("-"):
+            raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", thickness.place)
+        distance = float("inf")
+    else:
+        distance = thickness.number(0, "thickness") * millimetres
+    kind, fields = type_name(block), {}
+    row = types()[kind]
+    if "curvature" in row.holds:
+        fields["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)
+        fields["conic"] = _nonzero(block, "CONI", "conic constant", 1.0)
+    if row.is_break:
+        for keyword in ("GLAS", *aperture_keywords()):
+            record = block.last(keyword)
+            if record and (keyword != "GLAS" or record.words[:1] != ("AIR",)):
+                message = f"{keyword} on a coordinate break is not used: the medium stays, and nothing clips"
+                report.warn(message, record.place)
+    else:
+        fields["glass"] = _medium(block, blocks, catalogs, user, report)
+        fields["apertures"] = _apertures(block, millimetres, report)
+    numbers, marked = numbers_of(block, row, millimetres), block.last("TYPE", "SURF")
+    try:
+        fields |= poses(block, millimetres) | row.fields(numbers)
+    except ValueError as error:
+        if isinstance(error, LensFileError):
+            raise
+        raise LensFileError(str(error), marked.place if marked else block.place) from error
+    _report_unused(block, kind, row, report)
+    comment = block.last("COMM")
+    return Surface(
+        thickness=double(distance),
+        semi_diameter=numbers.size,
+        comment=comment.text.strip() if comment else "",
+        **fields,
+    )
+
+
+def _nonzero(block: Block, keyword: str, quantity: str, divisor: float) -> Tensor | None:
+    record = block.last(keyword)
+    number = record.number(0, quantity) / divisor if record else 0.0
+    return double(number) if number else None
+
+
+def semi_diameter(block: Block, millimetres: float) -> float | None:
+    """DIAM, which is a semi-diameter, in mm; None if absent or 0 (left to be computed)."""
+    record = block.last("DIAM")
+    size = record.number(0, "semi-diameter") * millimetres if record and record.words else 0.0
+    if size < 0:
+        raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
+    return size or None
+
+
+def _picked_up(block: Block, blocks: Sequence[Block], report: Draft) -> Record | None:
+    """The GLAS record of the medium of a surface: its own, or that of the surface it is picked up from; None is air.
+
+    A file stores the name of a glass that is picked up, but no indices of air or of a model glass: those in the line
+    are obsolete.
+    """
+    record, source = block.last("GLAS"), glass_source(block)
+    if source is None:
+        return record
+    held = _picked_up(blocks[source], blocks, report)
+    name = record.words[0].upper()
+    if held is not None and held.words[:1] and held.words[0].upper() == name:
+        return held._replace(place=record.place)
+    if is_blank(record):
+        medium = held.words[0] if held is not None and held.words else "air"
+        report.note(f"surface {block.place.surface}: the medium, {medium}, is picked up from surface {source}")
+        return held and held._replace(place=record.place)
+    message = f"GLAS {name[:40]} is a pickup from surface {source}, which has {held.words[0] if held else 'air'}"
+    report.warn(f"{message}; {name[:40]} is taken", record.place)
+    return record
+
+
+def _medium(
+    block: Block, blocks: Sequence[Block], catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft
+) -> Glass:
+    """The medium of a GLAS record: name, flag (0 catalog, 1 model, 2 pickup, 3 substitute), -, nd, Vd, ΔPgF.
+
+    The columns after the name are placeholders unless the flag says model glass or the name is ___BLANK.
+    """
+    record = _picked_up(block, blocks, report)
+    if record is None:
+        return AIR
+    if not record.words:
+        raise LensFileError("GLAS without a name; delete the line for air", record.place)
+    name, surface = record.words[0], record.place.surface
+    if name.upper() in ("AIR", "MIRROR"):
+        return AIR if name.upper() == "AIR" else MIRROR
+    if is_blank(record) or record.integer(1, "flag", 0) == 1:
+        name = "" if is_blank(record) else name
+        nd, vd = record.number(3, "index nd"), record.number(4, "Abbe number Vd", 0.0)
+        dpgf = record.number(5, "ΔPgF", 0.0)
+        if nd <= 0 or vd < 0:
+            raise LensFileError(f"model glass of nd {nd:g}, Vd {vd:g}; expected nd > 0 and Vd ≥ 0", record.place)
+        report.glass(surface, name, f"model glass nd {nd!r}, Vd {vd!r}, ΔPgF {dpgf!r}")
+        return by_figures(nd, vd, dpgf, name)
+    if is_code(name):
+        report.glass(surface, name, "six-digit code: nd and Vd by its digits")
+        return mil_glass(name)
+    nd, vd = (record.number(k, "index or Abbe number of the glass", 0.0) for k in (3, 4))
+    figures = (nd, vd) if nd > 1 and vd > 0 and (nd, vd) != (1.5, 40.0) else None  # 1.5 and 40 are placeholders
+    return listed_glass(name, catalogs=catalogs, user=user, place=record.place, report=report, figures=figures)
+
+
+def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Aperture, ...]:
+    """The aperture of a surface; OpticStudio has one per surface.
+
+    A floating aperture (FLAP) follows the semi-diameter of its surface: it clips at DIAM.
+    """
+    records = block.all(*aperture_keywords())
+    if not records:
+        return ()
+    record = records[-1]
+    if len({other.keyword for other in records}) > 1:
+        names = ", ".join(other.keyword for other in records)
+        report.warn(f"several apertures on one surface ({names}); the last is used", record.place)
+    shape, obscures = aperture_keywords()[record.keyword]
+    count = SHAPES[shape].sizes
+    if count is None:
+        sizes = _corners(block.all("UDAD"), millimetres)
+        if not sizes:
+            message = f"user-defined aperture ({record.keyword}) is not of polygons (UDAD): it blocks no ray"
+            report.warn(message, record.place)
+            return ()
+    else:
+        sizes = tuple(record.number(k, "size of the aperture") * millimetres for k in range(count))
+    if record.keyword == "FLAP":
+        sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
+    if SHAPES[shape].objection(sizes):
+        raise LensFileError(f"{record.keyword} {SHAPES[shape].objection(sizes)}", record.place)
+    centre = block.last("OBDC")
+    x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
+    return (Aperture(shape, sizes, obscures, (x, y)),)
+
+
+def _corners(records: Sequence[Record], millimetres: float) -> tuple[float, ...]:
+    """x and y of the corners of polygons, each closed by its first corner; none for other elements, as arcs.
+
+    UDAD k x y 0: line 0 names a file, and 0 0 0 ends a polygon.
+    """
+    corners: list[float] = []
+    polygon: list[float] = []
+    for record in (*(record for record in records if record.integer(0, "number of the point") > 0), None):
+        x, y, other = (record.number(k, "point of the aperture", 0.0) for k in (1, 2, 3)) if record else (0, 0, 0)
+        if other:
+            return ()
+        if (x, y) != (0, 0):
+            polygon += [x * millimetres, y * millimetres]
+        elif polygon:
+            corners += [*polygon, *polygon[:2]]
+            polygon = []
+    return tuple(corners)

@@ -1,0 +1,326 @@
+"""AGF, the file format of glass catalogs: a Catalog from a file and back."""
+
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import torch
+
+from raytrace.files import encoding, read_bytes, write_text
+from raytrace.materials.formulas import BY_NUMBER, FORMULAS
+from raytrace.materials.glass import Glass
+from raytrace.words import calling_level
+
+_STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
+#: Records of numbers, by rank in the order in which a glass is written.
+_NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
+_KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
+_LARGEST_FILE = 16 * 2**20
+
+#: More glasses than any catalog has; all makers together list some thousands.
+MOST_GLASSES = 20_000
+
+_NAMES = re.compile(r"^[ \t]*NM[ \t]+(\S+)", re.MULTILINE)
+
+
+class CatalogError(ValueError):
+    """A glass catalog cannot be read: says file and line, what was found, what was expected and the likely fix."""
+
+
+class CatalogWarning(UserWarning):
+    """A catalog was read, but something in it was left aside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Catalog:
+    """A glass catalog: `name`, its `glasses` by name in file order, and the comment lines of its header."""
+
+    name: str
+    glasses: Mapping[str, Glass]
+    comments: tuple[str, ...] = ()
+
+    def find(self, name: str) -> Glass | None:
+        """The glass of this name, or of this name but for upper and lower case; None if there is none."""
+        if name not in self.glasses:
+            name = next((listed for listed in self.glasses if listed.upper() == name.upper()), None)
+        return None if name is None else self.glasses[name]
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_agf(path: str | Path) -> Catalog:
+    """Read a glass catalog in AGF format: UTF-16, UTF-8 or Latin-1, any line ends.
+
+    Raises CatalogError; warns CatalogWarning of records it does not know and of a name defined twice.
+    """
+    return parse_agf(read_text(path), path)
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a catalog's file, however it is encoded. Raises CatalogError."""
+    path = Path(path)
+    try:
+        content = read_bytes(path, _LARGEST_FILE)
+    except OSError as error:
+        raise CatalogError(f"{path}: cannot be read ({error.strerror or error}); expected a glass catalog") from error
+    return decode(content, path)
+
+
+def decode(content: bytes, path: str | Path) -> str:
+    """The text of a catalog's bytes; `path` is its place in messages. Raises CatalogError."""
+    path, found = Path(path), encoding(content)
+    try:
+        text = content.decode(found).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
+    except UnicodeDecodeError as error:
+        raise CatalogError(f"{path}: damaged {found.upper()} text at byte {error.start}; cut off?") from error
+    binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
+    if binary:
+        line = text.count("\n", 0, binary.start()) + 1
+        raise _fault(path, line, f"binary data (byte {ord(binary[0]):#04x})", "the text of an AGF")
+    return text
+
+
+class _Listing(Mapping):
+    """The glasses of a catalog's text by their names, each parsed when it is asked for; raises CatalogError then."""
+
+    def __init__(self, text: str, catalog: str, path: Path):
+        self._text, self._catalog, self._path = text, catalog, path
+        starts = [(found[1], found.start()) for found in _NAMES.finditer(text)]
+        ends = [start for _, start in starts[1:]] + [len(text)]
+        self._places: dict[str, tuple[int, int]] = {}
+        for (name, start), end in zip(starts, ends, strict=True):
+            self._places.setdefault(name, (start, end))
+        self._parsed: dict[str, Glass] = {}
+
+    def __getitem__(self, name: str) -> Glass:
+        if name not in self._parsed:
+            start, end = self._places[name]
+            line = self._text.count("\n", 0, start) + 1
+            block = next(_blocks(_records(self._text[start:end], {}, line)))
+            self._parsed[name] = _glass(block, self._catalog, self._path)
+        return self._parsed[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+def listed(text: str, path: str | Path) -> Catalog:
+    """The catalog of a text as `parse_agf` reads it, but that a glass is parsed when it is asked for.
+
+    Raises CatalogError where there is none, or more than MOST_GLASSES; of a damaged glass when it is asked for.
+    """
+    path, text = Path(path), re.sub(r"\r\n|\r", "\n", text)
+    _refuse_many(text, path)
+    glasses = _Listing(text, path.stem.upper(), path)
+    if not glasses:
+        raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
+    return Catalog(path.stem.upper(), glasses)
+
+
+def _refuse_many(text: str, path: Path) -> None:
+    count = sum(1 for _ in _NAMES.finditer(text))
+    if count > MOST_GLASSES:
+        raise CatalogError(f"{path}: {count} glasses, more than any catalog ({MOST_GLASSES}); not read")
+
+
+def parse_agf(text: str, path: str | Path) -> Catalog:
+    """The catalog written in the text of an AGF file; `path` gives its name and its place in messages."""
+    path = Path(path)
+    _refuse_many(text, path)
+    name, comments, glasses = path.stem.upper(), [], {}
+    unknown: dict[str, int] = {}
+    for block in _blocks(_records(text, unknown)):
+        comments += [rest for _, keyword, rest in block if keyword == "CC" and rest]
+        if block[0][1] != "NM":
+            stray = next((record for record in block if record[1] != "CC"), None)
+            if stray:
+                raise _fault(path, stray[0], f"a {stray[1]} record before any glass", "an NM record first")
+            continue
+        glass = _glass(block, name, path)
+        first = glasses.setdefault(glass.listed_name, glass)
+        if first is not glass:
+            message = f"{path}:{block[0][0]}: {glass.listed_name} is defined again; the first definition holds"
+            warnings.warn(message, CatalogWarning, stacklevel=calling_level())
+    if not glasses:
+        raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
+    if unknown:
+        listed = ", ".join(f"{word!r} (line {line})" for word, line in list(unknown.items())[:5])
+        warnings.warn(f"{path}: left aside lines that begin with {listed}", CatalogWarning, stacklevel=calling_level())
+    return Catalog(name, MappingProxyType(glasses), tuple(comments))
+
+
+def _fault(path: Path, line: int, found: str, expected: str, fix: str = "") -> CatalogError:
+    return CatalogError(f"{path}:{line}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
+
+
+def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tuple[int, str, str]]:
+    """(line, keyword, rest) of every record, its lines counted from `first`.
+
+    A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
+    status; what is neither is noted in `unknown` as word -> line.
+    """
+    line_of_record, keyword, parts = 0, "", []
+    for line, content in enumerate(re.split(r"\r\n|\r|\n", text), first):
+        word, *rest = content.split(maxsplit=1) or [""]
+        if not word or word.startswith("!"):
+            continue
+        if keyword in _NUMERIC and _NUMBER.fullmatch(word):
+            parts.append(content)
+        elif word in _KEYWORDS:
+            if keyword:
+                yield line_of_record, keyword, " ".join(parts).strip()
+            line_of_record, keyword, parts = line, word, rest
+        elif len(unknown) < 100:
+            unknown.setdefault(word[:20], line)
+    if keyword:
+        yield line_of_record, keyword, " ".join(parts).strip()
+
+
+def _blocks(records: Iterator[tuple[int, str, str]]) -> Iterator[list[tuple[int, str, str]]]:
+    """The records of each glass, its NM first; the file's header, if any, before them."""
+    block: list[tuple[int, str, str]] = []
+    for record in records:
+        if record[1] == "NM" and block:
+            yield block
+            block = []
+        block.append(record)
+    if block:
+        yield block
+
+
+def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> Glass:
+    line, _, rest = block[0]
+    words = rest.split()
+    if len(words) < 5:
+        raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
+    name = words[0]
+    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
+    formula = BY_NUMBER.get(number)
+    if formula is None:
+        raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
+    line, text = _only(block, "CD", name, path)
+    coefficients, count = _numbers(text.split(), path, line), FORMULAS[formula].count
+    if len(coefficients) < count:
+        found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
+        raise _fault(path, line, found, expected, "is the line cut off?")
+    comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
+    listing = re.search(r"\balternatives: *([^;\n]+)", comment)
+    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
+    return Glass(
+        name=name,
+        formula=formula,
+        coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
+        catalog=catalog,
+        wavelength_range=_wavelength_range(block, name, path),
+        status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
+        nd_listed=None if unlisted else nd_listed,
+        abbe_listed=None if unlisted else abbe_listed,
+        alternatives=tuple(listing[1].replace(",", " ").split()) if listing else (),
+        listed_name=name,
+        comment=comment,
+        records=tuple(
+            (keyword, _numbers(_told(keyword, text.split()), path, line, blanks=True))
+            for line, keyword, text in block
+            if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
+        ),
+    )
+
+
+def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
+    line, text = _only(block, "LD", name, path)
+    numbers = _numbers(text.split(), path, line)[:2]
+    if numbers == (0.0, 0.0):
+        return None
+    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
+        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
+    return numbers
+
+
+def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
+    """The one record of a keyword that every glass must have, (line, text).
+
+    A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
+    """
+    found = [(line, text) for line, key, text in block if key == keyword]
+    if not found:
+        raise _fault(path, block[-1][0], f"{name} without a {keyword} record", "one", "is the file cut off?")
+    if len(found) > 1:
+        fix = "is the NM line of the next glass missing or misspelt?"
+        raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
+    return found[0]
+
+
+def _told(keyword: str, words: list[str]) -> list[str]:
+    """The words of a record; a thermal coefficient that is not known is 0, as AGF has it, and its temperature 20 °C."""
+    if keyword != "TD":
+        return words
+    return [("20" if k == 6 else "0") if word in ("-", "_") else word for k, word in enumerate(words)]
+
+
+def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
+    """Numbers of a record; where `blanks`, "-" and "_" stand for a figure that is not known, which AGF writes as -1."""
+    numbers = []
+    for word in words:
+        if blanks and word in ("-", "_"):
+            word = "-1"
+        try:
+            number = float(word if "D" not in word else word.replace("D", "E"))  # Fortran writes 1.0D-03
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or "_" in word:
+            fix = "write decimals with a point" if "," in word else "is the line damaged?"
+            raise _fault(path, line, repr(word[:40]), "a finite number", fix)
+        numbers.append(number)
+    return tuple(numbers)
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_agf(catalog: Catalog, path: str | Path) -> None:
+    """Write a catalog as an AGF file in UTF-8, every number so that it reads back to the same bits; atomically.
+
+    Raises ValueError for a glass that the format cannot hold (its formula, or a blank in its name).
+    """
+    write_text(path, format_agf(catalog))
+
+
+def format_agf(catalog: Catalog) -> str:
+    """The text of an AGF file."""
+    lines = [f"CC {comment}" for comment in catalog.comments or (catalog.name,)]
+    for listed, glass in catalog.glasses.items():
+        lines += _glass_lines(listed, glass)
+    return "\n".join(lines) + "\n"
+
+
+def _glass_lines(name: str, glass: Glass) -> list[str]:
+    number = FORMULAS[glass.formula].number if glass.formula in FORMULAS else None
+    if number is None or len(name.split()) != 1:
+        raise ValueError(f"glass {name!r} with formula {glass.formula!r} cannot be written as AGF")
+    n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed)
+    code = f"{round(n * 1000) % 1000:03d}{round(v * 10) % 1000:03d}"
+    status = next((number for number, status in _STATUSES.items() if status == glass.status), -1)
+    coefficients = glass.coefficients.tolist()
+    figures = [("CD", coefficients + [0.0] * (10 - len(coefficients))), ("LD", glass.wavelength_range or (0.0, 0.0))]
+    records = sorted([*glass.records, *figures], key=lambda record: _NUMERIC[record[0]])
+    return [
+        f"NM {name} {number} {code} {_spell(n)} {_spell(v)} 0 {status} -1",
+        *[f"GC {comment}" for comment in glass.comment.split("\n") if comment],
+        *[" ".join([keyword, *map(_spell, numbers)]) for keyword, numbers in records],
+    ]
+
+
+def _spell(number: float) -> str:
+    return repr(float(number)).removesuffix(".0")

@@ -1,0 +1,285 @@
+"""Glass catalogs: a glass by its name.
+
+A name is never replaced by a similar one. `find_glass` searches, in this order,
+
+1. the catalogs of the user: files given by the caller, then those in the environment variable RAYTRACE_CATALOGS;
+2. the catalogs that the lens file lists, in its order: those supplied with it, else the shipped ones of these names;
+3. the other shipped catalogs, in the order of SHIPPED (with a warning if two of them define the name differently);
+4. the alias table glass_catalogs/ALIASES.csv: other spellings of the same glass, each with its reason;
+
+and otherwise raises `UnknownGlass`. Names are compared without regard to case: programs store them in capitals, and no
+shipped catalog has two names that differ in case alone. The Glass has the requested name, its catalog, and the
+catalog's spelling.
+"""
+
+import csv
+import difflib
+import os
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from raytrace.files import shipped
+from raytrace.materials import agf
+from raytrace.materials.agf import Catalog as Catalog
+from raytrace.materials.agf import CatalogError as CatalogError
+from raytrace.materials.agf import CatalogWarning as CatalogWarning
+from raytrace.materials.agf import read_agf as read_agf
+from raytrace.materials.agf import read_text
+from raytrace.materials.agf import write_agf as write_agf
+from raytrace.materials.glass import LINES, Glass, refractive_index
+from raytrace.words import calling_level
+
+#: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
+#: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
+SHIPPED = (
+    *("SCHOTT", "OHARA", "HOYA", "CDGM", "HIKARI", "SUMITA", "LZOS", "CORNING", "INFRARED", "MISC", "HERAEUS", "TOPAS"),
+    *("ZEON", "ARTON", "LIGHTPATH", "RPO", "UMICORE", "ISUZU", "ARCHER", "RAD_HARD", "BIREFRINGENT"),
+)
+#: Further names that lens files give to a shipped catalog.
+CATALOG_NAMES = {"NIKON": "HIKARI", "NIKON-HIKARI": "HIKARI", "NIKON_HIKARI": "HIKARI"}
+#: Environment variable: paths of AGF files, separated as in PATH.
+ENVIRONMENT = "RAYTRACE_CATALOGS"
+#: Glasses of an older edition than that of lens files of 2023: the newer edition, and the largest difference of its
+#: indices from ours from 0.42 to 0.46 µm. No source of its coefficients could be compared.
+OLDER_EDITIONS = {
+    ("CDGM", "H-ZBAF20"): ("CDGM of 2023-09", 5.3e-5),
+    ("CDGM", "H-ZBAF1"): ("CDGM of 2023-09", 3.0e-5),
+}
+#: Glasses of one name whose indices differ by more than this are different glasses.
+SAME_INDEX = 1e-6
+
+
+class AmbiguousGlass(UserWarning):
+    """Two catalogs define a name differently, and the lens file does not specify the catalog."""
+
+
+def _at(where: str) -> str:
+    return f"{where}: " if where else ""
+
+
+class UnknownGlass(LookupError):
+    """No catalog has the name; `suggestions`: (glass, catalog) of similar names, `searched`: names of the catalogs."""
+
+    def __init__(
+        self,
+        name: str,
+        where: str,
+        suggestions: tuple[tuple[str, str], ...],
+        searched: Sequence[str],
+        hint: str = "",
+    ):
+        self.name, self.where, self.suggestions, self.searched = name, where, suggestions, searched
+        near = ", ".join(f"{glass} ({catalog})" for glass, catalog in suggestions)
+        super().__init__(
+            f"{_at(where)}unknown glass {name!r}; no catalog of {', '.join(searched)} holds it. "
+            + (f"Nearest names: {near}. " if near else "No name comes near. ")
+            + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})"
+            + (f"; {hint}." if hint else ".")
+        )
+
+
+def find_glass(
+    name: str, *, catalogs: Sequence[str | Catalog] = (), user: Sequence[str | Path] = (), where: str = ""
+) -> Glass:
+    """The glass of a name, searched in the order of the module's docstring.
+
+    catalogs: those of the lens file in its order: names (those not shipped are ignored: see `missing_catalogs`) and
+    catalogs supplied with it; user: AGF files, searched first; where: the location for messages, as "lens.zmx:31,
+    surface 2". Raises UnknownGlass, and CatalogError for a bad user catalog; warns AmbiguousGlass.
+    """
+    wanted = name.strip()
+    own = [load(path) for path in user_catalogs(user)]
+    for catalog in own:
+        glass = catalog.find(wanted)
+        if glass:
+            return replace(glass, name=name)
+    for catalog in catalogs:
+        glass = catalog.find(wanted) if isinstance(catalog, Catalog) else _of_shipped(wanted, catalog)
+        if glass:
+            return replace(glass, name=name)
+    others = [_shipped_glass(wanted, catalog) for catalog in SHIPPED if wanted.upper() in _shipped_names(catalog)]
+    if others:
+        _warn_if_ambiguous(others, where)
+        return replace(others[0], name=name)
+    alias = aliases().get(wanted.upper())
+    if alias:
+        return replace(_shipped_glass(alias.glass, alias.catalog), name=name)
+    own += [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
+    raise UnknownGlass(name, where, _nearest(wanted, own), [*(catalog.name for catalog in own), *SHIPPED])
+
+
+def edition(glass: Glass) -> tuple[str, ...]:
+    """Statements on the edition of a glass's coefficients; empty for a glass of no catalog.
+
+    Shipped catalogs hold coefficients on which several public sources, listed in the glass's comment, agree.
+    """
+    if not glass.catalog:
+        return ()
+    parts = [part.strip() for part in glass.comment.split(";")]
+    sources = [part for part in parts if "sources agree" in part or "deviate by" in part]
+    if not sources:
+        own = f": {glass.comment}" if glass.comment else " does not state its edition"
+        return (glass.catalog + own,)
+    newer = OLDER_EDITIONS.get((glass.catalog, glass.listed_name or glass.name))
+    older = [f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}"] if newer else []
+    return ("date not stated; " + "; ".join(sources), *older)
+
+
+def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()) -> tuple[str, ...]:
+    """The catalog names of a lens file that are neither shipped nor the file name of a user catalog."""
+    own = {path.stem.upper() for path in user_catalogs(user)}
+    return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in own)
+
+
+def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:
+    """Up to `count` (glass, catalog) of similar names, the nearest first; hyphens are ignored."""
+    return _nearest(name, [load(path) for path in user_catalogs(user)], count)
+
+
+def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[str, str], ...]:
+    spellings: dict[str, list[tuple[str, str]]] = {}
+    listed = [(glass, catalog.name) for catalog in own for glass in catalog.glasses]
+    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
+    for glass, catalog in listed + shipped:
+        spellings.setdefault(_bare(glass), []).append((glass, catalog))
+    near = difflib.get_close_matches(_bare(name), spellings, n=count, cutoff=0.6)
+    return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
+
+
+def plain_names(
+    name: str, *, came: Sequence[Catalog] = (), user: Sequence[str | Path] = ()
+) -> tuple[tuple[str, str], ...]:
+    """The (glass, catalog) whose names are `name` but for hyphens, underscores, blanks and points, in search order.
+
+    came: catalogs that came with a lens; user: further AGF files.
+    """
+    bare = _bare(name)
+    own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
+    own += [(glass, catalog.name) for catalog in came for glass in catalog.glasses]
+    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
+    return tuple((glass, catalog) for glass, catalog in own + shipped if _bare(glass) == bare)
+
+
+def same_catalog(one: str, other: str) -> bool:
+    """Whether two names denote the same catalog, as NIKON and HIKARI do."""
+    return one.upper() == other.upper() or (_shipped_name(one) or one) == (_shipped_name(other) or other)
+
+
+def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
+    """The user's AGF files: those given, then those of the environment variable RAYTRACE_CATALOGS."""
+    listed = [entry for entry in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if entry.strip()]
+    return tuple(dict.fromkeys(Path(entry) for entry in (*user, *listed)))
+
+
+def shipped_folder() -> Path:
+    """The folder of the shipped catalogs: inside the installed package, or next to it in a checkout."""
+    folder = shipped("glass_catalogs")
+    if not (folder / f"{SHIPPED[0]}.AGF").is_file():
+        raise CatalogError(f"{folder}: no glass catalogs here; reinstall raytrace")
+    return folder
+
+
+def shipped_file(name: str) -> Path | None:
+    """The file of a shipped catalog; None for a name that is not shipped."""
+    shipped = _shipped_name(name)
+    return None if shipped is None else shipped_folder() / f"{shipped}.AGF"
+
+
+def shipped_catalog(name: str) -> Catalog:
+    """A shipped catalog by its name, parsed once. Raises CatalogError for a name that is not shipped."""
+    shipped = _shipped_name(name)
+    if shipped is None:
+        raise CatalogError(f"no catalog {name!r} is shipped; there are {', '.join(SHIPPED)}")
+    return load(shipped_folder() / f"{shipped}.AGF")
+
+
+def load(path: str | Path, *, listed: bool = False) -> Catalog:
+    """The catalog of an AGF file, parsed again only after a change of the file. Raises CatalogError.
+
+    listed: each glass is parsed at its first use, and raises then.
+    """
+    path = Path(path)
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise CatalogError(f"{path}: cannot be read ({error.strerror}); expected a glass catalog (AGF)") from error
+    return _load(path.resolve(), state.st_mtime_ns, state.st_size, listed)
+
+
+@lru_cache(maxsize=64)
+def _load(path: Path, modified: int, size: int, listed: bool) -> Catalog:
+    return agf.listed(read_text(path), path) if listed else read_agf(path)
+
+
+class Alias(NamedTuple):
+    """Another spelling of a glass, and why it is the same glass."""
+
+    glass: str
+    catalog: str
+    reason: str
+
+
+@lru_cache(maxsize=1)
+def aliases() -> dict[str, Alias]:
+    """The alias table, by name in capitals."""
+    with (shipped_folder() / "ALIASES.csv").open(encoding="utf-8", newline="") as file:
+        return {row.pop("alias").upper(): Alias(**row) for row in csv.DictReader(file)}
+
+
+@lru_cache(maxsize=64)
+def _shipped_names(catalog: str) -> dict[str, str]:
+    """Capitals -> name of the glasses of a shipped catalog, without parsing their figures."""
+    text = read_text(shipped_folder() / f"{catalog}.AGF")
+    return {name.upper(): name for name in re.findall(r"^NM (\S+)", text, re.MULTILINE)}
+
+
+def _shipped_name(catalog: str) -> str | None:
+    name = CATALOG_NAMES.get(catalog.upper(), catalog.upper())
+    return name if name in SHIPPED else None
+
+
+def _of_shipped(name: str, catalog: str) -> Glass | None:
+    shipped = _shipped_name(catalog)
+    return _shipped_glass(name, shipped) if shipped and name.upper() in _shipped_names(shipped) else None
+
+
+def shipped_difference(glass: Glass) -> float:
+    """Largest index difference of a glass from that of the same name in the shipped catalog; 0 if there is none."""
+    shipped = _of_shipped(glass.listed_name, glass.catalog)
+    return _difference(glass, shipped) if shipped else 0.0
+
+
+def _shipped_glass(name: str, catalog: str) -> Glass:
+    return shipped_catalog(catalog).glasses[_shipped_names(catalog)[name.upper()]]
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"[-_ .]", "", name.upper())
+
+
+def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
+    glass, *others = candidates
+    rivals = [f"{other.catalog} by {gap:.1e}" for other in others if (gap := _difference(glass, other)) > SAME_INDEX]
+    if rivals:
+        message = (
+            f"{_at(where)}{glass.listed_name} is taken from {glass.catalog}, but another glass has this name in other "
+            f"catalogs (index differs in {', '.join(rivals)}); name the catalog in the file, or give it (--catalog)"
+        )
+        warnings.warn(message, AmbiguousGlass, stacklevel=calling_level())
+
+
+def _difference(one: Glass, other: Glass) -> float:
+    """Largest difference of two indices in the range they share, or at the d line if they share none."""
+    spans = [glass.wavelength_range for glass in (one, other) if glass.wavelength_range]
+    shortest, longest = max((span[0] for span in spans), default=1.0), min((span[1] for span in spans), default=0.0)
+    if shortest > longest:
+        shortest = longest = LINES["d"]
+    wavelengths = torch.linspace(shortest, longest, 9, dtype=torch.float64)
+    return float((refractive_index(one, wavelengths) - refractive_index(other, wavelengths)).abs().max())

@@ -1,0 +1,325 @@
+"""Glass: media by their dispersion formulas (`formulas.py`), and the door where a wavelength is refused.
+
+Two ways to an index, on purpose:
+
+* `refractive_index(glass, wavelength)` is pure mathematics, for use inside `torch.func`, `torch.compile` and
+  optimisation. Where the formula has no real index (n² ≤ 0, a pole, a wavelength that is no length) it returns 0 with
+  gradient 0, never NaN: 0 is the index of no medium and reads as the mask `index > 0`.
+* `check_wavelengths(glass, wavelengths)` is the door: it raises `InvalidIndex` there and warns `OutOfRange` where the
+  glass's coefficients were not fitted. `index(glass, wavelength)` is both in one call.
+
+Wavelengths in µm, indices relative to air at the catalog's reference temperature and 1 atm (`environment.py`:
+at others).
+"""
+
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.materials.formulas import FORMULAS
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.value import value
+from raytrace.words import calling_level
+
+#: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
+LINES = {"i": 0.3650146, "h": 0.4046561, "g": 0.4358343, "F'": 0.4799914, "F": 0.4861327, "e": 0.5460740}
+LINES |= {"d": 0.5875618, "D": 0.5892938, "C'": 0.6438469, "C": 0.6562725, "r": 0.7065188, "s": 0.8521100}
+LINES |= {"t": 1.0139800}
+
+#: Relative slack at the ends of a wavelength range: a few float32 spacings.
+_RANGE_SLACK = 1e-6
+
+#: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
+_SHORTEST, _LONGEST = 3e-5, 100.0
+_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
+
+
+class ImplausibleWavelength(ValueError):
+    """A wavelength that no lens is for: most likely it is in another unit than µm."""
+
+
+class InvalidIndex(ValueError):
+    """A glass has no real, positive refractive index at a wavelength asked of it."""
+
+
+class OutOfRange(UserWarning):
+    """A wavelength lies outside the range that the coefficients of a glass were fitted to."""
+
+
+@value
+class Glass:
+    """A refracting medium: a dispersion formula with its coefficients.
+
+    name: as written in the lens file, "" for air.
+    formula: key of FORMULAS ("constant", "model", "schott", "sellmeier_1", ...), or "mirror".
+    coefficients: (m, ...) of the formula, float64; trailing axes broadcast against the wavelength.
+    catalog: name of the catalog the glass came from, "" if none.
+    wavelength_range: µm (shortest, longest) or None.
+    status: "standard", "preferred", "obsolete", "special", "melt", or "" if not listed.
+    nd_listed, abbe_listed: n_d and V_d as the catalog lists them (rounded by its maker), None if it does not.
+    alternatives: names of present-day glasses of the same catalog that come near, as the catalog comments say.
+    listed_name: the catalog's own spelling of the name.
+    comment: the catalog's comment on the glass.
+    records: further figures of the catalog, (keyword, numbers) in file order: ED, TD, MD, OD, IT.
+    """
+
+    name: str
+    formula: str
+    coefficients: Tensor
+    catalog: str = ""
+    wavelength_range: tuple[float, float] | None = None
+    status: str = ""
+    nd_listed: float | None = None
+    abbe_listed: float | None = None
+    alternatives: tuple[str, ...] = ()
+    listed_name: str = ""
+    comment: str = ""
+    records: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+# -- the index --------------------------------------------------------------------------------------------------------
+
+
+def refractive_index(glass: Glass, wavelength: Tensor | float) -> Tensor:
+    """n of a glass, evaluated in float64; 0 with gradient 0 where the formula has no real, positive index.
+
+    wavelength: (...) µm, plain numbers in float64; a constant index takes any number. Returns (...), broadcast with the
+    trailing axes of the coefficients, in the dtype and on the device of `wavelength`. No check, no warning, no host
+    synchronisation: see the module's docstring.
+    Raises InvalidIndex for MIRROR, which has no index: light stays in the medium before it.
+    """
+    if glass.formula == "mirror":
+        raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
+    if not isinstance(wavelength, Tensor):
+        wavelength = torch.as_tensor(wavelength, dtype=torch.float64)
+    exact = wavelength.to(torch.float64)
+    coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
+    count, *batch = coefficients.shape
+    coefficients = coefficients.reshape(count, *[1] * (exact.dim() - len(batch)), *batch)
+    formula = FORMULAS[glass.formula]
+    if formula.wavelengths is None:  # air is half of all media: no formula, no wavelength
+        n = formula.index(coefficients, exact)
+        return torch.where((n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+    shortest, longest = formula.wavelengths
+    finite = coefficients.abs() < torch.inf
+    usable = (exact > shortest) & (exact < longest) & finite.all(0)
+    n = formula.index(torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
+    return torch.where(usable & (n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+
+
+def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:
+    """Refuse wavelengths (µm) at which a glass has no index; warn of those outside its range.
+
+    where: the place to name in the message ("lens.zmx:31, surface 2"). Raises InvalidIndex; warns OutOfRange.
+    """
+    if glass.formula == "mirror":
+        return
+    wavelengths = _as_wavelength(wavelengths).detach()
+    place = f"{where}: " if where else ""
+    name = f"{glass.name or 'medium'} ({glass.catalog})" if glass.catalog else glass.name or "medium"
+    span = glass.wavelength_range
+    fitted = f"its coefficients hold from {span[0]:g} to {span[1]:g} µm" if span else "it lists no wavelength range"
+    n = refractive_index(glass, wavelengths).detach()
+    exists = (n > 0) & (wavelengths > 0) & torch.isfinite(wavelengths)
+    missing = wavelengths.expand(exists.shape)[~exists]
+    if missing.numel():
+        raise InvalidIndex(
+            f"{place}{name} has no real refractive index at {_spell(missing)} µm (formula {glass.formula}: "
+            f"n² ≤ 0, a pole, or not a wavelength); {fitted}. Check the wavelength, in µm, or choose another glass"
+        )
+    if span:
+        shortest, longest = span[0] * (1 - _RANGE_SLACK), span[1] * (1 + _RANGE_SLACK)
+        outside = wavelengths[(wavelengths < shortest) | (wavelengths > longest)]
+        if outside.numel():
+            message = f"{place}{name} is extrapolated to {_spell(outside)} µm; {fitted}"
+            warnings.warn(message, OutOfRange, stacklevel=calling_level())
+
+
+def check_unit(
+    wavelengths: Tensor, media: Iterable[Glass] = (), *, believed: Tensor | None = None, where: str = ""
+) -> None:
+    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
+
+    media: glasses whose range, where it reaches further, is believed. believed: wavelengths (...) known to be in µm, as
+    those of a lens file: up to ten times longer or shorter ones are, too. Raises ImplausibleWavelength, with a guess;
+    it refuses what is not above 0 and finite in any case.
+    """
+    spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
+    known = [] if believed is None else [one for one in believed.detach().flatten().tolist() if 0 < one < math.inf]
+    shortest = min([_SHORTEST, *(s[0] for s in spans), *(0.1 * one for one in known)])
+    longest = max([_LONGEST, *(s[1] for s in spans), *(10 * one for one in known)])
+    for wavelength in wavelengths.detach().flatten().tolist():
+        if not (0 < wavelength < math.inf and shortest <= wavelength <= longest):
+            guesses = (wavelength * factor for factor in _UNITS)
+            guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
+            raise ImplausibleWavelength(
+                f"{where}{': ' if where else ''}a wavelength of {wavelength:g} µm: expected "
+                f"{shortest:g} to {longest:g}; wavelengths are in µm" + (f"; {guess}" if guess else "")
+            )
+
+
+def index(glass: Glass, wavelength: Tensor | float) -> Tensor:
+    """n of a glass at wavelengths (...) µm, checked: raises InvalidIndex, warns OutOfRange (`check_wavelengths`)."""
+    wavelength = _as_wavelength(wavelength)
+    check_wavelengths(glass, wavelength)
+    return refractive_index(glass, wavelength)
+
+
+def _as_wavelength(wavelength: Tensor | Sequence[float] | float) -> Tensor:
+    if isinstance(wavelength, Tensor) and wavelength.is_floating_point():
+        return wavelength
+    return torch.as_tensor(wavelength, dtype=torch.float64)
+
+
+def _spell(wavelengths: Tensor) -> str:
+    listed = list(dict.fromkeys(f"{number:.7g}" for number in wavelengths.flatten().tolist()))
+    return ", ".join(listed[:5]) + (f" and {len(listed) - 5} more" if len(listed) > 5 else "")
+
+
+def _at_lines(glass: Glass, lines: str) -> tuple[Tensor, ...]:
+    device = glass.coefficients.device
+    return tuple(
+        refractive_index(glass, torch.tensor(LINES[line], dtype=torch.float64, device=device)) for line in lines
+    )
+
+
+def nd(glass: Glass) -> Tensor:
+    """n at the helium d line (0.5875618 µm), by the formula also where that lies outside the glass's range."""
+    return _at_lines(glass, "d")[0]
+
+
+def abbe_number(glass: Glass) -> Tensor:
+    """V_d = (n_d - 1)/(n_F - n_C); 0 for a medium without dispersion, as lens files write it."""
+    d, blue, red = _at_lines(glass, "dFC")
+    return safe_divide(d - 1.0, blue - red)
+
+
+# -- media ------------------------------------------------------------------------------------------------------------
+
+
+def constant(index: float | Tensor, name: str = "") -> Glass:
+    """A medium of one refractive index at every wavelength."""
+    return Glass(name, "constant", torch.as_tensor(index, dtype=torch.float64).reshape(1))
+
+
+#: Sellmeier's formulas of three, four and five terms.
+_SELLMEIER = ("sellmeier_1", "sellmeier_3", "sellmeier_5")
+
+
+def sellmeier(strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known) -> Glass:
+    """The glass n² = 1 + Σ_i B_i λ²/(λ² - C_i): strengths B_i and poles C_i (µm²), (m, ...) with m ≤ 5.
+
+    known: further fields of Glass, such as `wavelength_range`.
+    """
+    b, c = (torch.as_tensor(part, dtype=torch.float64) for part in (strengths, poles))
+    formula = next((name for name in _SELLMEIER if FORMULAS[name].count >= 2 * b.shape[0]), None)
+    if b.shape[:1] != c.shape[:1] or formula is None:
+        raise ValueError(f"expected as many strengths as poles and at most 5, found {b.shape[0]} and {c.shape[0]}")
+    b, c = torch.broadcast_tensors(b, c)
+    pairs = torch.stack([b, c], 1).flatten(0, 1)
+    padding = pairs.new_zeros(FORMULAS[formula].count - pairs.shape[0], *pairs.shape[1:])
+    return Glass(name, formula, torch.cat([pairs, padding]), **known)
+
+
+def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0.0, *, name: str = "") -> Glass:
+    """The medium of index n_d, Abbe number V_d and deviation ΔP_gF from the normal line (`FORMULAS["model"]`).
+
+    Differentiable in all three. V_d = 0 is a constant index. Raises ValueError where a number is not finite or nd ≤ 0.
+    """
+    numbers = torch.broadcast_tensors(*(torch.as_tensor(part, dtype=torch.float64) for part in (nd, vd, dpgf)))
+    coefficients = torch.stack(numbers)
+    if not (torch.isfinite(coefficients).all() and (numbers[0] > 0).all() and (numbers[1] >= 0).all()):
+        raise ValueError(f"a model glass needs finite nd > 0, Vd ≥ 0 and ΔPgF; found {nd}, {vd}, {dpgf}")
+    return Glass(name, "model", coefficients)
+
+
+def label(glass: Glass) -> str:
+    """The name of a medium; of one without a name n_d/V_d of a model glass, "n 1.5" of a constant index, "" of air."""
+    if glass.name or glass.coefficients.dim() > 1:
+        return glass.name
+    numbers = glass.coefficients.tolist()
+    if glass.formula == "model":
+        return f"{numbers[0]:.6g}/{numbers[1]:.4g}"
+    return f"n {numbers[0]:.6g}" if glass.formula == "constant" and numbers[0] != 1 else ""
+
+
+def mil_glass(code: str) -> Glass:
+    """The model glass of a six-digit code: "517642" is n_d = 1.517, V_d = 64.2.
+
+    The code holds three decimals of n_d - 1, so an index of 2 or more cannot be written (003283 reads 1.003).
+    Raises ValueError for anything but six digits.
+    """
+    if len(code) != 6 or not (code.isascii() and code.isdigit()):
+        raise ValueError(f"a MIL glass code is six digits, as 517642 for nd = 1.517 and Vd = 64.2; found {code!r}")
+    return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
+
+
+#: Powers of λ in Schott's formula, the first m of which m measured indices decide, and where each stands in it.
+_SCHOTT_POWERS, _SCHOTT_PLACES = (0, -2, 2, -4, -6, -8), (0, 2, 1, 3, 4, 5)
+
+
+def from_table(
+    wavelengths: Sequence[float] | Tensor,
+    indices: Sequence[float] | Tensor,
+    *,
+    exact: int = 0,
+    terms: int = len(_SCHOTT_POWERS),
+    name: str = "table",
+) -> Glass:
+    """The glass n² = a₀ + a₂ λ⁻² + a₁ λ² + a₃ λ⁻⁴ + … through indices (m,) at wavelengths (m,) µm.
+
+    As many indices as there are terms are met exactly, more by least squares; of these the first `exact` ones, fewer
+    than there are terms, still are. Differentiable in the indices.
+    Raises ValueError for lists of unequal length, for equal wavelengths and for numbers that are none.
+    """
+    w, n = (torch.as_tensor(part, dtype=torch.float64) for part in (wavelengths, indices))
+    if w.dim() != 1 or w.shape != n.shape or not len(w):
+        raise ValueError(f"{n.numel()} indices at {w.numel()} wavelengths: expected one each")
+    if not bool((w > 0).all() & torch.isfinite(w).all() & (n > 0).all() & torch.isfinite(n).all()):
+        raise ValueError(f"wavelengths {w.tolist()} µm and indices {n.tolist()}: expected finite, positive numbers")
+    if len(torch.unique(w)) < len(w):
+        raise ValueError(f"a wavelength stands twice in {w.tolist()}: expected one index for each")
+    terms, exact = min(len(w), terms, len(_SCHOTT_POWERS)), min(exact, len(w))
+    basis = torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1)
+    if len(w) > terms > exact > 0:  # a = Q (y, z): the first rows decide y, least squares z
+        q, r = torch.linalg.qr(basis[:exact].T, mode="complete")
+        y = torch.linalg.solve_triangular(r[:exact].T, (n * n)[:exact, None], upper=False)
+        rest = basis[exact:] @ q
+        left = (n * n)[exact:, None] - rest[:, :exact] @ y
+        found = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
+        missed = (n * n)[:exact, None] - basis[:exact] @ found[:, None]  # by rounding
+        found = found + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
+    else:
+        found = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
+    coefficients = found.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), found)
+    return Glass(name, "schott", coefficients, wavelength_range=(float(w.min()), float(w.max())))
+
+
+def normal_line_deviation(glass: Glass) -> Tensor:
+    """ΔP_gF = (n_g - n_F)/(n_F - n_C) - 0.6438 + 0.001682 V_d, the number a model glass takes; 0 without dispersion."""
+    violet, blue, red = _at_lines(glass, "gFC")
+    normal = 0.6438 - 0.001682 * abbe_number(glass)
+    return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - normal)
+
+
+def listing_error(glass: Glass) -> tuple[float, float]:
+    """How far n_d and V_d by the coefficients lie from the listed ones; (nan, nan) where the catalog lists none."""
+    if glass.nd_listed is None or glass.abbe_listed is None:
+        return math.nan, math.nan
+    return float(nd(glass)) - glass.nd_listed, float(abbe_number(glass)) - glass.abbe_listed
+
+
+#: How far from 1 the index of a gas may be: air at 1 atm has 1.0003, carbon dioxide 1.0005.
+_GAS = 1e-3
+
+
+def is_air(glass: Glass) -> bool:
+    """Whether a medium is air, or as thin as it: its index at the d line is 1 to 1e-3, whatever its name."""
+    return glass.formula != "mirror" and bool(((nd(glass).detach() - 1).abs() < _GAS).all())
+
+
+AIR = constant(1.0)
+MIRROR = Glass("MIRROR", "mirror", torch.ones(1, dtype=torch.float64))

@@ -1,0 +1,169 @@
+"""Merit functions as values: the rows of a file, of a list or of a default, which can be joined and weighed anew.
+
+rt.Merit.of(lens)                      the file's own
+rt.Merit.default(lens, "spot")         `default.rows_of`
+one + other, 2 * one                   joined; with all weights doubled
+one.with_weights(EFFL=1)               of all rows of an operand; with_targets likewise
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from raytrace.optimization.context import Line
+from raytrace.optimization.default_merit import BadMerit, Boundaries, boundary_rows, rows_of
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import parse_range
+from raytrace.words import did_you_mean
+
+
+@dataclass(frozen=True)
+class Merit:
+    """Rows of a merit function, in order; `rows[i - 1]` is row i.
+
+    unit: mm in the unit of length of targets and values, which matters beside rows of pure numbers or waves.
+    """
+
+    rows: tuple[Row, ...] = field(default=())
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, lens: Lens) -> "Merit":
+        """That of the lens's file. Raises BadMerit where it has none."""
+        if lens.optimization_data is None or not lens.optimization_data.merit:
+            raise BadMerit("the lens has no merit function of its own: choose one by `merit=spot`")
+        return cls(lens.optimization_data.merit, lens.optimization_data.unit)
+
+    @classmethod
+    def default(cls, lens: Lens, kind: str = "spot", **how) -> "Merit":
+        """A default merit function of the lens, in mm; how: as for `default.rows_of`."""
+        return cls(rows_of(lens, kind, **how))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(self.rows)
+
+    def __add__(self, other: "Merit | Sequence[Row]") -> "Merit":
+        """The rows of both, in the unit of the first; mere rows are in mm.
+
+        Rows of the second are of the first configuration until they say otherwise, and rows of arithmetic keep to
+        their rows. Raises BadMerit.
+        """
+        unit = other.unit if isinstance(other, Merit) else 1.0
+        behind = (in_unit(row, unit, self.unit) for row in other)
+        if any(row.operand == "PRIM" for row in self.rows):
+            raise BadMerit("rows behind a row PRIM would be of that wavelength: join them the other way round")
+        reset = (Row("CONF", (1, 0)),) if any(row.operand == "CONF" for row in self.rows) else ()
+        ahead = (*self.rows, *reset)
+        return Merit((*ahead, *(_moved(row, len(ahead)) for row in behind)), self.unit)
+
+    def __radd__(self, other: Sequence[Row]) -> "Merit":
+        return Merit(tuple(other)) + self
+
+    def __mul__(self, factor: float) -> "Merit":
+        """With all weights larger."""
+        return self._each(lambda row: dataclasses.replace(row, weight=row.weight * factor))
+
+    __rmul__ = __mul__
+
+    def with_weights(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
+        """With other weights, by the number of a row or for all rows of an operand. Raises BadMerit."""
+        return self._with("weight", by_row or {}, by_operand)
+
+    def with_targets(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
+        """With other targets, by the number of a row or for all rows of an operand. Raises BadMerit."""
+        return self._with("target", by_row or {}, by_operand)
+
+    def _with(self, name: str, by_row: Mapping[int, float], by_operand: Mapping[str, float]) -> "Merit":
+        known = dict.fromkeys(row.name for row in self.rows)
+        for operand in by_operand:
+            if operand not in known:
+                raise BadMerit(f"no row {operand}; there are {', '.join(known)}{did_you_mean(operand, known)}")
+        for number in by_row:
+            if not 1 <= number <= len(self.rows):
+                raise BadMerit(f"no row {number}; there are rows 1 to {len(self.rows)}")
+        given = [by_row.get(number, by_operand.get(row.name)) for number, row in enumerate(self.rows, 1)]
+        changed = (
+            row if number is None else dataclasses.replace(row, **{name: float(number)})
+            for row, number in zip(self.rows, given, strict=True)
+        )
+        return Merit(tuple(changed), self.unit)
+
+    def _each(self, change) -> "Merit":
+        return Merit(tuple(map(change, self.rows)), self.unit)
+
+    def __str__(self) -> str:
+        lines = [f"{'row':>5}  {'operand':<8}{'arguments':<40}{'target':>14}{'weight':>14}"]
+        for number, row in enumerate(self.rows, 1):
+            told = "" if row.text else f"{row.target:>14.6g}{row.weight:>14.6g}"
+            lines.append(f"{number:>5}  {row.name:<8}{arguments(row) or row.text:<40}{told}".rstrip())
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def merit_for(
+    lens: Lens,
+    merit: "Merit | Sequence[Row] | str | None" = None,
+    *,
+    glass_thickness: tuple[float, float] | str | None = None,
+    air_thickness: tuple[float, float] | str | None = None,
+    edge: float | None = None,
+    configurations: Sequence[int] | None = None,
+    **how,
+) -> Merit:
+    """The merit function that is meant: a value, rows, the name of a default one, or by default the file's.
+
+    glass_thickness, air_thickness, edge: boundaries in mm, also as words "2:15", beside the rows that there are. how:
+    as for `default.rows_of`, of a default one; what is None is left to it. Raises BadMerit.
+    """
+    how = {name: given for name, given in how.items() if given is not None}
+    glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+    boundaries = Boundaries(glass, air, edge)
+    if isinstance(merit, str):
+        return Merit.default(lens, merit, boundaries=boundaries, configurations=configurations, **how)
+    if how:
+        raise BadMerit(f"`{next(iter(how))}` belongs to a default merit function: name it by `merit`, as spot")
+    found = Merit.of(lens) if merit is None else merit if isinstance(merit, Merit) else Merit(tuple(merit))
+    bounds = boundary_rows(lens, boundaries, configurations)
+    return found + Merit(bounds) if bounds else found
+
+
+def arguments(row: Row) -> str:
+    """The arguments of a row in words: what its whole numbers name, where they are known, and its four numbers."""
+    operand = OPERANDS.get(row.operand)
+    takes = operand.takes if operand is not None else ("", "")
+    named = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
+    plain = [] if named or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
+    numbers = [f"{number:.6g}" for number in row.numbers]
+    return "  ".join([*named, *plain, *([" ".join(numbers)] if any(row.numbers) else [])])
+
+
+def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
+    """The configuration (from 1) that every row is of; current: that of the rows before the first that says so."""
+    found = []
+    for row in rows:
+        current = row.integers[0] if row.operand == "CONF" else current
+        found.append(current)
+    return found
+
+
+def in_unit(row: Row, before: float, after: float) -> Row:
+    """The row with its target in another unit of length; both in mm."""
+    power = OPERANDS[row.operand].length if row.operand in OPERANDS else 0
+    return dataclasses.replace(row, target=row.target * (before / after) ** power) if power else row
+
+
+def _moved(row: Row, by: int) -> Row:
+    """A row that stands further down; one of arithmetic takes the values of the same rows, further down as well."""
+    operand = OPERANDS.get(row.operand)
+    if operand is None or operand.refers is None:
+        return row
+    probe = tuple(Row("EFFL") for _ in range(3))
+    taken = operand.refers(Line(3, Row(row.operand, (1, 2)), 0), probe)  # [1], or [1, 2] of two rows and of a range
+    first, second = row.integers
+    return dataclasses.replace(row, integers=(first + by, second + by if len(taken) > 1 else second))

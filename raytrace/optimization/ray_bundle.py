@@ -1,0 +1,554 @@
+"""Bundle: all rays that the rows of a merit function ask for, launched and traced in one pass, with derivatives.
+
+Rays are those of `tracing.launch`. Where they set out from numbers of the whole lens only by the entrance pupil and the
+focal length, they are launched here, by the same formulas in numpy; in every other case (ray aiming, real image
+heights, telecentric objects, curved ones) by `tracing.launch` itself, a forward derivative for every variable.
+
+Launch of bundles: rays through the paraxial entrance pupil, with derivatives by what the pupil moves with.
+
+Ray aiming for bundles: pupil points whose rays pass given points of the stop, with their derivatives.
+
+The points a solve s(a, x) = p r(x), s the hit on the stop, p the point of the pupil, r the radius of the stop: by
+Newton's method from where they were last, and by the implicit function theorem ∂a/∂x = (∂s/∂a)⁻¹ (p ∂r/∂x - ∂s/∂x).
+
+Rays by torch: for lenses that are launched or traced by torch alone, a derivative for every variable.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
+from raytrace.maths.numerics import dot
+from raytrace.optimization.lens_model import GLASS, unbent
+from raytrace.optimization.lens_state import LensState
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
+from raytrace.tracing.aiming import aiming_of, is_bent
+from raytrace.tracing.compiled.run import Pushed, Task
+from raytrace.tracing.compiled.structure import is_expressible, rows_of
+from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
+
+
+def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
+    """Rays through the paraxial entrance pupil, as `tracing.launch` starts them: position, direction and path."""
+    data = state.gaussian(state.primary)
+    kind, distance = state.lens.fields.kind, state.thickness[0]
+    index = np.abs(state.view.indices[:, :1])
+    radius, depth = 0.5 * state.entrance_pupil_diameter, data.entrance_pupil_position
+    at_infinity = np.isinf(value_of(distance))
+    x, y = (state.field_scale * part for part in (np.tan(np.deg2rad(field)) if kind == "angle" else field))
+    aim = radius * pupil[0], radius * pupil[1], depth
+    if at_infinity:
+        length = np.sqrt(x * x + y * y + 1.0)
+        direction = x / length, y / length, 1.0 / length
+        return aim, direction, index * dot(aim, direction)
+    source = x, y, -distance
+    chord = tuple(a - o for a, o in zip(aim, source, strict=True))
+    length, far = np.sqrt(dot(chord, chord)), np.sqrt(dot(source, source))
+    # Towards +z: a virtual object lies behind surface 1, and a pupil may lie before the object.
+    is_backward, is_virtual = value_of(depth) < -value_of(distance), value_of(distance) < 0
+    direction = tuple((-part if is_backward else part) / length for part in chord)
+    if abs(value_of(distance)) < abs(value_of(depth)):
+        return source, direction, index * (far if is_virtual else -far)
+    path = (dot(aim, aim) - 2 * dot(aim, source)) / (length + far)
+    if is_backward:
+        path = -path if is_virtual else -path - 2 * far
+    return aim, direction, index * path
+
+
+_STEPS = 12
+_CLOSE = 1e-9  # of the radius of the stop: one more step ends at rounding
+
+#: The hits (x, y) on the stop of rays through pupil points (2, W, R), and which arrive.
+AtStop = Callable[[LensState, tuple], tuple]
+
+
+def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: np.ndarray):
+    """Pupil points, two of (W, R), as numbers or dual ones, and which rays were found.
+
+    state: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: where to begin.
+    """
+    fixed = state.fixed()
+    goal = target * value_of(radius)
+    points, found, inverse = _root(fixed, at_stop, goal, abs(value_of(radius)), last)
+    if not state.count:
+        return tuple(points), found, points
+    (x, y), _ = at_stop(state, tuple(points))
+    missed = [target[0] * radius - x, target[1] * radius - y]
+    slopes = [part.full() if isinstance(part, Dual) else np.zeros((state.count, *target.shape[1:])) for part in missed]
+    moved = [inverse[k][0] * slopes[0] + inverse[k][1] * slopes[1] for k in range(2)]
+    return tuple(Dual(at, np.where(found, by, 0.0)) for at, by in zip(points, moved, strict=True)), found, points
+
+
+def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray):
+    """Points (2, W, R), which were found, and the inverse of ∂s/∂a there, by components."""
+    points, done = start.copy(), False
+    for _ in range(_STEPS):
+        moving = tuple(Dual(part, np.eye(2)[:, k, None, None] * np.ones_like(part)) for k, part in enumerate(points))
+        (x, y), arrives = at_stop(state, moving)
+        missed = goal - np.stack([x.value, y.value])
+        (xx, xy), (yx, yy) = x.full(), y.full()
+        determinant = xx * yy - xy * yx
+        usable = arrives & (determinant != 0)
+        scale = np.where(usable, determinant, 1.0)
+        inverse = ((yy / scale, -xy / scale), (-yx / scale, xx / scale))
+        step = np.stack([row[0] * missed[0] + row[1] * missed[1] for row in inverse])
+        points = np.where(usable, points + step, points)
+        close = usable & (np.abs(missed).max(0) <= _CLOSE * size)
+        if done or not usable.any():
+            break
+        done = bool((close | ~usable).all())
+    return points, close, inverse
+
+
+def rays_by_torch(
+    state: LensState, function: Callable[[Lens], Rays], shape: tuple[int, int], *, backward: bool = False
+) -> tuple[list, np.ndarray]:
+    """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity.
+
+    backward: derivatives of every ray, one by one, where the function takes forward derivatives of its own (rays aimed
+    about a base ray), which do not nest.
+    """
+
+    def told(lens: Lens) -> tuple[list[Tensor], Tensor]:
+        rays = function(lens)
+        parts = *rays.position, *rays.direction, rays.opl
+        return [part.expand(shape) for part in parts], rays.valid.expand(shape)
+
+    with torch.no_grad():
+        parts, valid = told(state.view.leaves(_values(state))[1])
+        values, valid = [part.numpy().copy() for part in parts], valid.numpy().copy()
+    if not state.count:
+        return values, valid
+    slopes = (_backward if backward else _forward)(state, lambda lens: told(lens)[0], valid)
+    return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(values, slopes, strict=True)], valid
+
+
+def _values(state: LensState) -> dict:
+    return {at: value_of(number) for at, number in state.numbers.items()}
+
+
+def _forward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
+    slopes = np.zeros((7, state.count, *valid.shape))
+    numbers = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in _values(state).items()}
+    for variable in range(state.count):
+        with forward_ad.dual_level():
+            moved = {
+                at: forward_ad.make_dual(numbers[at], numbers[at].new_tensor(float(number.slope[variable])))
+                for at, number in state.numbers.items()
+                if isinstance(number, Dual)
+            }
+            for part, number in zip(slopes, told(state.view.held(numbers | moved)), strict=True):
+                tangent = forward_ad.unpack_dual(number).tangent
+                if tangent is not None:
+                    part[variable] = tangent.numpy()
+    return slopes
+
+
+def _backward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
+    slopes = np.zeros((7, state.count, valid.size))
+    with torch.enable_grad():
+        leaves, lens = state.view.leaves(_values(state))
+        for part, number in zip(slopes, told(lens), strict=True):
+            for ray in np.flatnonzero(valid) if number.requires_grad else ():
+                part[:, ray] = state.chained(number.reshape(-1)[ray], leaves).slope
+    return slopes.reshape(7, state.count, *valid.shape)
+
+
+class Ray(NamedTuple):
+    """A ray by its wavelength (from 0), field (Hx, Hy) as part of the largest, and pupil point before vignetting."""
+
+    wavelength: int
+    field: tuple[float, float]
+    pupil: tuple[float, float]
+
+
+class Hits:
+    """Rays (R,) behind a surface: `position` x, y, z mm in the axes of its vertex; `direction` L, M, N; `opl`; `valid`.
+
+    Components are arrays or dual numbers, each taken from the table of the trace when it is first asked for.
+    """
+
+    def __init__(self, parts: Sequence, slopes: Sequence | None, valid: np.ndarray, places: np.ndarray):
+        """parts: x, y, z, L, M, N and path (W, R) each; slopes: (n, W, R) each; places: in the flat table."""
+        self._parts, self._slopes, self._valid, self._places = parts, slopes, valid, places
+        self.valid = valid.reshape(-1)[places]
+        self.position, self.direction = _Components(self, 0), _Components(self, 3)
+
+    def component(self, k: int):
+        value = self._parts[k].reshape(-1)[self._places]
+        if self._slopes is None:
+            return value
+        slope = self._slopes[k]
+        slope = slope.reshape(len(slope), -1)[:, self._places]
+        return Dual(value, slope if self.valid.all() else np.where(self.valid, slope, 0.0))
+
+    @cached_property
+    def opl(self):
+        return self.component(6)
+
+    def at(self, rays: np.ndarray) -> "Hits":
+        """Those of some rays."""
+        return Hits(self._parts, self._slopes, self._valid, self._places[rays])
+
+
+class _Components:
+    """Three components of rays, each found once."""
+
+    def __init__(self, hits: Hits, first: int):
+        self._hits, self._first, self._found = hits, first, {}
+
+    def __getitem__(self, k: int):
+        if not 0 <= k < 3:
+            raise IndexError(k)
+        if k not in self._found:
+            self._found[k] = self._hits.component(self._first + k)
+        return self._found[k]
+
+    def __sub__(self, other) -> Vector:
+        return Vector(self) - other
+
+    def __mul__(self, factor) -> Vector:
+        return Vector(self) * factor
+
+
+class Marks(NamedTuple):
+    """Rays (R,) on the surfaces 1 to `last` (S,) of a bundle.
+
+    x, y: (S, R) mm in the axes of the vertices; valid: (S, R) bool, up to there; by_x, by_y: (S, V, R), their
+    derivatives by V variables, or None.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    valid: np.ndarray
+    by_x: np.ndarray | None = None
+    by_y: np.ndarray | None = None
+
+
+class Bundle:
+    """The rays asked for of a lens in one configuration, behind the surfaces 1 to `last`."""
+
+    def __init__(self, view, last: int):
+        self.view, self.last = view, last
+        self.rays: dict[Ray, int] = {}
+
+    def ask(self, wavelength: int, field: tuple[float, float], pupil: tuple[float, float]) -> int:
+        """The number of a ray, by which `Hits.at` finds it."""
+        return self.rays.setdefault(Ray(wavelength, tuple(field), tuple(pupil)), len(self.rays))
+
+    # -- found once ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, list[list[Ray]]]:
+        """Where every ray stands in a table of wavelengths and rays, and its rows, filled up to one length."""
+        rows: list[list[Ray]] = [[] for _ in self.view.wavelengths]
+        places = []
+        for ray in self.rays:
+            places.append((ray.wavelength, len(rows[ray.wavelength])))
+            rows[ray.wavelength].append(ray)
+        length = max(map(len, rows))
+        filling = [row[0] if row else Ray(0, (0.0, 0.0), (0.0, 0.0)) for row in rows]
+        rows = [row + [one] * (length - len(row)) for row, one in zip(rows, filling, strict=True)]
+        return np.array([w * length + r for w, r in places]), rows
+
+    @cached_property
+    def field(self) -> np.ndarray:
+        """(2, W, R) in the lens's own kind of field."""
+        fields = self.view.lens.fields
+        largest = float(torch.hypot(fields.x, fields.y).max())
+        return (
+            self._opening
+            * largest
+            * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        )
+
+    @cached_property
+    def pupil(self) -> np.ndarray:
+        """(2, W, R) of the entrance pupil, vignetted."""
+        points = self._opening * np.array([[ray.pupil for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        return vignette(self.view.lens, torch.from_numpy(self.field), torch.from_numpy(points.copy())).numpy()
+
+    @property
+    def _opening(self) -> float:
+        return self.view.model.opening
+
+    @cached_property
+    def _template(self):
+        """Surfaces, structure and table (W, K) as stored, and where the table holds what moves (`_Columns`)."""
+        view = self.view
+        with torch.enable_grad():
+            shapes = {at: n for at, n in view.stored.items() if at[1] not in GLASS}
+            leaves, lens = view.leaves(shapes)
+            n = torch.from_numpy(np.abs(view.indices))
+            media = {k: n[:, k].clone().requires_grad_() for k in view.glasses}
+            _, structure, table = view.table_of(self.last, lens, media)
+            columns = _columns(table, leaves | media)
+        return view.table_of(self.last, view.lens)[0], structure, table.detach().numpy().copy(), columns
+
+    @cached_property
+    def is_expressible(self) -> bool:
+        """Whether tables can tell all the surfaces."""
+        return all(map(is_expressible, self.view.lens.surfaces[1 : self.last + 1]))
+
+    @cached_property
+    def _launches_itself(self) -> bool:
+        lens = self.view.lens
+        source = lens.surfaces[0]
+        plane = source.is_plane and source.after is None
+        usual = lens.fields.kind in ("angle", "object_height", "paraxial_image_height") and not lens.fields.telecentric
+        return plane and usual and (not self._aims or not is_bent(lens))
+
+    @cached_property
+    def _aims(self) -> bool:
+        return aiming_of(self.view.lens) != "off"
+
+    @cached_property
+    def _at_stop(self) -> "Bundle":
+        """The same rays on the stop."""
+        found = Bundle(self.view, self.view.lens.stop)
+        found.rays = self.rays
+        return found
+
+    @cached_property
+    def _marginal(self) -> "Bundle":
+        """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
+        found = Bundle(self.view, self.view.lens.stop)
+        found.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
+        return found
+
+    # -- at a state ---------------------------------------------------------------------------------------------------
+
+    def hits(self, state: LensState) -> Hits:
+        """All rays on surface `last`, in the order in which they were asked for; 0: in front of surface 1."""
+        if self.last == 0:
+            return self._at_object(state)
+        if not self.is_expressible:
+            return self._hits_by_torch(state)
+        return self._told(*self._traced(state, *self.launched(state)))
+
+    def _at_object(self, state: LensState) -> Hits:
+        """The rays as they leave the object: on its plane, or nowhere where that is at infinity."""
+        position, direction, opl, valid = self.launched(state)
+        if np.isinf(value_of(state.thickness[0])):
+            return self._as_hits(state, (*[np.full(valid.shape, np.nan)] * 3, *direction, opl), valid)
+        step = (-state.thickness[0] - position[2]) / direction[2]
+        x, y = (position[k] + step * direction[k] for k in range(2))
+        return self._as_hits(state, (x, y, 0 * step, *direction, opl), valid)
+
+    def marks(self, state: LensState) -> Marks:
+        """All rays on all surfaces from 1 to `last`, in the order in which they were asked for."""
+        if self.is_expressible:
+            surfaces, task, changes, start, count = self._task(state, *self.launched(state))
+            found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
+            if found is not None:
+                return self._marked(found, rows_of(task.structure, surfaces), count)
+        hits = [bundle.hits(state) for bundle in self._each]
+        parts = [[hit.position[k] for hit in hits] for k in range(2)]
+        values = (np.stack([value_of(one) for one in part]) for part in parts)
+        slopes = (np.stack([slope_of(one, state.count) for one in part]) for part in parts if state.count)
+        return Marks(*values, np.stack([hit.valid for hit in hits]), *slopes)
+
+    @cached_property
+    def _each(self) -> list["Bundle"]:
+        """The same rays on one surface each."""
+        found = [Bundle(self.view, last) for last in range(1, self.last + 1)]
+        for bundle in found:
+            bundle.rays = self.rays
+        return found
+
+    def _marked(self, found: Pushed, rows: list[int], count: int | None) -> Marks:
+        places, size = self._places[0], self.field[0].size
+
+        def picked(part: Tensor) -> np.ndarray:
+            return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
+
+        by = () if count is None else map(picked, found.by_position[:2])
+        return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
+
+    def _traced(self, state: LensState, position, direction, opl, valid: np.ndarray):
+        """Rays behind surface `last` as a table, and by how many variables they change, if any."""
+        surfaces, task, changes, start, count = self._task(state, position, direction, opl, valid)
+        return (ends(surfaces, task) if count is None else pushed(surfaces, task, changes, start)), count
+
+    def _task(self, state: LensState, position, direction, opl, valid: np.ndarray):
+        """Surfaces, what to trace, how table and rays change, and by how many variables, if any."""
+        surfaces, structure, *_ = self._template
+        table, changes = self.table(state)
+        moving = [part for part in (*position, *direction, opl) if isinstance(part, Dual)]
+        given = [np.stack([value_of(p) for p in part]) for part in (position, direction)] + [value_of(opl)]
+        given = [torch.from_numpy(np.ascontiguousarray(part)) for part in given]
+        task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
+        count = state.count or max((len(part.slope) for part in moving), default=0)
+        if not count:
+            return surfaces, task, torch.from_numpy(changes), None, None
+        start = self._start(count, position, direction, opl) if moving else None
+        changes = changes if state.count else np.zeros((count, *table.shape))
+        return surfaces, task, torch.from_numpy(changes), start, count
+
+    def starts(self, state: LensState) -> Hits:
+        """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
+        position, direction, opl, valid = self.launched(state)
+        return self._as_hits(state, (*position, *direction, opl), valid)
+
+    def _as_hits(self, state: LensState, parts, valid: np.ndarray) -> Hits:
+        slopes = [slope_of(part, state.count) for part in parts] if state.count else None
+        return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
+
+    def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
+        shape = count, *self.field.shape[1:]
+        found = np.zeros((7, *shape))
+        for part, number in zip(found, (*position, *direction, opl), strict=True):
+            if isinstance(number, Dual):
+                part[:] = number.full()
+        found = torch.from_numpy(found)
+        return found[:3], found[3:6], found[6]
+
+    def _told(self, end, count: int | None) -> Hits:
+        """The rays of a table as those that were asked for."""
+        parts = [*end.position.numpy(), *end.direction.numpy(), end.opl.numpy()]
+        slopes = None
+        if count is not None:
+            slopes = [*end.by_position.numpy(), *end.by_direction.numpy(), end.by_opl.numpy()]
+        return Hits(parts, slopes, end.valid.numpy(), self._places[0])
+
+    def table(self, state: LensState) -> tuple[np.ndarray, np.ndarray]:
+        """The table (W, K) of the lens at a state, and its derivatives (n, W, K)."""
+        _, _, stored, columns = self._template
+        if columns is None:
+            return self._table_by_torch(state)
+        table = stored.copy()
+        changes = np.zeros((state.count, *table.shape))
+        for at, number in state.numbers.items():
+            if at not in columns:
+                continue
+            table[:, columns[at]] = value_of(number)
+            if isinstance(number, Dual):
+                changes[:, :, columns[at]] = number.slope[:, None, None]
+        for surface, index in state.media.items():
+            if surface in columns:
+                table[:, columns[surface]] = value_of(index)[:, None]
+                if isinstance(index, Dual):
+                    changes[:, :, columns[surface]] = index.slope[:, :, None]
+        return table, changes
+
+    def _table_by_torch(self, state: LensState) -> tuple[np.ndarray, np.ndarray]:
+        with torch.enable_grad():
+            leaves, lens = self.view.leaves({at: value_of(n) for at, n in state.numbers.items()})
+            table = self.view.table_of(self.last, lens)[2]
+            by = _by_leaves(table, leaves) if state.count else {}
+        changes = np.zeros((state.count, *table.shape))
+        for at, derivative in by.items():
+            if isinstance(state.numbers[at], Dual):
+                changes += state.numbers[at].slope[:, None, None] * derivative
+        return table.detach().numpy(), changes
+
+    def launched(self, state: LensState):
+        """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
+        if not self._launches_itself:
+            return self._launched_by_torch(state)
+        if not self._aims:
+            return self._through(state, self.pupil)
+        pupil, found = self._aimed(state)
+        *rays, valid = self._through(state, pupil)
+        return *rays, valid & found
+
+    def _through(self, state: LensState, pupil):
+        shape = self.field.shape[1:]
+        position, direction, opl = launched(state, self.field, pupil)
+        filled = [part + np.zeros(shape) for part in (*position, *direction, opl)]
+        return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
+
+    def _aimed(self, state: LensState):
+        """Pupil points, two of (W, R), whose rays pass the stop where the pupil points say, and which were found."""
+        stop, shape = self._at_stop, self.field.shape[1:]
+
+        def at_stop(state: LensState, pupil):
+            end, count = stop._traced(state, *self._through(state, pupil))
+            x, y = end.position[:2].numpy()
+            if count is None:
+                return (x, y), end.valid.numpy()
+            by = end.by_position.numpy()
+            return (Dual(x, by[0]), Dual(y, by[1])), end.valid.numpy()
+
+        last = self.__dict__.get("_last")
+        begin = self.pupil if last is None else last
+        radius = self._stop_radius(state)
+        pupil, found, points = aimed(state, at_stop, self.pupil, radius, begin)
+        if not found.all() and last is not None:
+            pupil, found, points = aimed(state, at_stop, self.pupil, radius, self.pupil)
+        self._last = np.where(found, points, self.pupil)
+        return tuple(part + np.zeros(shape) for part in pupil), found
+
+    def _stop_radius(self, state: LensState):
+        """mm, negative where the entrance pupil is an inverted image of the stop."""
+        lens = self.view.lens
+        paraxial = 0.5 * state.entrance_pupil_diameter * state.gaussian(state.primary).front[0]
+        if lens.aperture.kind == "float_by_stop":
+            return float(lens.aperture.value) * np.sign(value_of(paraxial))
+        if lens.ray_aiming == "paraxial":
+            return paraxial
+        marginal = self._marginal
+        hits = marginal._told(*marginal._traced(state, *marginal._through(state, marginal.pupil)))
+        height = hits.position[1][np.array([0])]
+        real = np.abs(height) * np.sign(value_of(paraxial))
+        return real[0] if hits.valid[0] else paraxial
+
+    def _launched_by_torch(self, state: LensState):
+        def start(lens) -> Rays:
+            field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
+            return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
+
+        bent = self._aims and is_bent(self.view.lens)
+        parts, valid = rays_by_torch(state, start, self.field.shape[1:], backward=bent)
+        return parts[:3], parts[3:6], parts[6], valid
+
+    def _hits_by_torch(self, state: LensState) -> Hits:
+        def end(lens) -> Rays:
+            field, pupil, wavelength = torch.from_numpy(self.field), torch.from_numpy(self.pupil), lens.wavelengths
+            rays = rays_of_field(lens, field, pupil, wavelength=wavelength[:, None])
+            indices = unbent(lens, media(lens, wavelength[:, None])[: self.last + 1])
+            return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
+
+        bent = self._aims and is_bent(self.view.lens)
+        parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=bent)
+        slopes = [part.full() for part in parts] if state.count else None
+        return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
+
+
+def _by_leaves(table: Tensor, leaves: dict) -> dict:
+    """∂table/∂leaf (W, K), or (W, K, W) of a leaf (W,), of every leaf that it depends on."""
+    every = torch.eye(table.numel(), dtype=table.dtype)
+    if not leaves or not table.requires_grad:
+        return {}
+    found = torch.autograd.grad(
+        table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True
+    )
+    return {
+        at: g.reshape(*table.shape, *leaves[at].shape).numpy()
+        for at, g in zip(leaves, found, strict=True)
+        if g is not None
+    }
+
+
+def _columns(table: Tensor, leaves: dict) -> dict | None:
+    """The columns that hold what moves just as it is, by address; None where anything stands in it changed."""
+    found = {}
+    for at, derivative in _by_leaves(table, leaves).items():
+        leaf = leaves[at].detach().numpy()
+        held = (table.detach().numpy() == (leaf if leaf.ndim == 0 else leaf[:, None])).all(0)
+        as_it_is = np.eye(len(table)) if leaf.ndim else np.ones(len(table))
+        columns = derivative.swapaxes(0, 1)  # (K, W, …)
+        moving = (columns != 0).reshape(len(columns), -1).any(-1)
+        if not (held[moving].all() and (columns[moving] == as_it_is).all()):
+            return None
+        found[at] = np.flatnonzero(moving)
+    return found

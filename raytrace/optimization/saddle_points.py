@@ -1,0 +1,371 @@
+"""Insertion: from a minimum over saddles to the minima of lenses with one element more, two from every surface.
+
+A meniscus without thickness makes a saddle of the minimum (`meniscus.py`). Down either side of it all but the new
+thicknesses vary; then these grow, a part of their least values at a time, and the lens follows; at last everything
+varies under the whole merit function.
+
+Meniscus: a lens of no thickness beside a surface, which changes no ray, and the saddle of the merit that it makes.
+
+Before surface k between air and a glass two more of its shape are put, so that a lens of the same glass, without
+thickness, touches it. Of the curvatures (c₁, c₂, c₃) of the three the merit stays what it was for
+
+    c₁ = c₂, c₃ = c_k      and      c₁ = c_k, c₂ = c₃
+
+and where a lens is a minimum, its slope along (1, 1, 1) vanishes as well: all three vanish, and along the two lines the
+merit is flat while it is not between them. So the lens is a saddle with one way down, to two sides.
+
+Source: Bociort & van Turnhout, Generating saddle points in the merit function landscape of optical systems, Proc. SPIE
+5962, 2005; van Turnhout & Bociort, Instabilities and fractal basins of attraction in optical system optimization,
+Opt. Express 17, 2009.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import null_space
+
+from raytrace.materials.glass import is_air
+from raytrace.optimization.journal import Ended, Journal
+from raytrace.optimization.least_squares import Manner, State
+from raytrace.optimization.operands.boundaries import BOUNDARIES
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.problem import NoProblem, Problem
+from raytrace.optimization.search_result import Minima, Minimum
+from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
+from raytrace.optimization.variables import Freedom
+from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.parameter_paths import sensor
+from raytrace.system.surface import Surface, is_posed
+
+_SURFACES = ("surface", "place", "met surface", "contribution")  # of `arguments.ARGUMENTS`
+_NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, to tell second derivatives
+_ACTIVE = 1e-9  # up to which a limit counts as reached
+
+
+# -- where one can stand -----------------------------------------------------------------------------------------------
+
+
+def places_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
+    """The surfaces at which a meniscus can stand, or those that are named. Raises NoProblem."""
+    lens = free.lens
+    if lens.operands:
+        raise NoProblem("`insert`: the lens has several configurations; take one of them")
+    if not named:
+        found = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
+        if not found:
+            raise NoProblem("`insert`: no spherical surface between glass and air whose curvature varies")
+        return found
+    for k in named:
+        if objection := _objection(free, k):
+            raise NoProblem(f"`insert`: surface {k} {objection}")
+    return tuple(dict.fromkeys(named))
+
+
+def _objection(free: Freedom, k: int) -> str:
+    """What keeps a meniscus from a surface; nothing where it can stand there."""
+    lens = free.lens
+    if not 1 <= k <= sensor(lens):
+        return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
+    surface, before = lens.surfaces[k], lens.surfaces[k - 1]
+    shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
+    if surface.is_mirror or before.is_mirror or any(part is not None for part in shaped) or is_posed(surface):
+        return "is no centred sphere that refracts"
+    if before.is_break or is_air(before.glass) == is_air(surface.glass):
+        return "does not stand between glass and air"
+    varies = any((one.surface, one.quantity) == (k, "curvature") for one in free.variables)
+    return "" if varies else "has a curvature that does not vary: name it by `vary`"
+
+
+# -- the lens with one element more ------------------------------------------------------------------------------------
+
+
+def enlarged(lens: Lens, asked: Asked, k: int) -> Asked:
+    """What is searched of a lens with a meniscus before surface k, by what is asked of the lens itself."""
+    made, free = with_meniscus(lens, k), asked.free
+    new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
+    old = [_moved(one, k) for one in free.variables]
+    own = {one: ends for one, *ends in zip(old, *asked.bounds, strict=True)}
+    steep = own[next(one for one in old if (one.surface, one.quantity) == (k + 2, "curvature"))]
+    own |= {one: steep if one.quantity == "curvature" else (-np.inf, np.inf) for one in new}
+    quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
+    variables = tuple(sorted(own, key=lambda one: (quantities.index(one.quantity), one.surface)))
+    solves = tuple(_moved(one, k) for one in free.solves)
+    if lens.optimization_data is not None:
+        made = replace(made, optimization_data=_optimization_data(lens.optimization_data, k, variables, solves))
+    return replace(
+        asked,
+        free=Freedom(made, variables, solves),
+        rows=tuple(_row(row, k) for row in asked.rows),
+        conditions=tuple(replace(one, row=_row(one.row, k)) for one in asked.conditions),
+        bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
+    )
+
+
+def new_gaps(asked: Asked, k: int) -> np.ndarray:
+    """(n,) which variables are the thicknesses of the meniscus and of the air beside it."""
+    return np.array([one.quantity == "thickness" and one.surface in (k, k + 1) for one in asked.free.variables])
+
+
+def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
+    """The rows with that part of the least thicknesses asked of the new gaps, of 0 none; as many rows ahead of those
+    that are split off."""
+    pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
+    return (*(one[0] for one in pieces), *(row for one in pieces for row in one[1:]))
+
+
+def with_meniscus(lens: Lens, k: int) -> Lens:
+    """The lens with a meniscus without thickness before surface k, of the glass beside it; no ray goes otherwise."""
+    surface = lens.surfaces[k]
+    media = lens.surfaces[k], lens.surfaces[k - 1]  # behind the two new surfaces
+    new = tuple(_touching(surface, one) for one in media)
+    stop = lens.stop + 2 if lens.stop >= k else lens.stop
+    return replace(lens, surfaces=(*lens.surfaces[:k], *new, *lens.surfaces[k:]), stop=stop)
+
+
+def _touching(surface: Surface, medium: Surface) -> Surface:
+    """A surface of the same shape with another medium behind it, and no space."""
+    nothing = 0 * surface.thickness
+    beside = {"glass": medium.glass, "environment": medium.environment}
+    return replace(surface, thickness=nothing, apertures=(), comment="", **beside)
+
+
+def _behind(surface: int, k: int) -> int:
+    """The number of a surface once two more stand before surface k."""
+    return surface + 2 if surface >= k else surface
+
+
+def _moved(one: Vary | Solve, k: int) -> Vary | Solve:
+    further = {"source": _behind(one.source, k)} if isinstance(one, Solve) else {}
+    return replace(one, surface=_behind(one.surface, k), **further)
+
+
+def _row(row: Row, k: int) -> Row:
+    """A row that names the same surfaces by their new numbers."""
+    kinds = _kinds(row)
+    moved = [_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True)]
+    return replace(row, integers=tuple(moved)) if any(kinds) else row
+
+
+def _kinds(row: Row) -> tuple[str, str]:
+    """What the integers of a row name."""
+    if row.operand in BOUNDARIES:
+        return ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
+    return OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
+
+
+def _split(row: Row, k: int, part: float) -> list[Row]:
+    """A row of least thicknesses as several: of the gaps of old, and with part of its target of the new ones."""
+    first, last = row.integers
+    is_least = row.operand in BOUNDARIES and row.operand[:2] == "MN" and row.operand[-1] in "TGA"
+    if not is_least or last < k or first > k + 1:
+        return [row]
+    ranges = [(first, k - 1), (max(first, k + 2), last)]
+    found = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
+    if part > 0:
+        found.append(replace(row, integers=(k, k + 1), target=part * row.target))
+    return found or [replace(row, weight=0.0)]
+
+
+def _optimization_data(
+    optimization_data: OptimizationData, k: int, variables: tuple[Vary, ...], solves: tuple[Solve, ...]
+) -> OptimizationData:
+    """What the file means, by the new numbers of its surfaces; lines of tolerances, which name surfaces, are left."""
+    return dataclasses.replace(
+        optimization_data,
+        variables=variables,
+        solves=solves,
+        merit=tuple(_row(row, k) for row in optimization_data.merit),
+        tolerances=(),
+        semi_diameters=tuple(_behind(one, k) for one in optimization_data.semi_diameters),
+        kept=tuple(_moved(one, k) for one in optimization_data.kept),
+    )
+
+
+# -- the saddle --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Saddle:
+    """How the merit curves under its conditions. ways (n, m): a basis of the steps that break none, each of which
+    changes the residuals alike; slope (m,) and curves (m, m) of half the square of the merit along them."""
+
+    ways: np.ndarray
+    slope: np.ndarray
+    curves: np.ndarray
+
+    @property
+    def descent(self) -> np.ndarray:
+        """(n,) the way along which it falls most, to both sides."""
+        return self.ways @ np.linalg.eigh(self.curves)[1][:, 0]
+
+
+def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
+    """How the merit curves at x (n,) where the variables `moves` (n,) move."""
+    state = problem.state(x, True)
+    columns = np.sqrt((state.jacobian**2).sum(0))
+    scale = np.where(columns > 0, columns, 1.0)
+    step = _NEAR * np.sqrt(max(state.cost, 1e-30)) / scale
+    slopes = _conditions(state)
+    price = np.linalg.lstsq((slopes / scale)[:, moves].T, -(_slope(state) / scale)[moves], rcond=None)[0]
+    told = lambda s: _slope(s) + price @ _conditions(s, like=state)  # noqa: E731
+    free = np.nonzero(moves)[0]
+    second = np.zeros((len(free), len(free)))
+    for row, j in enumerate(free):
+        ahead, back = (problem.state(x + sign * step * (np.arange(len(x)) == j), True) for sign in (1, -1))
+        second[row] = ((told(ahead) - told(back)) / (2 * step[j] * scale[j]) / scale)[free]
+    along = null_space((slopes / scale)[:, free]) if len(slopes) else np.eye(len(free))
+    ways = np.zeros((len(x), along.shape[1]))
+    ways[free] = along / scale[free, None]
+    return Saddle(ways, ways.T @ told(state), 0.5 * along.T @ (second + second.T) @ along)
+
+
+def _slope(state: State) -> np.ndarray:
+    """Half the gradient (n,) of the sum of squares."""
+    sides = state.sides
+    over = sides.excess > 0
+    sums = np.bincount(sides.row, np.maximum(sides.excess, 0.0)) if len(sides.row) else np.zeros(0)
+    return state.jacobian.T @ state.residuals + sums[sides.row[over]] @ sides.slope[over]
+
+
+def _conditions(state: State, like: State | None = None) -> np.ndarray:
+    """Slopes (h, n) of what is held and of the limits that are reached, at the state `like`."""
+    reached = (like or state).limits > -_ACTIVE
+    return np.concatenate([state.held_slope, state.limits_slope[reached]])
+
+
+SIDES = {"one side": 1.0, "other side": -1.0}
+_PARTS = 0.25, 0.5, 0.75, 1.0  # of the least thicknesses, one after the other
+_OFF = np.geomspace(0.03, 10, 18)  # of the residuals: steps off the saddle that are tried
+_CYCLES = 15, 10  # off the saddle, and with every part of the thickness
+_CAREFUL = Manner(damping=0.1, bends=False)
+_MEETINGS = 4  # of conditions, after a step off the saddle
+
+
+@dataclass(frozen=True)
+class Place:
+    """A lens with a meniscus before surface k: its problems by how much of its least thickness it has."""
+
+    k: int
+    asked: Asked
+
+    def stage(self, part: float, cycles: int, manner: Manner) -> Stage:
+        """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
+        gaps, space = new_gaps(self.asked, self.k), self.asked.space
+        lower = np.where(gaps, part * space.lower, space.lower)
+        upper = np.where(gaps & (part == 0), 0.0, space.upper)
+        problem = self.asked.problem(thinned(self.asked.rows, self.k, part))
+        return Stage(problem, cycles, manner, lower, upper)
+
+    @property
+    def family(self) -> tuple:
+        """What lenses have in common whose variables can be compared."""
+        lens = self.asked.free.lens
+        variables = tuple((one.surface, one.quantity) for one in self.asked.free.variables)
+        media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
+        return media, lens.stop, variables
+
+    def gone(self, sign: float, until: float = np.inf) -> Ended:
+        """The minimum on one side of the saddle, of a lens of real thickness. Raises Stopped."""
+        first = self.stage(0.0, _CYCLES[0], _CAREFUL)
+        thicker = [self.stage(part, _CYCLES[1], _CAREFUL) for part in _PARTS]
+        x = self.beside(first, sign)
+        return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
+
+    def beside(self, stage: Stage, sign: float) -> np.ndarray:
+        """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
+        x, problem = self.asked.model.start, stage.problem
+        way = saddle(problem, x, stage.moves(x)).descent
+        way = sign * way / np.abs(way[np.argmax(np.abs(way))]) * np.sign(way[np.argmax(np.abs(way))])
+        columns = np.sqrt((problem.state(x, True).jacobian ** 2).sum(0))
+        unit = np.sqrt(problem.state(x, False).cost) / np.linalg.norm(columns * way)
+        best, least = x + _OFF[0] * unit * way, np.inf
+        for size in _OFF:
+            there = self._met(stage, x + size * unit * way)
+            state = problem.state(there, False)
+            if not state.is_finite or state.lost or state.cost >= least:
+                break
+            best, least = there, state.cost
+        return best
+
+    def _met(self, stage: Stage, x: np.ndarray) -> np.ndarray:
+        """x with what is held met, by the shortest steps."""
+        x = np.clip(x, stage.lower, stage.upper)
+        moves = stage.moves(x)
+        for _ in range(_MEETINGS):
+            state = stage.problem.state(x, True)
+            if not len(state.held) or not state.is_finite:
+                return x
+            columns = np.sqrt((state.jacobian**2).sum(0))
+            scale = np.where(columns > 0, columns, 1.0)
+            back = np.linalg.lstsq((state.held_slope / scale)[:, moves], state.held, rcond=None)[0]
+            x = x.copy()
+            x[moves] -= back / scale[moves]
+            x = np.clip(x, stage.lower, stage.upper)
+        return x
+
+
+@dataclass
+class Insertion:
+    """The search from a lens, over menisci at some of its surfaces."""
+
+    asked: Asked
+    journal: Journal
+    places: Sequence[int]
+    found: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
+    begun: int = 0  # descents
+
+    DONE: ClassVar[str] = "surfaces"
+
+    @property
+    def followed(self) -> int:
+        """Descents that were followed to their end."""
+        return self.begun
+
+    def through(self, progress: Callable | None) -> None:
+        """The lens itself, then both sides at every place. Raises Stopped and NoProblem."""
+        model, space = self.asked.model, self.asked.space
+        stage = Stage(self.asked.whole, LONG, FOLLOW, space.lower, space.upper)
+        until = self.journal.until
+        own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
+        if not own.is_whole:
+            raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
+        lens, work = model.lens_at(own.x), own.seconds
+        bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
+        try:
+            for k in self.places:
+                work += self._both(Place(k, enlarged(lens, self.asked, k)), work, bar)
+        finally:
+            if bar is not None:
+                bar.close()
+
+    def _both(self, place: Place, work: float, bar) -> float:
+        """The two sides of a saddle; the seconds that they took."""
+        tasks = [
+            (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))
+            for side, sign in SIDES.items()
+        ]
+        space = place.asked.space
+        ends = self.journal.each(tasks, len(space.lower))
+        ranges = np.maximum(space.upper - space.lower, 1e-300)
+        _, minima = self.found.setdefault(place.family, (place.asked.whole, Minima(ranges)))
+        for (key, _), end in zip(tasks, ends, strict=True):
+            work += end.seconds
+            minima.add(end, key, work)
+            self.begun += 1
+            if bar is not None:
+                bar.update(1)
+                bar.set_postfix_str(self._words())
+        return sum(end.seconds for end in ends)
+
+    def _words(self) -> str:
+        each = self.each()
+        return f"{len(each)} minima, the best {each[0][1].ended.merit:.6g}" if each else ""
+
+    def each(self) -> list[tuple[Problem, Minimum]]:
+        """All minima, the best first, each with the problem that it is one of."""
+        found = [(problem, one) for problem, minima in self.found.values() for one in minima.each]
+        return sorted(found, key=lambda pair: pair[1].ended.merit)

@@ -1,0 +1,279 @@
+"""How the figures look: fonts, colours, the wording of numbers; and how a figure is saved."""
+
+import functools
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.patheffects import withStroke
+from matplotlib.textpath import TextPath
+from torch import Tensor
+
+from raytrace.files import write_atomically
+from raytrace.maths.result import object_text
+from raytrace.maths.value import detached as detached
+from raytrace.system.lens import FIELD_UNITS, Lens
+from raytrace.tracing.paraxial import FirstOrder
+
+INK = "#262626"
+GREY = "#7a7a7a"
+FAINT = "#d0d0d0"
+
+#: Colours of the fields: Okabe and Ito's set, told apart by colour-blind readers; the first three differ most.
+FIELD_COLOURS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#6A51A3", "#525252")
+
+#: Colours of wavelengths the eye does not see, and markers of all wavelengths, in order.
+INVISIBLE_COLOURS = ("#7a1f1f", "#525252", "#8c6d31", "#5e3c99", "#1b6f6a", "#b0578d")
+GLASS_COLOURS = ("#e9f2f8", "#86b3d1")  # at n = 1.4 and n = 2.0
+WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
+
+#: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
+SUFFIXES = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "axes.unicode_minus": True,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "text.color": INK,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.solid_capstyle": "round",
+    "hatch.linewidth": 0.5,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "raytrace",
+    "savefig.facecolor": "white",
+}
+
+#: How the models are drawn: colour and dashes, to be told apart in print.
+LOOKS = {
+    "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
+    "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),
+    "gaussian": (FIELD_COLOURS[2], "solid"),
+    "drt": (INK, (0, (6, 1.5, 1, 1.5))),
+    "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
+}
+
+
+def styled(function: Callable) -> Callable:
+    """Run a function under the style of these figures; the reader's own settings are back when it returns."""
+
+    @functools.wraps(function)
+    def wrapper(*args, **kwargs):
+        with matplotlib.rc_context(_STYLE):
+            return function(*args, **kwargs)
+
+    return wrapper
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of width × height inches on a canvas of its own."""
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
+    figure.get_layout_engine().set(w_pad=0.07, h_pad=0.07)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+@styled
+def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
+    """Write a figure as .png, .pdf or .svg by its suffix; the file is replaced as a whole or not at all.
+
+    The same figure, built again, gives the same bytes. Raises ValueError for another suffix, OSError where nothing can
+    be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        found = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
+        raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
+    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=SUFFIXES[suffix]))
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """The numbers of a tensor, for drawing."""
+    return tensor.detach().to(device="cpu", dtype=torch.float64 if tensor.is_floating_point() else None).numpy()
+
+
+def tint(index: float) -> tuple[float, ...]:
+    """The colour of glass by its index."""
+    light, dark = (np.array(to_rgb(colour)) for colour in GLASS_COLOURS)
+    share = min(max((index - 1.4) / 0.6, 0.0), 1.0)
+    return tuple(light + share * (dark - light))
+
+
+def field_colour(number: int) -> str:
+    return FIELD_COLOURS[number % len(FIELD_COLOURS)]
+
+
+def field_colours(count: int) -> list[str]:
+    """A colour for each of so many fields; where there are too many to name, from dark to bright in their order."""
+    if count <= len(FIELD_COLOURS):
+        return [field_colour(f) for f in range(count)]
+    return [to_hex(matplotlib.colormaps["viridis"](0.92 * f / (count - 1))) for f in range(count)]
+
+
+def field_label(lens: Lens, field: Sequence[float]) -> str:
+    """A field point in words: `10°`, `(3, 4)°`, `5 mm`; the x coordinate is named only where it is not 0."""
+    x, y = (float(component) + 0.0 for component in field)
+    unit = "°" if FIELD_UNITS[lens.fields.kind] == "degrees" else " mm"
+    return f"{_minus(f'{y:.6g}')}{unit}" if x == 0 else _minus(f"({x:.6g}, {y:.6g})") + unit
+
+
+def field_title(lens: Lens) -> str:
+    """What a field of this lens is."""
+    return {
+        "angle": "Field angle",
+        "object_height": "Object height",
+        "paraxial_image_height": "Paraxial image height",
+        "real_image_height": "Image height",
+    }[lens.fields.kind]
+
+
+def wavelength_colours(wavelengths: Sequence[float]) -> list[str | tuple[float, float, float]]:
+    """A colour for each wavelength in µm: the one the eye sees, dark enough for a white page, where it sees one."""
+    colours, unseen = [], 0
+    for wavelength in wavelengths:
+        if 0.39 <= wavelength <= 0.75:
+            colours.append(_spectral_colour(float(wavelength)))
+        else:
+            colours.append(INVISIBLE_COLOURS[unseen % len(INVISIBLE_COLOURS)])
+            unseen += 1
+    return colours
+
+
+def ray_colours(fields: int, wavelengths: Sequence[float]) -> list[list]:
+    """A colour for the rays of every wavelength and field: by wavelength where there are several, else by field."""
+    if len(wavelengths) > 1:
+        return [[colour] * fields for colour in wavelength_colours(wavelengths)]
+    return [field_colours(fields)]
+
+
+def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
+    """Hues by wavelength, interpolated; chosen by eye for legibility rather than for colorimetry."""
+    knots = {
+        0.39: "#5b1a9a", 0.43: "#4421b8", 0.46: "#1f3fd1", 0.49: "#0077b6", 0.51: "#008f7a", 0.53: "#0a8f3c",
+        0.555: "#3f9a12", 0.575: "#8a9400", 0.59: "#c78500", 0.61: "#dd5f00", 0.64: "#d62828", 0.75: "#8b0f14",
+    }  # fmt: skip
+    channels = np.array([to_rgb(colour) for colour in knots.values()]).T
+    return tuple(float(np.interp(wavelength, list(knots), channel)) for channel in channels)
+
+
+def length_text(length: float, digits: int = 4) -> str:
+    """A length in mm as a reader would say it: µm below 0.1 mm, m from 10 m, km from 10 km."""
+    if math.isinf(length):
+        return "∞"
+    scales = ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km"))
+    scale, unit = next((scale, unit) for limit, scale, unit in scales if abs(length) < limit)
+    return f"{number_text(length * scale, digits)} {unit}"
+
+
+def number_text(value: float, digits: int = 4) -> str:
+    """A number to so many significant digits, never in exponents between 1e-4 and 1e6."""
+    if not math.isfinite(value):
+        return "∞" if math.isinf(value) else "–"
+    if value == 0 or not 1e-4 <= abs(value) < 1e6:
+        return _minus(f"{value:.{digits}g}")
+    rounded = abs(float(f"{value:.{digits - 1}e}"))  # 99.9999 is 100.0, not 100.00
+    return _minus(f"{value:.{max(digits - 1 - math.floor(math.log10(rounded)), 0)}f}")
+
+
+def micrometres(length: float) -> str:
+    """A length in mm written in µm, four significant digits."""
+    return f"{number_text(1e3 * length)} µm"
+
+
+def first_order_text(lens: Lens, paraxial: FirstOrder) -> str:
+    """`EFL 99.51 mm · F/2.99 · object at 25.00 m`, as a subtitle."""
+    parts = []
+    focal_length = float(paraxial.effective_focal_length)
+    if math.isfinite(focal_length):
+        parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(paraxial.f_number), 3)}"]
+    distance, working = float(lens.surfaces[0].thickness), float(paraxial.paraxial_working_f_number)
+    parts.append(f"object at {object_text(distance)}")
+    if math.isfinite(distance) and math.isfinite(working):
+        parts.append(f"working F/{number_text(working, 3)}")
+    return "  ·  ".join(parts)
+
+
+def round_length(length: float) -> float:
+    """The largest of 1, 2, 5 × 10^n that is not above a length."""
+    decade = 10.0 ** math.floor(math.log10(length))
+    return max(step for step in (decade, 2 * decade, 5 * decade) if step <= length * (1 + 1e-9))
+
+
+def round_text(length: float) -> str:
+    """A round length in mm, without zeros behind the point: `50 µm`, `20 mm`, `1 m`."""
+    scale, unit = (1e3, "µm") if length < 0.9 else (1.0, "mm") if length < 900 else (1e-3, "m")
+    return f"{length * scale:.6g} {unit}"
+
+
+def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "center") -> None:
+    """A bar of a length in mm that starts at (x, y), its length written above it: centred, or from its "left"."""
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
+    place = (x if align == "left" else x + length / 2, y)
+    axes.annotate(
+        round_text(length), place, (0, 3), textcoords="offset points", ha=align, va="bottom", fontsize=7.5, zorder=6,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+    )  # fmt: skip
+
+
+def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
+    """A white bar of a length in mm from (x, y), on axes of so many mm a unit, its length written above it."""
+    dark = [withStroke(linewidth=1.6, foreground="black")]  # legible on bright kernels too
+    frame = [withStroke(linewidth=3.0, foreground="black")]
+    axes.plot([x, x + length / unit], [y, y], color="white", linewidth=1.6, zorder=6, path_effects=frame)
+    axes.annotate(
+        words or round_text(length), (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom",
+        zorder=6, path_effects=dark,
+    )  # fmt: skip
+
+
+def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
+    """A text of a size in points in lines no wider than a figure of a width in inches, by the widths of its letters.
+
+    Lines that are there stay; a word wider than the figure is left whole.
+    """
+    space = _width(" ", size, bold)
+    room, lines = 72 * width - 2 * size, []
+    for paragraph in text.splitlines():
+        line, length = "", 0.0
+        for word in paragraph.split(" "):
+            own = _width(word, size, bold)
+            if line and length + space + own > room:
+                lines.append(line)
+                line, length = "", 0.0
+            line, length = (f"{line} {word}", length + space + own) if line else (word, own)
+        lines.append(line)
+    return "\n".join(lines)
+
+
+@functools.lru_cache(maxsize=1024)
+def _width(word: str, size: float, bold: bool) -> float:
+    """Points that a word of a size in points takes, from where it begins to where the next letter would."""
+    font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
+    between, none = (TextPath((0, 0), letters, prop=font).get_extents().width for letters in (f"n{word}n", "nn"))
+    return between - none
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")

@@ -1,0 +1,24 @@
+"""Point spread functions: five models behind one differentiable call.
+
+    psf(lens, model="gaussian", fields=…, object_distances=…, pixel=0.005, size=21, tol=1e-3) -> Psf
+
+`models.py` is the table of the models, `ladder.py` drives them to a tolerance, `compute.py` is the call.
+
+| model    | what it knows of the lens                                                       | module         |
+|----------|---------------------------------------------------------------------------------|----------------|
+| paraxial | focal length, principal planes, entrance pupil: a Gaussian of the defocus blur  | paraxial.py    |
+| fourier  | the same, with diffraction: a defocused (and aberrated) circular pupil          | fourier.py     |
+| gaussian | centroid and covariance of traced rays                                          | gaussian.py    |
+| drt      | all traced rays: geometric optics                                               | rays.py        |
+| wave     | the traced wavefront: diffraction with the true aberrations                     | diffraction.py |
+"""
+
+from raytrace.psf_models.closeup import CloseUp as CloseUp
+from raytrace.psf_models.closeup import close_up as close_up
+from raytrace.psf_models.compute import psf as psf
+from raytrace.psf_models.models import MODELS as MODELS
+from raytrace.psf_models.models import NotConverged as NotConverged
+from raytrace.psf_models.result import EmptyPsf as EmptyPsf
+from raytrace.psf_models.result import Kernels as Kernels
+from raytrace.psf_models.result import Psf as Psf
+from raytrace.tracing.scene import Memo as Memo

@@ -1,0 +1,270 @@
+"""Sums of waves: matrix DFT, FFT and direct Huygens sums, and the pixels that integrate their intensity.
+
+A path W (mm or waves) is a phase +2π W/λ. Phases are reduced to a fraction of a wave before the factor 2π, so that a
+million waves of piston cost no digits.
+"""
+
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.budget import afford, piece
+from raytrace.maths.grid import Grid, centres
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.scene import Scene
+from raytrace.words import calling_level
+
+
+class TooManyPoints(ValueError):
+    """A wave that turns too often over the pupil to be summed; the message says what helps."""
+
+
+class EmptyPupil(ValueError):
+    """No light passes the pupil: a point spread function normalised by its light is undefined."""
+
+
+class Aliased(UserWarning):
+    """The wavefront changes by more than half a wave between neighbouring samples."""
+
+
+def phasor(waves: Tensor) -> Tensor:
+    """exp(2πi waves), complex."""
+    angle = 2 * math.pi * (waves - torch.round(waves.detach()))
+    return torch.complex(torch.cos(angle), torch.sin(angle))
+
+
+def huygens(
+    points: Tensor, pupil: Tensor, radius: Tensor, *, path: Tensor, amplitude: Tensor, wavelength: Tensor
+) -> Tensor:
+    """Field U (K) at points, of wavelets from a reference sphere: U = Σ_j A_j exp(2πi (W_j + |q_j - p| - R)/λ).
+
+        |q - p| - R = (|p|² - 2 q·p)/(|q - p| + R)       (no cancellation, whatever R)
+
+    points p: (3, K) mm and pupil points q: (3, J) mm, from the centre of the sphere, |q| = |R|; radius R: mm, signed
+    as `Wavefront.radius`; path W: (J) mm; amplitude: (J); wavelength: mm in the image space.
+    """
+    p, q = points[:, :, None], pupil[:, None, :]
+    distance = torch.sqrt(sum((a - b) ** 2 for a, b in zip(q, p, strict=True)))
+    excess = sum(a * (a - 2 * b) for a, b in zip(p, q, strict=True)) / (distance + torch.abs(radius))
+    # Each term to a fraction of a wave by itself: neither spoils the digits of the other.
+    waves = _fraction(path / wavelength) + _fraction(torch.sign(radius) * excess / wavelength)
+    return phasor(waves) @ amplitude.to(phasor(waves[:1, :1]).dtype)
+
+
+def fft_psf(amplitude: Tensor, waves: Tensor, *, pad: int) -> Tensor:
+    """Intensity (M, M) of an N × N pupil, M = pad·N, over the peak of the same pupil without aberrations; no shift.
+
+        PSF[v, u] = |Σ A exp(2πi W) exp(-2πi (u i + v j)/M)|² / (Σ A)²,   i column, j row
+
+    Raises EmptyPupil for a pupil without light; warns `Aliased` if W steps by more than half a wave between samples.
+    """
+    total = amplitude.sum()
+    if not bool((amplitude != 0).any()):
+        raise EmptyPupil("every sample of the pupil has amplitude 0")
+    for axis in (0, 1):
+        step = waves.diff(dim=axis).abs()
+        lit = (amplitude != 0).narrow(axis, 1, step.shape[axis]) & (amplitude != 0).narrow(axis, 0, step.shape[axis])
+        if bool((lit & (step > 0.5)).any()):
+            largest = float(torch.where(lit, step, 0.0).max())
+            message = f"OPD steps by up to {largest:.3g} waves between pupil samples"
+            warnings.warn(message, Aliased, stacklevel=calling_level())
+            break
+    size = pad * amplitude.shape[-1]
+    field = torch.fft.fft2(amplitude * phasor(waves), s=(size, size))
+    return (field.real**2 + field.imag**2) / (total * total)
+
+
+def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """U(y, x) = Σ_j field_j exp(2πi (L_j x + M_j y)/λ): (..., Y, X) from waves (..., J) of any directions.
+
+    The image is separable even where the pupil is not: J (X + Y) exponentials and one product of matrices.
+    L, M: (..., J) direction cosines; x: (..., X), y: (..., Y) mm; wavelength: (...) mm in the image space.
+    """
+
+    def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
+        along_x = phasor(L[..., :, None] * (x[..., None, :] / wavelength[..., None, None]))
+        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None]))
+        return along_y @ (field[..., :, None] * along_x)
+
+    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
+
+
+def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
+
+    def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
+        turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
+        cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
+        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]
+        return torch.complex(along_y.real @ cosine, along_y.imag @ cosine)
+
+    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
+
+
+def rings_to_grid(field: Tensor, sine: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """U(y, x) = Σ_j field_j J₀(2π s_j ρ/λ), (..., Y, X): cones of waves (..., J) about the axis, s their sine."""
+    distance = safe_sqrt(y[..., :, None] ** 2 + x[..., None, :] ** 2)
+
+    def some(field: Tensor, sine: Tensor) -> Tensor:
+        argument = distance[..., None] * (2 * math.pi * sine / wavelength[..., None])[..., None, None, :]
+        J0 = bessel_j0(argument).flatten(-3, -2)
+        return torch.complex(*(J0 @ part[..., None] for part in (field.real, field.imag)))
+
+    U = _in_pieces(some, field, sine, each=32 * distance[..., 0, 0].numel() * x.shape[-1] * y.shape[-1])
+    return U[..., 0].unflatten(-1, distance.shape[-2:])
+
+
+def _in_pieces(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Tensor:
+    """sum_of(*waves), a sum over the last axis of the waves (..., J), in pieces; each: bytes that one of them takes."""
+    parts = zip(*(torch.split(wave, piece(each), -1) for wave in torch.broadcast_tensors(*waves)), strict=True)
+    total = sum_of(*next(parts))
+    for part in parts:
+        total = total + sum_of(*part)
+    return total
+
+
+def bessel_j0(x: Tensor) -> Tensor:
+    """J₀ with its derivatives (those of torch.special detach silently)."""
+    return _Bessel.apply(x, 0)
+
+
+def bessel_j1(x: Tensor) -> Tensor:
+    """J₁ with its derivatives (those of torch.special detach silently)."""
+    return _Bessel.apply(x, 1)
+
+
+def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
+    """Gauss rings and arms that integrate waves whose phase varies by `phase` radians along a pupil radius.
+
+    A Gauss rule in r² of n rings integrates it up to J_2n(phase/2), arms up to J_arms(phase): both fall faster than any
+    power beyond the argument. Order 0 adds a margin of the width of that fall, ∝ phase^(1/3); three orders add another.
+    """
+    margin = 1 + order / 3
+    rings = math.ceil(phase / 4 + margin * (2 + 0.8 * phase ** (1 / 3)))
+    arms = math.ceil(phase + margin * (6 + 1.5 * phase ** (1 / 3)))
+    return rings, 4 * math.ceil(arms / 4)
+
+
+def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and weights of `rings_and_arms`. Raises TooManyPoints where more than `most` would be needed."""
+    rings, arms = rings_and_arms(phase, order)
+    if rings * arms > most:
+        raise TooManyPoints(
+            f"{what} needs {rings * arms} pupil points, more than {most}: the phase turns {phase / (2 * math.pi):.0f} "
+            "times along a pupil radius. Centre the window where the light lands, make it smaller, or use a ray model"
+        )
+    return gauss_rings(rings, arms, dtype=like.dtype, device=like.device)
+
+
+def nodes_per_pixel(pitch: float, cutoff: float, order: int) -> int:
+    """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm.
+
+    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch; little light is near the cutoff. From
+    order -2 on; a margin of two nodes makes order 0.
+    """
+    return max(1, math.ceil(0.5 * math.pi * cutoff * pitch) + 2 + order)
+
+
+def sub_pixels(grid: Grid, nodes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """x (..., columns·nodes), y (..., rows·nodes) mm inside the pixels, and the weights (nodes) of a pixel, sum 1."""
+    place, weight = (grid.pitch.new_tensor(a) / 2 for a in np.polynomial.legendre.leggauss(nodes))
+    x, y = ((c[..., :, None] + place * grid.pitch).flatten(-2) for c in centres(grid))
+    return x, y, weight
+
+
+def integrate(intensity: Tensor, weight: Tensor, pitch: Tensor) -> Tensor:
+    """Energy (..., rows, columns) of pixels from the intensity per mm² (..., rows·nodes, columns·nodes)."""
+    nodes = len(weight)
+    pixels = intensity.unflatten(-1, (-1, nodes)).unflatten(-3, (-1, nodes))
+    return torch.einsum("...iajb,a,b->...ij", pixels, weight, weight) * pitch**2
+
+
+def window_moments(intensity: Tensor, x: Tensor, y: Tensor, weight: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) mm and covariance (3, ...) mm², xx, xy, yy, of the light inside a window, pixels or not.
+
+    intensity: (..., Y, X) per mm² at the nodes x (..., X), y (..., Y) mm of `sub_pixels`; weight: of one pixel. 0 where
+    there is no light.
+    """
+    intensity = intensity * pitch**2
+    along_x, along_y = (weight.repeat(t.shape[-1] // len(weight)) for t in (x, y))
+    by_x, by_y = (intensity.mT @ along_y[:, None])[..., 0] * along_x, (intensity @ along_x[:, None])[..., 0] * along_y
+    energy = by_x.sum(-1)
+    x_mean, y_mean = safe_divide((by_x * x).sum(-1), energy), safe_divide((by_y * y).sum(-1), energy)
+    x, y = x - x_mean[..., None], y - y_mean[..., None]
+    cross = ((intensity @ (along_x * x)[..., None])[..., 0] * along_y * y).sum(-1)
+    moments = [(by_x * x * x).sum(-1), cross, (by_y * y * y).sum(-1)]
+    return torch.stack([x_mean, y_mean]), torch.stack([safe_divide(moment, energy) for moment in moments])
+
+
+def _fraction(waves: Tensor) -> Tensor:
+    return waves - torch.round(waves.detach())
+
+
+class _Bessel(torch.autograd.Function):
+    """J_0 or J_1: J₀' = -J₁; J₁' = J₀ - J₁/x, 1/2 at 0."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x, number: int):
+        return (torch.special.bessel_j0, torch.special.bessel_j1)[number](x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        x, ctx.number = inputs
+        ctx.save_for_backward(x)
+        ctx.save_for_forward(x)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient * _bessel_slope(*ctx.saved_tensors, ctx.number), None
+
+    @staticmethod
+    def jvp(ctx, tangent, _):
+        return tangent * _bessel_slope(*ctx.saved_tensors, ctx.number)
+
+
+def _bessel_slope(x: Tensor, number: int) -> Tensor:
+    if number == 0:
+        return -bessel_j1(x)
+    return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
+
+
+# -- what waves take in memory, told in the words of a lens ------------------------------------------------------------
+
+_HELPS = "give a larger `tol`, a smaller `size` or `pixel`, a slower aperture (`f_number`), `model=drt`"
+
+
+def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
+    """Raise OverBudget where a pupil of so many Gauss rings is too much.
+
+    phase: radians along a pupil radius. n rings are counted as a matrix n × n: so do the points that they serve grow.
+    """
+    D, F, W = scene.shape
+    turns = phase / (2 * math.pi)
+    afford(
+        24.0 * rings**2 + 128.0 * rings * D * F * W,
+        f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times",
+        helps=_HELPS,
+    )
+
+
+def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
+    """Raise OverBudget where the light at `nodes`² points of each pixel is too much; fields come one by one."""
+    D, _, W = scene.shape
+    rows, columns = grid.rows * nodes, grid.columns * nodes
+    afford(
+        64.0 * D * W * rows * columns,
+        f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels",
+        helps=_HELPS,
+    )
+
+
+def _speed(scene: Scene) -> str:
+    return f"F/{float(axial_f_number(scene.lens).detach().abs().min()):.3g}"

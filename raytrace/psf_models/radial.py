@@ -1,0 +1,193 @@
+"""Round kernels: what is symmetric about the centre of the window is computed along one radius only.
+
+    E_ij = ∬_ij I(r) dx dy = Σ_k M_ijk I(r_k)      waves: I is band-limited, so that a few radii hold all of it
+    E_ij = ∫ g_ij(r) dE(r)                         rays: g_ij the share of a ring of radius r that lies in the pixel
+
+M and g are constants of the window in units of a pixel. Pixels alike by symmetry are computed once: 66 of 21 × 21.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.budget import afford, forewarn
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.tracing.scene import Scene, varies
+
+_STEPS = 64  # of the table of g in a pixel
+
+
+def is_centred(grid: Grid, scene: Scene | None = None) -> bool:
+    """Whether every window (of the whole scene) is centred on the axis, to a billionth of a pixel, and stays there
+    under differentiation.
+    """
+    if varies(grid.centre):
+        return False
+    centred = (grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all()
+    return bool(centred) if scene is None else scene.everywhere(centred)
+
+
+def reach(grid: Grid) -> float:
+    """Distance in pixels from the centre of a window to its corner."""
+    return 0.5 * math.hypot(grid.rows, grid.columns)
+
+
+def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tensor]:
+    """Radii (K,) mm at which to know an intensity of frequencies up to `cutoff` in 1/mm, and the matrix (U, K) mm² to
+    the energy of the pixels that differ, for `unfold`.
+
+    Even Chebyshev terms up to degree 2K - 2 hold exp(iat) up to J_2K(a), a = 2π · cutoff · reach.
+    """
+    radii, matrix, _ = (grid.pitch.new_tensor(a) for a in _rule_of(grid, cutoff, order))
+    return radii * grid.pitch, matrix * grid.pitch**2
+
+
+def light_of_radii(grid: Grid, cutoff: float, order: int, intensity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Kernel (..., rows, columns), and of the light inside the window centroid (2, ...) mm and covariance (3, ...) mm²,
+    0 if there is none, of round light about the axis, from its intensity (..., K) at those radii.
+    """
+    _, matrix, second = (grid.pitch.new_tensor(a) for a in _rule_of(grid, cutoff, order))
+    kernel = unfold(grid, intensity @ (matrix * grid.pitch**2).mT)
+    squares = intensity @ (second * grid.pitch**4).mT
+    xx, yy = (safe_divide(part, kernel.sum((-2, -1))) for part in squares.unbind(-1))
+    zero = torch.zeros_like(xx)
+    return kernel, torch.stack([zero, zero]), torch.stack([xx, zero, yy])
+
+
+def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pitch = float(grid.pitch.detach())
+    argument = 2 * math.pi * cutoff * pitch * reach(grid)
+    count = math.ceil(0.5 * argument + max(1.5, 2 + order) * (4 + argument ** (1 / 3)))
+    nodes = math.ceil(0.5 * math.pi * cutoff * pitch) + 4 + order
+    distinct = grid.rows * grid.columns / (4 if grid.rows != grid.columns else 8) + grid.rows
+    afford(
+        8.0 * (8 * distinct * nodes**2 + (2 * distinct + 2 * count) * count),
+        f"the PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
+        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
+    )
+    return _wave_rule(grid.rows, grid.columns, nodes, count)
+
+
+def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> Tensor:
+    """Pixel energies (..., U) of pieces of one meridian turned about the axis; for `unfold`.
+
+        E_u = Σ_c e_c (G_u(b_c) - G_u(a_c))/(b_c - a_c),   G_u(h) = ∫_0^h g_u(|r|) dr
+
+    first, last: (..., C) mm, heights of either sign a, b where a piece begins and ends; energy: (..., C) of the pieces,
+    spread evenly over their heights.
+    """
+    table = grid.pitch.new_tensor(_ring_table(grid.rows, grid.columns))
+    last_step = len(table) - 1
+    a, b = first / grid.pitch, last / grid.pitch
+    # A caustic has pieces without width: the share of a ring is taken there, over a thousandth of a pixel.
+    narrow = (b - a).abs() < 1e-3
+    middle = 0.5 * (a + b)
+    lower, upper = torch.where(narrow, middle - 5e-4, a), torch.where(narrow, middle + 5e-4, b)
+    density = energy / (upper - lower)
+    weights = density.new_zeros(*density.shape[:-1], last_step + 1)
+    for end, share in ((lower, -density), (upper, density)):
+        share = torch.where(end < 0, -share, share)
+        place = (end.abs() * _STEPS).clamp(max=float(last_step))
+        below = place.detach().floor().clamp(max=last_step - 1)
+        above = place - below
+        index = below.long()
+        weights = weights.scatter_add(-1, index, share * (1 - above)).scatter_add(-1, index + 1, share * above)
+    return weights @ table
+
+
+def lit_part(first: Tensor, last: Tensor, clearances: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor | float]:
+    """Where between a and b (..., C) light passes, if clearances (..., C + 1) run linearly: its ends, and its share."""
+    begin, end = torch.zeros_like(first), torch.ones_like(first)
+    for clearance in clearances:
+        c, d = clearance[..., :-1], clearance[..., 1:]
+        edge = safe_divide(c, c - d)
+        begin = torch.maximum(begin, torch.where(c >= 0, 0.0, torch.where(d > 0, edge, 1.0)))
+        end = torch.minimum(end, torch.where(d >= 0, 1.0, torch.where(c > 0, edge, 0.0)))
+    share = (end - begin).clamp_min(0.0)
+    return first + begin * (last - first), first + end * (last - first), share
+
+
+def unfold(grid: Grid, values: Tensor) -> Tensor:
+    """Pixels (..., rows, columns) from those that differ (..., U)."""
+    index = torch.as_tensor(_distinct(grid.rows, grid.columns)[1], device=values.device)
+    return values[..., index]
+
+
+@functools.lru_cache(maxsize=16)
+def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (U, 2) in pixels of the pixels that differ, 0 <= a <= b; and which each pixel is, (rows, columns)."""
+    y, x = np.abs(np.arange(rows) - 0.5 * (rows - 1)), np.abs(np.arange(columns) - 0.5 * (columns - 1))
+    pair = np.sort(np.stack(np.broadcast_arrays(y[:, None], x[None, :]), -1), -1)
+    places, index = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
+    return places, index.reshape(rows, columns)
+
+
+@functools.lru_cache(maxsize=16)
+def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chebyshev radii (K,) in pixels; and the matrices (U, K) to pixels and (2, K) to the second moments of all of them
+    along x and y, by Gauss-Legendre nodes read off the series.
+    """
+    corner = 0.5 * math.hypot(rows, columns)
+    angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
+    terms = 2 * np.arange(count)
+    # c_m = (2 - δ_m0)/K Σ_k f(r_k) T_2m(r_k/R)
+    series = np.where(terms == 0, 1, 2)[:, None] / count * np.cos(terms[:, None] * angle)
+    node, weight = (a / 2 for a in np.polynomial.legendre.leggauss(nodes))
+    places = _distinct(rows, columns)[0]
+    forewarn(
+        5e-9 * count * len(places) * nodes**2,
+        f"a PSF takes its light at {count:,} radii and {nodes:,}² points of each pixel",
+        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
+    )
+    x, y = (places[:, axis, None] + node for axis in (0, 1))
+    # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.
+    twice = 2 * (2 * np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0) ** 2 - 1)
+    previous, current = 0.5 * twice, np.ones_like(twice)  # T_-2 = T_2, T_0
+    pixels, second = np.empty((len(places), count)), np.empty((2, count))
+    share_of_x, share_of_y = _squares(rows, columns, x, y, weight)
+    for m in range(count):
+        pixels[:, m] = np.einsum("uab,a,b->u", current, weight, weight, optimize=True)
+        second[:, m] = [np.einsum("uab,uab->", current, share, optimize=True) for share in (share_of_x, share_of_y)]
+        previous, current = current, twice * current - previous
+    return corner * np.cos(angle), pixels @ series, second @ series
+
+
+def _squares(rows: int, columns: int, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Weights (U, A, A) by which an intensity at the nodes of the pixels that differ makes ∬ I x² and ∬ I y².
+
+    x, y: (U, A) of `_distinct`, x <= y: a pixel with |x| > |y| on the sensor is the image of one with both exchanged.
+    """
+    own = np.abs(np.arange(columns) - 0.5 * (columns - 1)) <= np.abs(np.arange(rows) - 0.5 * (rows - 1))[:, None]
+    index = _distinct(rows, columns)[1]
+    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (own, ~own))
+    x, y, rule = x[:, :, None] ** 2, y[:, None, :] ** 2, weight[:, None] * weight
+    return rule * (as_is * x + exchanged * y), rule * (as_is * y + exchanged * x)
+
+
+@functools.lru_cache(maxsize=16)
+def _ring_table(rows: int, columns: int) -> np.ndarray:
+    """G (K, U): ∫_0^r of the share of rings in each pixel, at r in steps of 1/_STEPS pixel to beyond the corner."""
+    corner = 0.5 * math.hypot(rows, columns)
+    fine = 16  # midpoints in a step
+    count = math.ceil(corner * _STEPS) + 1
+    r = (np.arange(count * fine) + 0.5) / (_STEPS * fine)
+    places = _distinct(rows, columns)[0]
+    # Share of a ring in the quadrant rectangle [0, a] × [0, b]: from acos(a/r) to asin(b/r).
+    edges = np.unique(np.concatenate([places - 0.5, places + 0.5]))
+    arc = {edge: np.sign(edge) * np.arcsin(np.minimum(1.0, abs(edge) / r)) for edge in edges}
+
+    def corner_share(a: float, b: float) -> np.ndarray:
+        share = np.maximum(0.0, np.abs(arc[a]) + np.abs(arc[b]) - 0.5 * np.pi) / (2 * np.pi)
+        return np.sign(a) * np.sign(b) * share
+
+    shares = []
+    for a, b in places:
+        (a0, a1), (b0, b1) = (a - 0.5, a + 0.5), (b - 0.5, b + 0.5)
+        shares.append(corner_share(a1, b1) - corner_share(a0, b1) - corner_share(a1, b0) + corner_share(a0, b0))
+    steps = np.stack(shares, -1).reshape(count, fine, -1).mean(1) / _STEPS
+    return np.concatenate([np.zeros((1, len(places))), np.cumsum(steps, 0)])

@@ -1,0 +1,309 @@
+"""What a PSF model gives back, Kernels, and what the call that drives it does, a Psf; and how several become one."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.files import write_atomically
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.result import Result, axis, cell, number, numbers
+from raytrace.maths.value import value
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.tracing.spot import where_lit
+
+#: How many axes stand before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
+_BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
+_BEFORE |= {"centroid": 1, "covariance": 1, "ray_centroid": 1, "ray_covariance": 1}
+
+
+class EmptyPsf(ValueError):
+    """No ray of a field reaches the sensor: there is no PSF to compute."""
+
+
+@value
+class Kernels:
+    """PSFs of one model, one for each object distance, field and wavelength.
+
+    kernel: (D, F, W, rows, columns), energy in each pixel; 1 = all light through the entrance pupil.
+    grid: its centre is (2,) or (2, D, F, W).
+    centroid: (2, D, F, W) mm; covariance: (3, D, F, W) mm², xx, xy, yy, of the model's distribution before it is
+        integrated over pixels; of waves, of what lies inside the window: behind a hard edge there is no second moment.
+        None where nobody asks for them.
+    ray_centroid, ray_covariance: of waves, the same of the rays they follow, whatever the window; else None.
+    rays: how many rays were traced for each kernel; 0 if none.
+    residual: (D, F, W) how wrong the model itself is here, where it can tell (relative L1), or None.
+    arrived: (D, F, W) of plain rays, the energy on the whole sensor plane, or None.
+    """
+
+    kernel: Tensor
+    grid: Grid
+    centroid: Tensor | None
+    covariance: Tensor | None
+    rays: int
+    residual: Tensor | None = None
+    ray_centroid: Tensor | None = None
+    ray_covariance: Tensor | None = None
+    arrived: Tensor | None = None
+
+    @property
+    def energy(self) -> Tensor:
+        """(D, F, W): light inside the window."""
+        return self.kernel.sum((-2, -1))
+
+    @property
+    def ray_moments(self) -> tuple[Tensor, Tensor]:
+        """Centroid and covariance of geometric optics: of the rays that waves follow, else the model's own."""
+        if self.ray_centroid is None:
+            return self.centroid, self.covariance
+        return self.ray_centroid, self.ray_covariance
+
+    @property
+    def dark(self) -> Tensor:
+        """Which kernels no traced ray reaches, (D, F, W): their moments are 0 and mean nothing."""
+        return _is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
+
+
+@value
+class Psf(Result):
+    """PSFs over object distance × field, or object distance × field × wavelength: (D, F, W) for each (D, F) below.
+
+    kernel: (D, F, rows, columns), integrated over pixels; summed over the wavelengths by their weights, or with an
+        axis of them, (D, F, W, rows, columns).
+    grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
+    energy: (D, F) inside the window, of the light through the entrance pupil.
+    error: (D, F) estimated relative L1 error of the kernel against the model's own limit (a Gaussian's: relative error
+        of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
+    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration:
+        of all its light; of waves of the light inside the window, because behind a hard edge the second moment grows
+        with the window without limit. nan with gradient 0 where no ray reaches the sensor.
+    ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of waves those of the rays they
+        follow, or of their geometric limit, else again centroid and covariance.
+    residual: (D, F) how wrong the model itself is, where it can tell, or None.
+    arrived: (D, F) of plain rays, the energy on the whole sensor plane: what `energy` lacks of it lies beside the
+        window, what it lacks of 1 was lost in the lens; else None.
+    model: its name; waves: whether its light is diffracted; order: of its ladder, to repeat with `psf(order=…)`, None
+        for plain rays; rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
+    normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
+    wavelengths, wavelength_weights: (W,) µm and shares of 1, that the kernels are summed over or have an axis of.
+    lens, fields, object_distances: of what and where, (2, F) and (D,) mm; options: of the model.
+    framed: whether the pixels were asked for; otherwise a figure shows the light itself, finely.
+    """
+
+    FIGURE = "plotting.psf.psf_grid"
+
+    kernel: Tensor
+    grid: Grid
+    energy: Tensor
+    error: Tensor
+    centroid: Tensor
+    covariance: Tensor
+    ray_centroid: Tensor
+    ray_covariance: Tensor
+    residual: Tensor | None = None
+    arrived: Tensor | None = None
+    model: str = ""
+    waves: bool = False
+    order: int | None = None
+    rays: int = 0
+    reason: str = ""
+    normalised: str = "energy"
+    wavelengths: Tensor | None = None
+    wavelength_weights: Tensor | None = None
+    lens: Lens | None = None
+    fields: Tensor | None = None
+    object_distances: Tensor | None = None
+    options: Mapping = dataclasses.field(default_factory=dict)
+    framed: bool = True
+
+    @property
+    def wavelengths_summed(self) -> bool:
+        """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
+        return self.kernel.dim() == 4
+
+    def columns(self) -> dict[str, Tensor]:
+        """A row for every kernel: mm, widths of the light before pixels."""
+        axes = self.energy.dim()
+        colours = {} if self.wavelengths_summed else {"wavelength": axis(self.wavelengths, 2, axes)}
+        return {
+            "object_distance": axis(self.object_distances, 0, axes),
+            **{f"field_{a}": axis(field, 1, axes) for a, field in zip("xy", self.fields, strict=True)},
+            **colours,
+            **{f"centroid_{a}": t for a, t in zip("xy", self.centroid, strict=True)},
+            **{f"sigma_{a}": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
+            "energy": self.energy,
+            "error": self.error,
+        }
+
+    def document(self) -> dict:
+        """The kernels for JSON, distance-major, without their pixels."""
+        return {
+            "model": self.model,
+            "reason": self.reason or None,
+            "wavelengths": numbers(self.wavelengths),
+            "wavelength_weights": numbers(self.wavelength_weights),
+            "wavelengths_summed": self.wavelengths_summed,
+            "results": [self._entry(place) for place in np.ndindex(self.energy.shape)],
+        }
+
+    def _entry(self, place: tuple[int, ...]) -> dict:
+        at = (slice(None), *place)
+        return {
+            "object_distance": number(self.object_distances[place[0]]),
+            "field": numbers(self.fields[:, place[1]]),
+            **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
+            **{key: numbers(getattr(self, key)[at]) for key in ("centroid", "ray_centroid")},
+            **{key: _square(getattr(self, key)[at]) for key in ("covariance", "ray_covariance")},
+            "energy": number(self.energy[place]),
+            "error": number(self.error[place]),
+            "residual": None if self.residual is None else number(self.residual[place]),
+            "rays": self.rays,
+        }
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the arrays (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], and what belongs
+        to it.
+        """
+        names = "energy", "error", "centroid", "covariance", "ray_centroid", "ray_covariance", "wavelengths"
+        names = *names, "wavelength_weights", "wavelengths_summed", "model", "normalised"
+        arrays = {name: getattr(self, name) for name in names}
+        arrays |= {"psf": self.kernel, "centre": self.grid.centre, "object_distance": self.object_distances}
+        arrays |= {"field": self.fields.T, "pixel_pitch": self.grid.pitch}
+        arrays = {name: t.detach().cpu().numpy() if isinstance(t, Tensor) else t for name, t in arrays.items()}
+        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+    def __str__(self) -> str:
+        pitch = 1000 * float(self.grid.pitch)
+        said = [f"{self.model} PSF, {self.grid.columns} × {self.grid.rows} pixels of {pitch:g} µm, {self._colours()}"]
+        said += [self.reason] if self.reason else []
+        if self.waves:
+            said.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
+        own, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
+        table = {
+            ("object", "mm", 12): lambda at: f"{float(self.object_distances[at[0]]):g}",
+            ("field", FIELD_UNITS[self.lens.fields.kind], 9): lambda at: name_of_field(self.fields[:, at[1]]),
+            ("λ", "µm", 9): lambda at: f"{float(self.wavelengths[at[2]]):g}",
+            ("centroid x", "mm", 12): lambda at: cell(float(self.centroid[0][at]), ".6f"),
+            ("centroid y", "mm", 12): lambda at: cell(float(self.centroid[1][at]), ".6f"),
+            ("σ x", "µm", 9): lambda at: cell(float(own[0][at]), ".4f"),
+            ("σ y", "µm", 9): lambda at: cell(float(own[1][at]), ".4f"),
+            ("rays' σ x", "µm", 9): lambda at: cell(float(rays[0][at]), ".4f"),
+            ("rays' σ y", "µm", 9): lambda at: cell(float(rays[1][at]), ".4f"),
+            ("energy", "window", 8): lambda at: f"{float(self.energy[at]):.4f}",
+            ("error", "est.", 9): lambda at: cell(float(self.error[at]), ".1e"),
+            ("rays", "", 7): lambda at: f"{self.rays}",
+        }
+        left_out = ("λ",) * self.wavelengths_summed + ("rays' σ x", "rays' σ y") * (not self.waves)
+        shown = {column: text for column, text in table.items() if column[0] not in left_out}
+        said += [" ".join(f"{column[k]:>{column[2]}}" for column in shown) for k in (0, 1)]
+        for at in np.ndindex(self.energy.shape):
+            said.append(" ".join(f"{text(at):>{width}}" for (_, _, width), text in shown.items()))
+        if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
+            said.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
+        return "\n".join(said)
+
+    def _colours(self) -> str:
+        """The wavelengths in words, and what was done with them."""
+        named = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
+        if len(self.wavelengths) == 1:
+            return f"at {named} µm"
+        shares = (self.wavelength_weights / self.wavelength_weights.max()).tolist()
+        shares = ":".join(f"{share:.3g}" for share in shares)
+        return f"summed over {named} µm by weights {shares}" if self.wavelengths_summed else f"each of {named} µm"
+
+
+def _square(covariance: Tensor) -> list[list]:
+    """[[xx, xy], [xy, yy]]; nulls where there is no light."""
+    return [numbers(covariance[:2]), numbers(covariance[1:])]
+
+
+def _sigmas(covariance: Tensor) -> Tensor:
+    """σ_x and σ_y (2, ...); nan where there is no light."""
+    return covariance[::2].clamp_min(0.0).sqrt()
+
+
+def combined(parts: Sequence, join: Callable[[list[Tensor], int], Tensor]):
+    """One Kernels or Psf of several of a kind: `join(tensors, axes before those of the batch)` of all they have."""
+    names = [field.name for field in dataclasses.fields(parts[0]) if field.name in _BEFORE]
+    names = [name for name in names if getattr(parts[0], name) is not None]
+    tensors = {name: join([getattr(part, name) for part in parts], _BEFORE[name]) for name in names}
+    return dataclasses.replace(parts[0], rays=max(part.rays for part in parts), **tensors)
+
+
+def moments(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) and covariance (3, ...) of points (..., P), by shares that sum to 1 or are 0."""
+    mean_x, mean_y = (share * x).sum(-1), (share * y).sum(-1)
+    x, y = x - mean_x[..., None], y - mean_y[..., None]
+    covariance = [(share * pair).sum(-1) for pair in (x * x, x * y, y * y)]
+    return torch.stack([mean_x, mean_y]), torch.stack(covariance)
+
+
+def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) and covariance (3, ...) of all light of K distributions (2, ..., K), (3, ..., K).
+
+    energy: (..., K), theirs.
+
+        m = Σ_k s_k m_k,   C = Σ_k s_k (C_k + (m_k - m)(m_k - m)ᵀ),   s_k = E_k / Σ E
+
+    Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
+    """
+    share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
+    mean, apart = moments(*centroid, share)
+    return mean, apart + (share * covariance).sum(-1)
+
+
+def polychromatic(found: Kernels, weights: Tensor | None, model: str) -> Psf:
+    """Sum over wavelengths by their weights, moments being those of the sum of the distributions; None keeps each."""
+    own, rays, waves = (found.centroid, found.covariance), found.ray_moments, found.ray_centroid is not None
+    kernel, energy, residual, arrived = found.kernel, found.energy, found.residual, found.arrived
+    if weights is not None:
+        share = weights / weights.sum()
+        kernel = (share[:, None, None] * kernel).sum(-3)
+        residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
+        rays = mixture(torch.where(found.dark, 0.0, share), *rays)
+        # What lies inside a window counts by its light there.
+        own = mixture(share * energy, *own) if waves else rays
+        energy = kernel.sum((-2, -1))
+    centre = found.grid.centre if found.grid.centre.dim() == 1 else found.grid.centre[..., 0]
+    return Psf(
+        kernel=kernel,
+        grid=dataclasses.replace(found.grid, centre=centre),
+        energy=energy,
+        error=torch.full_like(energy.detach(), torch.nan),
+        centroid=own[0],
+        covariance=own[1],
+        ray_centroid=rays[0],
+        ray_covariance=rays[1],
+        residual=residual,
+        arrived=arrived,
+        model=model,
+        waves=waves,
+        rays=found.rays,
+    )
+
+
+def without_dark(found: Psf, empty: str = "nan") -> Psf:
+    """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
+    rays = found.ray_centroid, found.ray_covariance
+    dark = _is_dark(found.kernel, *rays, found.rays, of_waves=found.waves)
+    if empty == "error" and bool(dark.any()):
+        places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
+        raise EmptyPsf(
+            f"no ray reaches the sensor in {int(dark.sum())} of {dark.numel()} PSFs, those of index {places}"
+        )
+    names = "centroid", "covariance", "ray_centroid", "ray_covariance"
+    lit = where_lit(~dark, *(getattr(found, name) for name in names), empty=empty)
+    return dataclasses.replace(found, **dict(zip(names, lit, strict=True)))
+
+
+def _is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
+    """Which kernels (..., rows, columns) no ray reaches, by their light and the moments of their rays, all exactly 0.
+
+    Light beside the window is not lost: it has a place. of_waves: whose reference, the chief ray, has one in any case.
+    """
+    empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
+    return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)

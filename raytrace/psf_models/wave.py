@@ -1,0 +1,299 @@
+"""Wave model: the diffraction PSF of the traced wavefront, over the pupil as the lens leaves it.
+
+    U(x, y) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi [W_j + n (L_j x + M_j y)]/λ)
+
+Every ray j carries the light E_j of its share of the entrance pupil through its share Ω_j = |∂(L, M)/∂p| dp of the
+directions, so that the intensity |U|² holds the transmitted light (Parseval), whatever the distortion of the pupil.
+W is the OPD on the reference sphere and (L, M) point from there to its centre (Debye's integral, Born & Wolf §8.8.1).
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths import zernike
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import to, value
+from raytrace.psf_models.dft import (
+    afford_rings,
+    afford_sensor,
+    disc_rule,
+    integrate,
+    nodes_per_pixel,
+    phasor,
+    rings_and_arms,
+    rings_to_grid,
+    sub_pixels,
+    to_grid,
+    to_grid_mirrored,
+    window_moments,
+)
+from raytrace.psf_models.pupil_clearance import between, clear_arms
+from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves
+from raytrace.psf_models.result import Kernels, combined
+from raytrace.tracing.scene import Scene, symmetry, trace_scene
+from raytrace.tracing.wavefront import Wavefront, wavefront_of
+
+_MOST_RAYS = 400_000  # rays of one kernel; beyond, the phase is refused
+_DEGREE = 10  # of the map from the pupil to directions
+_TERMS = (_DEGREE + 1) * (_DEGREE + 2) // 2  # its Zernike terms
+_PROBE = 8, 32  # rings and arms of the rays that find the map and the sampling
+_RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
+
+
+@value
+class Waves:
+    """Plane waves that meet at the sensor: (D, F, W, P) of one field, ready to be summed.
+
+    amplitude: √(E Ω), 0 where no light comes; wavefront: its OPD, directions and centre.
+    symmetry: "round": each ray stands for its ring; "mirror": for itself and its image in x; "none".
+    """
+
+    amplitude: Tensor
+    wavefront: Wavefront
+    symmetry: str
+
+
+def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
+    """Kernels of the wave model; a kernel whose light is blocked altogether is 0 with gradient 0.
+
+    order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error.
+    centroid and covariance are those of the light inside the window. Those of the rays are
+    given beside them: the mean of the whole wave is theirs (Ehrenfest), its second moment does not exist behind a hard
+    edge. residual: size of the terms that Debye's integral leaves out.
+    Raises ValueError where the window or the blur would need too many rays.
+    """
+    fields = [_field_kernels(one_field(scene, f), one_field_grid(grid, f), order) for f in range(scene.shape[1])]
+    found = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
+    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
+
+
+def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
+    """Waves of one field, sampled for points up to `reach` mm from the chief ray's point.
+
+    The rays are Gauss rings over the pupil; where it is vignetted, over the clear part of every arm. One arm is enough
+    on the axis of a round lens, half the arms for a field in the y-z plane.
+    """
+    return _waves(scene, _probe(scene), reach, order)
+
+
+def _waves(scene: Scene, probe: Wavefront, reach: Tensor | float, order: int) -> Waves:
+    fold = symmetry(scene)
+    pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach, scene.largest), order)
+    front = wavefront_of(scene, pupil, weights)
+    solid = math.pi * weights * _jacobian(_direction_map(probe), pupil)
+    return Waves(safe_sqrt(front.energy * solid), front, fold)
+
+
+def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
+    """U (D, F, W, Y, X) in 1/mm at x (..., X), y (..., Y) mm from the chief ray's point, by a matrix DFT."""
+    front = waves.wavefront
+    wavelength = 1e-3 * front.wavelength
+    L, M, _ = front.direction
+    field = waves.amplitude * phasor(front.opd / wavelength[:, None])
+    inside = (wavelength / front.index).expand(field.shape[:-1])
+    if waves.symmetry == "round":
+        U = rings_to_grid(field, safe_sqrt(L * L + M * M), x, y, inside)
+    elif waves.symmetry == "mirror":
+        U = to_grid_mirrored(0.5 * field, L, M, x, y, inside)
+    else:
+        U = to_grid(field, L, M, x, y, inside)
+    return U / inside[..., None, None]
+
+
+def strehl(scene: Scene, *, order: int = 0) -> Tensor:
+    """Strehl ratio (D, F, W): the largest intensity on the sensor over Σ² of the same amplitudes without aberrations.
+
+    The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient: to first order the
+    value does not depend on it. 0 where no light arrives.
+    """
+    ratios = [_strehl(one_field(scene, f), order) for f in range(scene.shape[1])]
+    return torch.cat(ratios, 1).to(scene.wavelengths.dtype)
+
+
+def phase_along_radius(
+    probe: Wavefront, reach: Tensor | float, largest: Callable[[Tensor], Tensor] = torch.Tensor.detach
+) -> float:
+    """Largest change of phase in radians along a pupil radius, seen from points up to `reach` mm from the centre.
+
+    dΦ/dp = (2πn/λ) |∂(L, M)/∂p · (x_ray - x)|: directions times the distance between ray and point.
+    largest: as `Scene` has it.
+    """
+    with torch.no_grad():
+        spread = half_spread(probe)[..., None]
+        blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1, keepdim=True)
+        phase = 2e3 * math.pi * (probe.index / probe.wavelength)[:, None] * spread * (blur + reach)
+        return float(largest(phase.max()))
+
+
+def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
+    """Kernels (D, 1, W, rows, columns) of one field."""
+    probe = _probe(scene)
+    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
+    local = Grid(grid.pitch, grid.rows, grid.columns, centre)
+    cutoff = 2e3 * float(scene.largest((half_spread(probe) * probe.index / probe.wavelength).max()))
+    is_round = symmetry(scene) == "round" and is_centred(grid, scene)
+    if is_round:
+        # One radius tells all: as a row of points, without pixels.
+        x, _ = radii_of_waves(grid, cutoff, order)
+        y, corner = torch.zeros_like(x[:1]), x.detach().max()
+    else:
+        nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
+        afford_sensor("the wave PSF", scene, grid, nodes)
+        x, y, weight = sub_pixels(local, nodes)
+        corner = scene.largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
+    light = _waves(scene, probe, corner, order)
+    U = amplitude(light, x, y)
+    intensity = U.real**2 + U.imag**2
+    if is_round:
+        kernel, centroid, covariance = light_of_radii(grid, cutoff, order, intensity[..., 0, :])
+    else:
+        kernel = integrate(intensity, weight, grid.pitch)
+        centroid, covariance = window_moments(intensity, x, y, weight, grid.pitch)
+        centroid = centroid + probe.centre[:2]
+    residual = _debye_residual(light.wavefront, probe, corner)
+    return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1], residual, *_moments(light))
+
+
+def _probe(scene: Scene) -> Wavefront:
+    """A few hundred rays that find the blur, the map of directions and so the sampling."""
+    points, weights = gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
+    return wavefront_of(scene, points, weights)
+
+
+def _moments(light: Waves) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) mm on the sensor and covariance (3, ...) mm² of the rays."""
+    front = light.wavefront
+    share = safe_divide(front.energy, front.energy.sum(-1, keepdim=True))
+    x, y = torch.where(front.valid, front.landing, 0.0)
+    if light.symmetry == "round":
+        variance, zero = 0.5 * (share * (x * x + y * y)).sum(-1), torch.zeros_like(share[..., 0])
+        return front.centre[:2], torch.stack([variance, zero, variance])
+    mean_x, mean_y = (share * x).sum(-1), (share * y).sum(-1)
+    if light.symmetry == "mirror":
+        mean_x = torch.zeros_like(mean_x)
+    x, y = x - mean_x[..., None], y - mean_y[..., None]
+    xy = torch.zeros_like(mean_x) if light.symmetry == "mirror" else (share * x * y).sum(-1)
+    covariance = torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
+    return front.centre[:2] + torch.stack([mean_x, mean_y]), covariance
+
+
+def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tensor:
+    """Relative L1 error (...) by what |q - p| - R leaves out beside L x + M y, π n (s·p)²/(|R| λ) of phase.
+
+    Over the window or the blur b, and directions up to s, the mean of (s·p)² is b² s²/8; a fifth allows for light that
+    gathers at the rim. Where that turns many times it only moves rays, by up to b² s/|R|, which changes densities by
+    up to 6 b s/|R|. Against sums of wavelets on the exit pupil it is 1 to 10 times the true error out of focus.
+    """
+    with torch.no_grad():
+        spread = half_spread(probe)
+        wavelength = 1e-3 * front.wavelength / front.index
+        blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
+        b = torch.minimum(corner, blur + wavelength / spread.clamp_min(1e-30))
+        stretch = b * spread / front.radius.abs()
+        return torch.minimum(0.2 * math.pi * b * spread / wavelength, torch.full_like(b, 6.0)) * stretch
+
+
+def half_spread(front: Wavefront) -> Tensor:
+    """Largest distance (...) of the directions (L, M) of the rays from their mean."""
+    L, M = torch.where(front.usable, front.direction[:2], 0.0).detach()
+    count = front.usable.sum(-1, keepdim=True).clamp_min(1)
+    dL, dM = L - L.sum(-1, keepdim=True) / count, M - M.sum(-1, keepdim=True) / count
+    return torch.where(front.usable, torch.hypot(dL, dM), 0.0).amax(-1)
+
+
+def _orders() -> list[tuple[int, int]]:
+    return [zernike.noll(j) for j in range(1, _TERMS + 1)]
+
+
+def _direction_map(probe: Wavefront) -> Tensor:
+    """Zernike coefficients (2, ..., J) of L and M over the pupil; 0 where too few rays come through."""
+    basis = zernike.polynomials(_orders(), *probe.pupil)
+    enough = probe.usable.sum(-1, keepdim=True) >= 2 * _TERMS
+    weights = torch.where(probe.usable | ~enough, probe.weights, 0.0)
+    directions = torch.where(probe.usable & enough, probe.direction[:2], 0.0)
+    return zernike.fit(directions, basis, weights)
+
+
+def _jacobian(directions: Tensor, pupil: Tensor) -> Tensor:
+    """|∂(L, M)/∂(p_x, p_y)| (..., P) at pupil points, of Zernike series (2, ..., J) written out in powers of p."""
+    matrix, i, j = _powers()
+    terms = directions @ directions.new_tensor(matrix)
+    x, y = (torch.stack([torch.ones_like(p), *itertools.accumulate([p] * _DEGREE, torch.mul)]) for p in pupil)
+    by_x = (x[np.maximum(i - 1, 0)] * y[j]).movedim(0, -2)
+    by_y = (x[i] * y[np.maximum(j - 1, 0)]).movedim(0, -2)
+    (L_x, M_x), (L_y, M_y) = (
+        ((terms * terms.new_tensor(power))[..., None, :] @ slope)[..., 0, :] for power, slope in ((i, by_x), (j, by_y))
+    )
+    return (L_x * M_y - L_y * M_x).abs()
+
+
+@functools.cache
+def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrix (J, T) from Zernike coefficients to those of x^i y^j, and the exponents i and j (T,)."""
+    i, j = np.array([(n - k, k) for n in range(_DEGREE + 1) for k in range(n + 1)]).T
+    points, _ = gauss_rings(2 * _DEGREE, 4 * _DEGREE)
+    x, y = points.numpy()[:, :, None]
+    values = zernike.polynomials(_orders(), *points).numpy()
+    return np.linalg.lstsq(x**i * y**j, values.T, rcond=None)[0].T, i, j
+
+
+def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -> tuple[Tensor, Tensor]:
+    """Pupil points (2, P) and weights (P,): Gauss rings; where light is lost, (2, D, F, W, P) and (D, F, W, P) over the
+    clear part of every arm."""
+    like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
+    rings, arms = rings_and_arms(phase, order)
+    if fold == "round":
+        afford_rings("the wave PSF", scene, rings, phase)
+        arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
+    else:
+        points, weights = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
+    unit = points[:, :arms] / torch.hypot(*points[:, :arms])
+    if fold == "mirror":
+        right = points[0] > 0
+        points, weights, unit = points[:, right], 2 * weights[right], unit[:, unit[0] > 0]
+    with torch.no_grad():
+        if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
+            return points, weights
+    return between(*clear_arms(scene, unit), unit, rings=rings)
+
+
+def _strehl(scene: Scene, order: int) -> Tensor:
+    probe = _probe(scene)
+    spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
+    light = _waves(scene, probe, 20 * spacing.max(), order + 1)
+    front = light.wavefront
+    with torch.no_grad():
+        x, y = _moments(light)[0] - front.centre[:2]
+        offsets = torch.arange(-16, 17, dtype=x.dtype, device=x.device)
+        for _ in range(8):
+            near_x, near_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
+            U = amplitude(light, near_x, near_y)
+            best = (U.real**2 + U.imag**2).flatten(-2).argmax(-1, keepdim=True)
+            x = torch.gather(near_x, -1, best % len(offsets))[..., 0]
+            y = torch.gather(near_y, -1, best // len(offsets))[..., 0]
+            spacing = spacing / 8
+    U = amplitude(light, x[..., None], y[..., None])[..., 0, 0]
+    peak = light.amplitude.sum(-1) / (1e-3 * front.wavelength / front.index)
+    return safe_divide(U.real**2 + U.imag**2, peak**2)
+
+
+def one_field(scene: Scene, f: int) -> Scene:
+    """One field of a scene in double precision: in single precision the OPD itself is known to 1/400 wave only."""
+    return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
+
+
+def one_field_grid(grid: Grid, f: int) -> Grid:
+    """The windows of one field, in double precision."""
+    centre = grid.centre
+    if centre.dim() > 1 and centre.shape[2] > 1:
+        centre = centre[:, :, f : f + 1]
+    return to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)

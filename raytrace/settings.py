@@ -1,0 +1,119 @@
+"""Settings of trainings: every field decides the result, so that other settings are another run. Imports no torch."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Self
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """seed: of all random numbers."""
+
+    seed: int = 0
+
+    @classmethod
+    def of(cls, values: Mapping, **more) -> Self:
+        """Settings from those of the values that are fields and not None; `more` overrides them."""
+        named = {field.name: values.get(field.name) for field in dataclasses.fields(cls)}
+        return read(cls, {name: value for name, value in named.items() if value is not None} | more)
+
+
+def read(kind: type, document: Mapping):
+    """A dataclass of plain fields from JSON, whose lists become tuples. Raises TypeError for fields of another kind."""
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+
+
+#: PSF models that a lens is trained with.
+MODELS = ("paraxial", "fourier", "gaussian", "drt")
+#: Gaussian DRT, started at the sensor distance where the paraxial run of the same seed ended.
+AFTER_PARAXIAL = "gaussian-after-paraxial"
+#: A model, and a start: the optimum of its closed form.
+GAUSSIAN = "gaussian"
+#: Names of models in tables and figures.
+NAMES = {
+    "paraxial": "paraxial",
+    "fourier": "Fourier",
+    "gaussian": "Gaussian DRT",
+    "drt": "DRT",
+    AFTER_PARAXIAL: "Gaussian DRT from paraxial",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class CodesignSettings(Settings):
+    """Settings of co-design (`imaging.codesign`). Lengths in mm, wavelengths in µm, angles in degrees.
+
+    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; glass_thickness,
+    air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far, spread: range and
+    distribution of object distances; fields: points in y, one after the other for successive samples; pixel, size:
+    window of the PSF; depth, width: of the network; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
+    A stored run without one of the fields has its default.
+    """
+
+    model: str = "gaussian"
+    vary: str = "sensor"
+    bounds: str = ""
+    glass_thickness: str = ""
+    air_thickness: str = ""
+    edge: float | None = None
+    hold: str = ""
+    start: str = "paraxial"
+    focus_distance: float = 25e3
+    f_number: float | None = None
+    wavelengths: tuple[float, ...] = (0.53,)
+    wavelength_weights: tuple[float, ...] = (1.0,)
+    near: float = 10e3
+    far: float = 50e3
+    spread: str = "uniform"
+    fields: tuple[float, ...] = (0.0,)
+    pixel: float = 0.005
+    size: int = 21
+    normalise: str = "window"
+    noise: float = 0.1
+    depth: int = 10
+    width: int = 32
+    epochs: int = 30
+    batch: int = 32
+    patch: int = 64
+    crops: int = 4
+    rate_network: float = 1e-3
+    rate_optics: float = 1e-3
+    precision: str = "float32"
+    tol: float = 1e-2
+    rho: float = 0.5
+    rays: int | None = None
+    drt_rays: int | None = None
+    sampling: str = "sobol"
+    vignetting: str = "none"
+    decay: str = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class DesignSettings(Settings):
+    """Settings of the design of a phase element (`imaging.wave_design`). Lengths in mm.
+
+    kind: "smooth" (even powers of r), "rings" (free heights, started at the smooth optimum), "zernike" (Noll's, no
+    symmetry); terms: of the smooth start (Zernike terms without angle), or Noll's last; pitch: of rings; levels: of
+    etched rings, 0 for any height; rate: in µm, or a fraction of it; spread: of random starts, µm; start_steps: of
+    each; size: of the periodic pictures; noise: range of the standard deviation drawn for "images"; tolerance: uniform
+    random error of the heights of rings, resampled at every step.
+    """
+
+    kind: str = "rings"
+    glass: str = "F_SILICA"
+    terms: int = 7
+    pitch: float = 2e-3
+    levels: int = 0
+    loss: str = "spectral"
+    restoration: str = "blind"
+    optimizer: str = "adam"
+    schedule: str = "cosine"
+    rate: float = 0.02
+    steps: int = 120
+    starts: int = 4
+    spread: float = 0.5
+    start_steps: int = 60
+    size: int = 256
+    batch: int = 4
+    noise: tuple[float, float] = (0.01, 0.01)
+    tolerance: float = 0.0

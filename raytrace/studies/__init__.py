@@ -1,1 +1,0 @@
-"""Experiments: each a folder with its computation, figures, pages and command. Nothing imports them."""

@@ -1,1 +1,0 @@
-"""Extended depth of field behind a learned thin element."""

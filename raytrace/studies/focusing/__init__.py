@@ -1,1 +1,0 @@
-"""A flat plate that learns to be a lens."""

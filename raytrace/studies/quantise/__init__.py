@@ -1,1 +1,0 @@
-"""What fabrication costs: steps of height, wrapping, errors of height."""

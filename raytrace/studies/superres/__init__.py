@@ -1,1 +1,0 @@
-"""Pictures finer than the pixels of the sensor."""

@@ -1,0 +1,182 @@
+"""Aperture: the part of a surface that passes light, and one row for every shape that it may have.
+
+A shape is told by its edges, each a measure of a point and the limit of it: what lies within, how far from the edge,
+how a figure shows it and what files call it is in the row, and nowhere else but in tracing/cpp/apertures.h.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.value import value
+
+
+@value
+class Aperture:
+    """The part of a surface that passes light; one surface may carry several, and a ray must pass all of them.
+
+    shape: a key of SHAPES, "circular" (extent: inner and outer radius), "rectangular" or "elliptic" (half-widths in x
+        and y), "polygon" (x, y of its corners; several, each closed by its first corner, are one shape).
+    extent: the numbers of the shape, mm.
+    obscures: True if the shape blocks what lies inside it (an obscuration) instead of passing it.
+    centre: (x, y) mm of the shape in the surface's frame.
+    """
+
+    shape: str
+    extent: tuple[float, ...]
+    obscures: bool = False
+    centre: tuple[float, float] = (0.0, 0.0)
+
+
+class Edge(NamedTuple):
+    """An edge of a shape: points whose measure (...) is at most the limit lie within it, of an inner one at least.
+
+    size: what distances from it are counted in; by default the limit.
+    """
+
+    measure: Tensor
+    limit: float
+    is_inner: bool = False
+    size: float | None = None
+
+    def within(self) -> Tensor:
+        """Which points (...) lie within, the edge itself included."""
+        return self.measure >= self.limit if self.is_inner else self.measure <= self.limit
+
+    def strictly(self) -> Tensor:
+        """Which points (...) lie within, without the edge."""
+        return self.measure > self.limit if self.is_inner else self.measure < self.limit
+
+    def distance(self) -> Tensor:
+        """How far within points (...) lie, smooth at the edge, in its own size; an edge at infinity is none."""
+        if self.size is not None:
+            return (self.limit - self.measure) / self.size
+        return self.measure / self.limit - 1 if self.is_inner else 1 - self.measure / self.limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A shape of apertures; its numbers are sizes in mm, and have no derivatives: an edge is hard.
+
+    edges: x, y (...) mm from its centre and its sizes -> the edges, within all of which it lies.
+    reach: sizes -> from which to which |y| it extends in the cross section.
+    symmetry: "round", "mirror" (in x and y) or "none".
+    zemax: keywords of a .zmx file for it as an aperture and as an obscuration.
+    code: of tracing/cpp/apertures.h; None: clipped by torch alone.
+    sizes: how many numbers it has, of 0 or more; None: points x, y, as many as there are, from 3 on.
+    is_hollow: sizes -> whether light may be stopped within it.
+    """
+
+    edges: Callable[[Tensor, Tensor, Sequence[float]], list[Edge]]
+    reach: Callable[[Sequence[float]], tuple[float, float]]
+    symmetry: str
+    zemax: tuple[str, str]
+    code: int | None = None
+    sizes: int | None = 2
+    is_hollow: Callable[[Sequence[float]], bool] = lambda sizes: False
+
+    def objection(self, sizes: Sequence[float]) -> str:
+        """Why these are no sizes of the shape; "" if they are."""
+        if self.sizes is None:
+            return "" if len(sizes) >= 6 and len(sizes) % 2 == 0 else "has no points x, y, three or more"
+        if len(sizes) != self.sizes:
+            return f"has not {self.sizes} sizes"
+        return "" if min(sizes) >= 0 else "has a negative size"
+
+
+def _rings(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+    square, (inner, outer) = x * x + y * y, sizes
+    return [Edge(square, outer * outer), *([Edge(square, inner * inner, True)] if inner > 0 else [])]
+
+
+def _outlines(sizes: Sequence[float]) -> list[tuple[float, float, float, float]]:
+    """The sides (x1, y1, x2, y2) of polygons, each of which ends where its first point comes again, the last anyhow."""
+    points = list(zip(sizes[::2], sizes[1::2], strict=True))
+    sides, first = [], 0
+    for k in range(1, len(points)):
+        if first == k:
+            continue
+        sides.append((*points[k - 1], *points[k]))
+        first = k + 1 if points[k] == points[first] else first
+    return sides if first >= len(points) else [*sides, (*points[-1], *points[first])]
+
+
+def _polygons(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+    """The signed distance from the nearest side; what lies within an odd number of polygons is inside."""
+    nearest, odd = torch.full_like(x, float("inf")), torch.zeros_like(x, dtype=torch.bool)
+    for x1, y1, x2, y2 in _outlines(sizes):
+        along_x, along_y = x2 - x1, y2 - y1
+        length = along_x * along_x + along_y * along_y
+        share = (((x - x1) * along_x + (y - y1) * along_y) / (length or 1.0)).clamp(0, 1)
+        off_x, off_y = x - x1 - share * along_x, y - y1 - share * along_y
+        nearest = torch.minimum(nearest, off_x * off_x + off_y * off_y)
+        if y1 != y2:
+            odd = odd ^ (((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (along_x / along_y)))
+    distance = safe_sqrt(nearest)
+    return [Edge(torch.where(odd, -distance, distance), 0.0, size=max(map(abs, sizes)))]
+
+
+SHAPES = {
+    "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0),
+    "rectangular": Shape(
+        lambda x, y, sizes: [Edge(x.abs(), sizes[0]), Edge(y.abs(), sizes[1])],
+        lambda sizes: (0.0, sizes[1]),
+        "mirror",
+        ("SQAP", "SQOB"),
+        1,
+    ),
+    "elliptic": Shape(
+        lambda x, y, sizes: [Edge((x / sizes[0]) ** 2 + (y / sizes[1]) ** 2, 1.0)],
+        lambda sizes: (0.0, sizes[1]),
+        "mirror",
+        ("ELAP", "ELOB"),
+        2,
+    ),
+    "polygon": Shape(
+        _polygons,
+        lambda sizes: (0.0, max(map(abs, sizes[1::2]))),
+        "none",
+        ("USAP", "USOB"),
+        3,
+        sizes=None,
+        is_hollow=lambda sizes: True,
+    ),
+}
+
+
+def edges(aperture: Aperture, hit: Tensor | Sequence[Tensor]) -> list[Edge]:
+    """The edges of an aperture as seen from points (2 or 3, ...) mm."""
+    x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
+    return SHAPES[aperture.shape].edges(x, y, aperture.extent)
+
+
+def inside(apertures: Sequence[Aperture], hit: Tensor | Sequence[Tensor]) -> Tensor | None:
+    """Which points (...) pass all the apertures; None if there are none. An edge belongs to the clear side."""
+    passed = None
+    for aperture in apertures:
+        sides = [edge.strictly() if aperture.obscures else edge.within() for edge in edges(aperture, hit)]
+        within = sides[0] if len(sides) == 1 else sides[0] & sides[1]
+        clear = ~within if aperture.obscures else within
+        passed = clear if passed is None else passed & clear
+    return passed
+
+
+def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
+    """How far points (2, ...) lie on the clear side of an aperture's edge: smooth there, above 0 where light passes."""
+    sides = [edge.distance() for edge in edges(aperture, hit)]
+    within = sides[0] if len(sides) == 1 else torch.minimum(*sides)
+    return -within if aperture.obscures else within
+
+
+def reach(aperture: Aperture) -> tuple[float, float]:
+    """From which to which distance along y from its centre, mm, the shape extends."""
+    return SHAPES[aperture.shape].reach(aperture.extent)
+
+
+def stands_inside(aperture: Aperture) -> bool:
+    """Whether an aperture can stop light in the midst of a beam whose rim it lets through."""
+    return aperture.obscures or SHAPES[aperture.shape].is_hollow(aperture.extent)

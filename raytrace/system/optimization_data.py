@@ -1,0 +1,152 @@
+"""Optimisation data of a lens: variables, solves, pickups and the merit function.
+
+A lens file stores solved values beside the rule that made them. The numbers of a `Lens` are always those values; the
+rules stand here, and hold while the lens is optimised. None of it is a tensor: two sets are equal where their parts
+are.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Vary:
+    """A number that an optimisation may change.
+
+    surface: of the file; quantity: "thickness", "curvature", or another name of `parameter_paths`, as "conic", "a4",
+    "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass.
+    configuration, operand: of a number that differs from one configuration to the next, which (from 1), and which of
+    `lens.operands` (from 0) it belongs to; surface and quantity are those of the operand. 0 and None: the lens's own.
+    bounds: smallest and largest value, in mm; () where none are told.
+    """
+
+    surface: int
+    quantity: str
+    configuration: int = 0
+    operand: int | None = None
+    bounds: tuple[float, ...] = ()
+
+    def __str__(self) -> str:
+        within = f" from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else ""
+        return f"{_where(self)}{within}"
+
+
+@dataclass(frozen=True, slots=True)
+class Solve:
+    """A number that follows from others, at every moment.
+
+    surface, quantity: as for `Vary`. kind, a key of `optimization.lens_state.SOLVES`, and its numbers:
+
+    "pickup": `scale` times a number of surface `source`, plus `offset`; quantity_of_source: which number, by default
+        the one of the same name.
+    "marginal_angle": the curvature behind which the paraxial marginal ray has the slope numbers[0].
+    "f_number": the curvature behind which the paraxial marginal ray has the slope of the F-number numbers[0].
+    "marginal_height": the thickness behind which the paraxial marginal ray has the height numbers[0] mm, or the real
+        axial ray through the part numbers[1] of the pupil, where that is not 0.
+    "edge_thickness": the thickness by which the space behind is numbers[0] mm thick at the height numbers[1] mm, or at
+        0 at the semi-diameter of the surface before it.
+    "position": the thickness by which those from surface `source` to this one have the sum numbers[0] mm; of a `source`
+        behind this surface, those from this one up to it.
+    "power": the curvature by which the surface has the power numbers[0], in 1/mm.
+
+    "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
+
+    All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):
+
+    "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" of a "semi_diameter", the latter: over the
+        configurations.
+    others, named as the file has them.
+
+    configuration, operand: as for `Vary`. A "pickup" of those follows configuration `source`, there operand numbers[0];
+        its offset is in `OptimizationData.unit`.
+    """
+
+    surface: int
+    quantity: str
+    kind: str
+    numbers: tuple[float, ...] = ()
+    source: int = 0
+    scale: float = 1.0
+    offset: float = 0.0
+    quantity_of_source: str = ""
+    configuration: int = 0
+    operand: int | None = None
+
+    def __str__(self) -> str:
+        if self.kind == "pickup" and self.operand is None:
+            named = self.quantity_of_source or self.quantity
+            scale = "" if self.scale == 1 else f"{self.scale:g} × "
+            offset = "" if self.offset == 0 else f" {'-' if self.offset < 0 else '+'} {abs(self.offset):g}"
+            return f"{_where(self)} = {scale}{named} of surface {self.source}{offset}"
+        numbers = " ".join(f"{number:g}" for number in self.numbers)
+        return f"{_where(self)}: {self.kind} {numbers}".rstrip()
+
+
+def _where(one: Vary | Solve) -> str:
+    configuration = f" in configuration {one.configuration}" if one.configuration else ""
+    return f"{one.quantity} of surface {one.surface}{configuration}"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of a merit function: an operand, its arguments, and what it is meant to be.
+
+    operand: its name, as "TRAC", a key of `optimization.operands.table.OPERANDS` where it is known, or a function
+    from a lens to a
+        tensor () or (k,), which may be a `optimization.operands.custom.Measure`; `name` is a word for either.
+    integers, numbers: its arguments as the field's programs write them: surfaces, a wavelength (from 1, 0 the primary
+        one) or rows; Hx, Hy, Px, Py or data.
+    target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
+    text: what a line of text says, and words behind the numbers; further: numbers behind those.
+    Lengths in `OptimizationData.unit`: a merit of lengths and pure numbers depends on the unit: rows stay as written.
+    """
+
+    operand: str | Callable
+    integers: tuple[int, int] = (0, 0)
+    numbers: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    target: float = 0.0
+    weight: float = 0.0
+    text: str = ""
+    further: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the operand, also where that is a function."""
+        if isinstance(self.operand, str):
+            return self.operand
+        return getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class OptimizationData:
+    """Everything that a lens file says about how the lens is to be optimised.
+
+    variables, solves: of the numbers of the lens, in the order of surfaces; kept: rules that are kept with the file and
+    not followed: their numbers stay as they are. merit: the lines of its merit function, in order, text included: row i
+    of the function is merit[i - 1]; tolerances: lines as they stand; unit: mm in the unit of length of both, in which a
+    file of the lens is written.
+    semi_diameters: surfaces whose semi-diameter is given; it follows the rays at all others, larger by
+    semi_diameter_margin: per cent, and mm.
+    """
+
+    variables: tuple[Vary, ...] = ()
+    solves: tuple[Solve, ...] = ()
+    merit: tuple[Row, ...] = ()
+    unit: float = 1.0
+    tolerances: tuple[str, ...] = ()
+    semi_diameters: tuple[int, ...] = ()
+    semi_diameter_margin: tuple[float, float] = (0.0, 0.0)
+    kept: tuple[Solve, ...] = ()
+
+    def __str__(self) -> str:
+        counts = Counter(row.name for row in self.merit)
+        operands = ", ".join(f"{name} x{count}" for name, count in counts.items())
+        lines = [
+            *(f"varies: {one}" for one in self.variables),
+            *(f"follows: {one}" for one in self.solves),
+            *(f"kept: {one}" for one in self.kept),
+            *([f"merit function of {len(self.merit)} lines: {operands}"] if self.merit else []),
+            *([f"tolerances: {len(self.tolerances)} lines"] if self.tolerances else []),
+        ]
+        return "\n".join(lines) or "nothing varies, nothing follows, no merit function"

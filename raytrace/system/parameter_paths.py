@@ -1,0 +1,184 @@
+"""Naming: numbers of a lens, their bounds and ranges as words name them.
+
+thickness:5,6 curvature:1-4 a4:3 sensor     numbers of surfaces, which are counted as in the file
+sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
+2:15                                        least and greatest
+
+Places: the numbers of a surface by name, whatever its kind is: of its shape, its phase and its pose.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.system.lens import Lens
+from raytrace.system.poses import Pose
+from raytrace.system.shapes import EVEN, KINDS, Kind
+from raytrace.system.surface import SHAPE, Surface
+from raytrace.words import did_you_mean
+
+_POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
+
+
+class ParameterPath(NamedTuple):
+    """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
+
+    path: tuple[str, ...]
+    entry: int | None = None
+
+
+def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
+    """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of sag terms, a phase and the poses.
+
+    Entries of a tensor are counted from 1, coefficients by the power of r, or of y, that they belong to. The pose
+    behind the surface has its names with "_after", as tilt_x_after.
+    """
+    found: dict[str, ParameterPath] = {}
+    for field in dataclasses.fields(Surface):
+        part = getattr(surface, field.name)
+        if field.name == "coefficients":
+            found |= _coefficients(part, KINDS[surface.kind])
+        elif field.name in SHAPE and field.type == Tensor | None:
+            found[field.name] = ParameterPath((field.name,))
+        elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
+            behind = "_after" if field.name == "after" else ""
+            for own in dataclasses.fields(part):
+                found |= _entries((field.name, own.name), getattr(part, own.name), own.name + behind)
+    return found
+
+
+def _coefficients(part: Tensor | None, kind: Kind) -> dict[str, ParameterPath]:
+    if part is None:
+        return {}
+    return {kind.name_of(entry): ParameterPath(("coefficients",), entry) for entry in range(part.numel())}
+
+
+def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str, ParameterPath]:
+    if not isinstance(part, Tensor):
+        return {}
+    if part.dim() == 0:
+        return {name: ParameterPath(path)}
+    return {f"{name}{entry + 1}": ParameterPath(path, entry) for entry in range(part.numel())}
+
+
+def number_at(part, place: ParameterPath) -> Tensor | None:
+    """The number in its place; None where it is not modelled."""
+    for name in place.path:
+        part = getattr(part, name)
+    return part if place.entry is None else part.reshape(-1)[place.entry]
+
+
+def with_number(part, place: ParameterPath, number: Tensor):
+    """The surface with another number in that place."""
+    name, *rest = place.path
+    old = getattr(part, name)
+    if rest:
+        number = with_number(old, ParameterPath(tuple(rest), place.entry), number)
+    elif place.entry is not None:
+        flat = old.reshape(-1)
+        number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
+    return dataclasses.replace(part, **{name: number})
+
+
+def modelled(surface: Surface, name: str) -> Surface:
+    """The surface with a number modelled, at 0 where it was not; the surface itself where it cannot have that number.
+
+    Curvature and conic, the terms a2, a4, … of an even asphere, and the fields of the pose before the surface or, with
+    "_after", behind it.
+    """
+    zero = torch.zeros_like(surface.thickness)
+    if name in ("curvature", "conic"):
+        return surface if getattr(surface, name) is not None else dataclasses.replace(surface, **{name: zero})
+    if name in parameter_paths(surface):
+        return surface
+    term = re.fullmatch(r"a(\d+)", name)
+    if term and surface.kind == EVEN and 2 <= int(term[1]) <= 2 * KINDS[EVEN].parameters and not int(term[1]) % 2:
+        own = zero.new_zeros(0) if surface.coefficients is None else surface.coefficients
+        further = zero.new_zeros((int(term[1]) // 2 - len(own), *own.shape[1:]))
+        return dataclasses.replace(surface, coefficients=torch.cat([own, further]))
+    field, side = name.removesuffix("_after"), "after" if name.endswith("_after") else "before"
+    pose = getattr(surface, side) or Pose()
+    if field in _POSED and isinstance(pose, Pose):
+        return dataclasses.replace(surface, **{side: dataclasses.replace(pose, **{field: zero})})
+    return surface
+
+
+#: Surfaces and configurations are counted up to this number, and so many are named at a time.
+MOST = 10_000
+
+
+class BadVariables(ValueError):
+    """A list of variables that the lens does not have, or that cannot be read."""
+
+
+class BadLimits(ValueError):
+    """Limits that cannot be read, or that nothing can keep to."""
+
+
+def joined(words: str | Sequence[str]) -> str:
+    """Words as one text, that may come as several."""
+    return words if isinstance(words, str) else " ".join(words)
+
+
+def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
+    """The numbers of a list like "1,3-5". Raises BadVariables naming the word that it is part of."""
+    found: list[int] = []
+    for part in numbers.split(","):
+        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+        if not match:
+            raise BadVariables(f"{word!r}: {part!r} is no {what} number; expected numbers and ranges like 1,3-5")
+        first, last = (int(digits) if len(digits) < 10 else MOST + 1 for digits in (match[1], match[2] or match[1]))
+        if last > MOST or len(found) + last - first > MOST:
+            raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {what} {MOST}, which no lens has")
+        found += range(first, last + 1)
+    return found
+
+
+def parameter_path(lens: Lens, kind: str, number: int, word: str) -> ParameterPath:
+    """Where a surface holds a number of that name; "sensor" is a thickness. Raises BadVariables."""
+    if not 1 <= number <= len(lens.surfaces) - 2:
+        raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(lens.surfaces[number])}
+    wanted = "thickness" if kind == "sensor" else kind
+    if wanted not in known:
+        meant = did_you_mean(kind, known)
+        raise BadVariables(f"{word!r}: surface {number} has no {kind}; it has {', '.join(known)}{meant}")
+    return known[wanted]
+
+
+def sensor(lens: Lens) -> int:
+    """The surface behind which the sensor stands."""
+    return len(lens.surfaces) - 2
+
+
+def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
+    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1..0". Raises BadVariables saying what is wrong."""
+    found = {}
+    for word in text.split():
+        name, _, ends = word.rpartition(":")
+        try:
+            low, high = ends.split(".." if ".." in ends else ",")
+            low, high = float(low or -math.inf), float(high or math.inf)
+        except ValueError as error:
+            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
+        if not low < high:
+            raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
+        found[name] = (low, high)
+    return found
+
+
+def parse_range(text: str) -> tuple[float, float]:
+    """Least and greatest of "2:15", or of "2" (nothing at most). Raises BadLimits saying what is wrong."""
+    least, colon, most = text.partition(":")
+    try:
+        low, high = float(least), float(most) if colon else math.inf
+    except ValueError:
+        raise BadLimits(f"{text!r}: expected the least thickness in mm, or least and greatest like 2:15") from None
+    if not 0 <= low < high:
+        raise BadLimits(f"{text!r}: expected 0 ≤ least < greatest, found {low:g} and {high:g} mm")
+    return low, high

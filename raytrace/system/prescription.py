@@ -1,0 +1,136 @@
+"""Build: a lens from plain numbers, as one types it from a book or a patent.
+
+lens([dict(radius=37.4, thickness=5.9, glass="SK4"), …], stop=5, f_number=3.5, fields=[0, 8.4, 11.9])
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import AIR, MIRROR, Glass, check_unit, constant, model_glass
+from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
+from raytrace.system.surface import Surface
+from raytrace.words import named_value
+
+
+class BadPrescription(ValueError):
+    """Numbers that do not make a lens: says which surface, what was found and what was expected."""
+
+
+def lens(
+    rows: Iterable[Mapping],
+    *,
+    stop: int,
+    fields: Sequence = (0.0,),
+    field_kind: str = "",
+    wavelengths: Sequence[float] = (0.5875618,),
+    wavelength_weights: Sequence[float] | None = None,
+    primary_wavelength: int = 1,
+    object_distance: float = math.inf,
+    name: str = "",
+    catalogs: Sequence[str] = (),
+    ray_aiming: str = "auto",
+    **aperture: float,
+) -> Lens:
+    """A lens from rows of plain numbers, surface 1 to the last before the sensor; object and image are added.
+
+    rows: mappings, or a DataFrame: radius (mm, inf is a plane) or curvature (1/mm), thickness (mm to the next vertex,
+    of the last row to the sensor), glass (a name, an index, (nd, Vd) or a Glass behind the surface; air by default,
+    "MIRROR" reflects), conic, coefficients (of r², r⁴, … in mm^(1-2j)), semi_diameter, apertures, comment; numbers may
+    be tensors that require a gradient.
+    stop: number of the stop surface, counted from 1. One aperture by name, as f_number=3.5 or
+    entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
+    fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
+    FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: its number, from 1, the first by default.
+    object_distance: mm from surface 1. Raises BadPrescription, UnknownGlass.
+    """
+    rows = rows.to_dict("records") if hasattr(rows, "to_dict") else list(rows)
+    if not rows:
+        raise BadPrescription(
+            "no rows: give one mapping for each surface, as dict(radius=50, thickness=5, glass='N-BK7')"
+        )
+    surfaces = [surface(row, number, catalogs) for number, row in enumerate(rows, 1)]
+    wavelengths = _vector(wavelengths, "wavelengths")
+    weights = torch.ones_like(wavelengths) if wavelength_weights is None else _vector(wavelength_weights, "weights")
+    kind = field_kind or ("angle" if math.isinf(float(object_distance)) else "object_height")
+    if kind not in FIELD_UNITS:
+        raise BadPrescription(f"field_kind {kind!r}: expected one of {', '.join(FIELD_UNITS)}")
+    points = field_points(fields, like=wavelengths)
+    found = Lens(
+        surfaces=(Surface(_tensor(object_distance)), *surfaces, Surface(_tensor(0.0))),
+        stop=stop,
+        aperture=_aperture(aperture),
+        fields=Fields(kind, points[0], points[1], torch.ones_like(points[0])),
+        wavelengths=wavelengths,
+        wavelength_weights=weights,
+        primary_wavelength=primary_wavelength,
+        name=name,
+        catalogs=tuple(catalogs),
+        ray_aiming=ray_aiming,
+    )
+    try:
+        check_unit(wavelengths, (surface.glass for surface in found.surfaces))
+        check(found)
+    except ValueError as error:
+        raise BadPrescription(str(error)) from error
+    return found
+
+
+def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surface:
+    """A surface of a row of plain numbers; number: its number, for errors. Raises BadPrescription, UnknownGlass."""
+    where = f"surface {number}"
+    if not isinstance(row, Mapping):
+        raise BadPrescription(
+            f"{where}: {named_value(row)}; expected a mapping, as dict(radius=50, thickness=5, glass='N-BK7')"
+        )
+    given = {key: value for key, value in row.items() if not _is_empty(value)}
+    if "thickness" not in given:
+        raise BadPrescription(f"{where}: no thickness; give mm to the next vertex, 0 where they touch")
+    plane = {"radius": math.inf, "curvature": 0.0}
+    if any(not isinstance(given.get(key), Tensor) and given.get(key) == flat for key, flat in plane.items()):
+        given = {key: value for key, value in given.items() if key not in plane}
+    given["glass"] = medium(given.get("glass", AIR), catalogs, where)
+    try:
+        return changed(Surface(_tensor(0.0)), given, where, like=_tensor(0.0))
+    except (TypeError, ValueError) as error:
+        raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
+
+
+def medium(glass: Glass | str | float | Sequence[float], catalogs: Sequence[str] = (), where: str = "") -> Glass:
+    """A glass by its name, its index, (nd, Vd) or (nd, Vd, ΔPgF); a Glass passes as it is."""
+    if isinstance(glass, Glass):
+        return glass
+    if isinstance(glass, str):
+        word = glass.strip().upper()
+        known = {"": AIR, "AIR": AIR, "MIRROR": MIRROR}
+        return known[word] if word in known else find_glass(glass.strip(), catalogs=catalogs, where=where)
+    if isinstance(glass, Sequence):
+        return model_glass(*glass)
+    return AIR if not isinstance(glass, Tensor) and float(glass) == 1 else constant(glass)
+
+
+def _aperture(given: Mapping[str, float]) -> SystemAperture:
+    names = {"f_number": "image_f_number"} | {kind: kind for kind in APERTURE_KINDS}
+    if len(given) != 1 or next(iter(given)) not in names:
+        found = ", ".join(given) or "none"
+        raise BadPrescription(f"aperture: {found} given; expected one of {', '.join(names)}, as f_number=3.5")
+    ((name, number),) = given.items()
+    return SystemAperture(names[name], _tensor(number))
+
+
+def _is_empty(value) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _tensor(value) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+
+
+def _vector(numbers, what: str) -> Tensor:
+    try:
+        return torch.as_tensor(numbers, dtype=torch.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise BadPrescription(f"{what} {numbers!r}: expected numbers") from error

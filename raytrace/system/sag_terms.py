@@ -1,0 +1,403 @@
+"""Sag terms: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
+
+    GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
+    SplineSag    the same by its coefficients c, found once
+    ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
+    FringeSag    the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
+
+Slopes and second derivatives are written out, and autograd may differentiate them further. What rays need of a
+sag_terms are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`, where the
+polynomials in x and y of `polynomials` have theirs too.
+
+
+Polynomials: sag_terms that are sums of powers of x and y, linear in their coefficients.
+
+    PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
+    IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
+    TiltSag         D = x tan_x + y tan_y
+
+The other two are made into the first (`as_polynomial`), by linear maps that autograd follows. For the compiled trace
+all three, and Zernike's polynomials, are made into powers about a centre:
+
+    PowerSag        D = h + Σ_k c_k E_k(u, v),  u = (x - x_0)/R,  v = (y - y_0)/R
+
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
+from raytrace.maths.numerics import polynomial
+from raytrace.maths.value import value
+from raytrace.maths.zernike import Order, fringe, noll, norm
+from raytrace.system.poses import cos_sin
+
+_LEAST = 4  # points along a side of a grid: a cubic
+_FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
+_BLOCK = 128  # coefficients that are found together
+
+
+@value
+class GridSag:
+    """The spline through heights (rows, columns) mm at points `pitch` mm apart, the vertex in their middle.
+
+    Row 0 lies at the smallest y, column 0 at the smallest x. The spline is cubic with continuous second derivatives;
+    at the ends the third derivative is continuous at the last point but one ("not a knot"), so that the error falls as
+    pitch⁴ up to the rim. The surface ends half a pitch beyond the outermost points: a ray that crosses farther out
+    misses it. Every meeting of rays and surface finds the coefficients of the spline anew: see `spline`.
+    """
+
+    heights: Tensor
+    pitch: Tensor
+
+
+@value
+class SplineSag:
+    """A cubic spline by its coefficients (rows + 2, columns + 2) mm, those beyond either end included; pitch: mm."""
+
+    coefficients: Tensor
+    pitch: Tensor
+
+
+@value
+class ZernikeSag:
+    """Noll's polynomials from j = 1 on: coefficients (J,) mm RMS over the disc of `radius` mm; it goes on beyond."""
+
+    coefficients: Tensor
+    radius: Tensor
+
+
+@value
+class FringeSag:
+    """The fringe polynomials from j = 1 on: coefficients (J,) mm at the rim of the disc of `radius` mm; it goes on.
+
+    centre_x, centre_y: mm, the centre of the disc.
+    """
+
+    coefficients: Tensor
+    radius: Tensor
+    centre_x: Tensor
+    centre_y: Tensor
+
+
+class Sag(NamedTuple):
+    """D (...) mm with its slopes and second derivatives (...); those above the highest asked for are 0."""
+
+    z: Tensor
+    x: Tensor
+    y: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+
+
+def spline(grid: GridSag) -> SplineSag:
+    """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
+
+    Raises ValueError for a grid of fewer than 4 × 4 heights.
+    """
+    heights = grid.heights.double()
+    rows, columns = heights.shape
+    if min(rows, columns) < _LEAST:
+        raise ValueError(f"{rows} × {columns} heights: a cubic spline needs at least {_LEAST} × {_LEAST}")
+    return SplineSag(_spline_coefficients(_spline_coefficients(heights).T).T, grid.pitch.double())
+
+
+def spline_covers(numbers: Sequence[Tensor], x: Tensor, y: Tensor) -> Tensor:
+    """Whether points (...) mm lie on the grid."""
+    c, pitch = numbers
+    half_y, half_x = (0.5 * (count - 2) * pitch for count in c.shape)
+    return (x.abs() <= half_x) & (y.abs() <= half_y)
+
+
+def spline_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| over the grid: the weights of a spline are positive and sum to 1."""
+    return numbers[0].abs().max()
+
+
+def zernike_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| over the disc."""
+    c = numbers[0]
+    norms = c.new_tensor([norm(*noll(j)) for j in range(1, len(c) + 1)])
+    return (norms * c.abs()).sum()
+
+
+def fringe_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| over the disc."""
+    return numbers[0].abs().sum()
+
+
+def _spline_coefficients(heights: Tensor) -> Tensor:
+    """Coefficients (n + 2, ...) along the first axis of heights (n, ...); each feels only its surroundings."""
+    count = len(heights)
+    matrix = _prefilter(count).to(heights)
+    parts = []
+    for first in range(0, count + 2, _BLOCK):
+        near = slice(max(first - _FELT, 0), first + _BLOCK + _FELT)
+        parts.append(matrix[first : first + _BLOCK, near] @ heights[near])
+    return torch.cat(parts)
+
+
+@functools.lru_cache(maxsize=8)
+def _prefilter(count: int) -> Tensor:
+    """Matrix (n + 2, n) from heights at n points to the coefficients of their spline, c[k] at the point k - 1.
+
+    (c[k-1] + 4 c[k] + c[k+1])/6 = h,   the fourth differences of the first five and the last five c are 0
+    """
+    system = torch.zeros((count + 2, count + 2), dtype=torch.float64)
+    for k in range(count):
+        system[k + 1, k : k + 3] = torch.tensor([1 / 6, 4 / 6, 1 / 6], dtype=torch.float64)
+    system[0, :5] = system[-1, -5:] = torch.tensor([1.0, -4.0, 6.0, -4.0, 1.0], dtype=torch.float64)
+    return torch.linalg.inv(system)[:, 1:-1].contiguous()
+
+
+def spline_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The spline at points (...) mm; beyond its edge with the height there."""
+    x, y = torch.broadcast_tensors(x, y)
+    c, pitch = (number.to(x.dtype) for number in numbers)
+    row, weights_y = _weights(y / pitch, c.shape[0] - 2, highest)
+    column, weights_x = _weights(x / pitch, c.shape[1] - 2, highest)
+    lines = [[c[row + a, column + b] for b in range(4)] for a in range(4)]
+
+    def term(along_x: int, along_y: int) -> Tensor:
+        if along_x + along_y > highest:
+            return torch.zeros_like(x)
+        sums = [_combined(weights_x[along_x], line) for line in lines]
+        return _combined(weights_y[along_y], sums) / pitch ** (along_x + along_y)
+
+    return Sag(*(term(*orders) for orders in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))))
+
+
+def _weights(place: Tensor, count: int, highest: int) -> tuple[Tensor, list[Sequence[Tensor]]]:
+    """First of the four coefficients (...) that a point feels, and their weights with `highest` derivatives by place.
+
+    place: (...) in pitches from the middle; beyond the edge it is held there.
+    """
+    last = 0.5 * count
+    held = place.clamp(-last, last)
+    inside = (place.detach().abs() <= last).to(place.dtype)
+    place = held + 0.5 * (count - 1)
+    cell = place.detach().floor().clamp(0, count - 2)
+    f = place - cell
+    g = 1 - f
+    weights = [(g**3 / 6, (f**2 * (3 * f - 6) + 4) / 6, (g**2 * (3 * g - 6) + 4) / 6, f**3 / 6)]
+    if highest > 0:
+        slopes = (-0.5 * g**2, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f**2)
+        weights.append([inside * w for w in slopes])
+    if highest > 1:
+        weights.append([inside * w for w in (g, 3 * f - 2, 3 * g - 2, f)])
+    return cell.long(), weights
+
+
+def _combined(weights: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
+    """Σ w v, written out: the order of a reduction would depend on the shape of the batch."""
+    (w, *others), (v, *rest) = weights, values
+    total = w * v
+    for w, v in zip(others, rest, strict=True):
+        total = torch.addcmul(total, w, v)
+    return total
+
+
+def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """Σ_j c_j Z_j of Noll's terms at points (...) mm."""
+    c, radius = (number.to(x.dtype) for number in numbers)
+    orders = [noll(j) for j in range(1, len(c) + 1)]
+    terms = [(order, a * norm(*order)) for order, a in zip(orders, c.unbind(0), strict=True)]
+    return _summed(terms, radius, x, y, highest)
+
+
+def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The same of the fringe terms, which are 1 at the rim."""
+    c, radius, centre_x, centre_y = (number.to(x.dtype) for number in numbers)
+    terms = [(fringe(j), a) for j, a in enumerate(c.unbind(0), 1)]
+    return _summed(terms, radius, x - centre_x, y - centre_y, highest)
+
+
+def _summed(terms: Sequence[tuple[Order, Tensor]], radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+    """Σ_m (Σ_k c_mk P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
+    x, y = torch.broadcast_tensors(x / radius, y / radius)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    harmonics, radial = _harmonics([order for order, _ in terms], x, y), _radial(terms, 2 * (x * x + y * y) - 1)
+    z, zx, zy, zxx, zxy, zyy = (zero,) * 6
+    for m, (p, dp, d2p) in radial.items():
+        h, hx, hy, hxx, hxy = (one, zero, zero, zero, zero) if m == 0 else harmonics[m]
+        z = z + p * h
+        if highest > 0:
+            zx = zx + 4 * x * dp * h + p * hx
+            zy = zy + 4 * y * dp * h + p * hy
+        if highest > 1:
+            both = 4 * dp * h
+            zxx = zxx + both + 16 * x * x * d2p * h + 8 * x * dp * hx + p * hxx
+            zxy = zxy + 16 * x * y * d2p * h + 4 * dp * (x * hy + y * hx) + p * hxy
+            zyy = zyy + both + 16 * y * y * d2p * h + 8 * y * dp * hy - p * hxx
+    return Sag(z, zx / radius, zy / radius, *(s / radius**2 for s in (zxx, zxy, zyy)))
+
+
+def _harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]:
+    """H, H_x, H_y, H_xx, H_xy of m > 0, Re (x + iy)^m, and of -m, Im (x + iy)^m."""
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    powers = [(one, zero)]
+    found = {}
+    for m in range(1, max((abs(m) for _, m in orders), default=0) + 1):
+        re, im = powers[-1]
+        powers.append((re * x - im * y, re * y + im * x))
+        below = powers[m - 2] if m > 1 else (zero, zero)
+        second = m * (m - 1)
+        found[m] = powers[m][0], m * re, -m * im, second * below[0], -second * below[1]
+        found[-m] = powers[m][1], m * im, m * re, second * below[1], second * below[0]
+    return found
+
+
+def _radial(terms: Sequence[tuple[Order, Tensor]], t: Tensor) -> dict[int, list[Tensor]]:
+    """Σ_k c N P_k^(0,|m|)(t) with two derivatives by t, for every signed m of the Noll terms 1 … J.
+
+    P_i = (α t + β) P_{i-1} - γ P_{i-2} (DLMF 18.9.2), and the same derived once and twice.
+    """
+    known: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    sums: dict[int, list[Tensor]] = {}
+    for (n, m), coefficient in terms:
+        size, k = abs(m), (n - abs(m)) // 2
+        _extend(known.setdefault(size, []), size, k, t)
+        total = sums.setdefault(m, [torch.zeros_like(t)] * 3)
+        sums[m] = [torch.add(s, coefficient * p) for s, p in zip(total, known[size][k], strict=True)]
+    return sums
+
+
+def _extend(found: list[tuple[Tensor, Tensor, Tensor]], m: int, k: int, t: Tensor) -> None:
+    zero = torch.zeros_like(t)
+    for i in range(len(found), k + 1):
+        if i == 0:
+            found.append((torch.ones_like(t), zero, zero))
+        elif i == 1:
+            found.append((0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), zero))
+        else:
+            a = 2 * i + m
+            below = 2 * i * (i + m) * (a - 2)
+            alpha, beta = (a - 1) * a * (a - 2) / below, -(a - 1) * m * m / below
+            gamma = 2 * (i - 1) * (i + m - 1) * a / below
+            (p, dp, d2p), (q, dq, d2q) = found[-1], found[-2]
+            slope = alpha * t + beta
+            found.append(
+                (
+                    slope * p - gamma * q,
+                    slope * dp + alpha * p - gamma * dq,
+                    slope * d2p + 2 * alpha * dp - gamma * d2q,
+                )
+            )
+
+
+@value
+class PolynomialSag:
+    """Powers of x/R and y/R by coefficients (J,) mm: x, y, x², xy, y², x³, x²y, …; radius: R mm."""
+
+    coefficients: Tensor
+    radius: Tensor
+
+
+@value
+class IrregularSag:
+    """Errors of making by their height in mm at `radius` mm: spherical aberration, astigmatism and coma.
+
+    angle: degrees, by which astigmatism and coma are turned from y.
+    """
+
+    spherical: Tensor
+    astigmatism: Tensor
+    coma: Tensor
+    angle: Tensor
+    radius: Tensor
+
+
+@value
+class TiltSag:
+    """A plane that leans: its slopes along x and y, tangents."""
+
+    tan_x: Tensor
+    tan_y: Tensor
+
+
+@value
+class PowerSag:
+    """A height and powers about a centre, all in mm; coefficients: (J,) of u, v, u², uv, v², …"""
+
+    centre_x: Tensor
+    centre_y: Tensor
+    radius: Tensor
+    height: Tensor
+    coefficients: Tensor
+
+
+def as_polynomial(sag_terms: IrregularSag | TiltSag) -> PolynomialSag:
+    """The same as a sum of powers."""
+    if isinstance(sag_terms, TiltSag):
+        return PolynomialSag(torch.stack([sag_terms.tan_x, sag_terms.tan_y]), torch.ones_like(sag_terms.tan_x))
+    cosine, sine = cos_sin(sag_terms.angle)
+    zero, across = torch.zeros_like(sag_terms.coma), -sine * sag_terms.coma
+    along, s = cosine * sag_terms.coma, sag_terms.spherical
+    bent = [a * sag_terms.astigmatism for a in (sine * sine, -2 * sine * cosine, cosine * cosine)]
+    return PolynomialSag(
+        torch.stack([zero, zero, *bent, across, along, across, along, s, zero, 2 * s, zero, s]), sag_terms.radius
+    )
+
+
+def polynomial_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The sum of powers at points (...) mm."""
+    c, radius = (number.to(x.dtype) for number in numbers)
+    z, *slopes = polynomial_xy(c, x / radius, y / radius, highest)
+    return Sag(z, *(slope / radius for slope in slopes[:2]), *(bend / radius**2 for bend in slopes[2:]))
+
+
+def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| up to a radius (...) mm: Σ |c| (r/R)^degree."""
+    c, unit = numbers
+    degrees = [sum(power) for power in powers(len(c))]
+    sums = [c.new_zeros(())] * (max(degrees, default=0) + 1)
+    for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
+        sums[degree] = sums[degree] + a
+    return polynomial(torch.stack(sums), radius / unit.abs())
+
+
+def powers_of_polynomial(sag_terms: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
+    """The same as powers about the vertex."""
+    given = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
+    zero = torch.zeros_like(given.radius)
+    return PowerSag(zero, zero, given.radius, zero, given.coefficients)
+
+
+def powers_of_fringe(sag_terms: FringeSag) -> PowerSag:
+    """The same as powers about its centre."""
+    orders = [fringe(j) for j in range(1, len(sag_terms.coefficients) + 1)]
+    height, powers_ = _powers_of(orders, sag_terms.coefficients)
+    return PowerSag(sag_terms.centre_x, sag_terms.centre_y, sag_terms.radius, height, powers_)
+
+
+def powers_of_zernike(sag_terms: ZernikeSag) -> PowerSag:
+    """The same as powers about the vertex."""
+    orders = [noll(j) for j in range(1, len(sag_terms.coefficients) + 1)]
+    norms = sag_terms.coefficients.new_tensor([norm(*order) for order in orders])
+    height, powers_ = _powers_of(orders, norms * sag_terms.coefficients)
+    zero = torch.zeros_like(sag_terms.radius)
+    return PowerSag(zero, zero, sag_terms.radius, height, powers_)
+
+
+def _powers_of(orders: Sequence[Order], coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """The height and the coefficients of powers of a sum of Zernike's terms, 1 at the rim."""
+    matrix, constants = (coefficients.new_tensor(part) for part in zernike_to_powers(tuple(orders)))
+    return (constants * coefficients).sum(), matrix @ coefficients
+
+
+def power_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The height and the powers at points (...) mm."""
+    centre_x, centre_y, radius, height, coefficients = (number.to(x.dtype) for number in numbers)
+    found = polynomial_sag((coefficients, radius), x - centre_x, y - centre_y, highest)
+    return found._replace(z=found.z + height)
+
+
+def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| up to a radius (...) mm of the vertex."""
+    centre_x, centre_y, unit, height, coefficients = numbers
+    return height.abs() + polynomial_size((coefficients, unit), radius + centre_x.abs() + centre_y.abs())

@@ -1,0 +1,298 @@
+"""Ray aiming: rays through given points of the stop, chief rays to given image points, and whether the axis bends.
+
+Roots of traced residuals are found by Newton's method from the paraxial rays; where it fails, by continuation from the
+axis to the full field. Each root is independent of the others of a batch.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import islice
+
+import torch
+from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
+
+from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.maths.value import detached
+from raytrace.system.lens import Lens
+from raytrace.system.phases import kind_of
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface, is_posed, is_round
+from raytrace.tracing.trace import lens_steps, media, steps
+from raytrace.words import named
+
+_STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
+_STEPS = 8  # Newton steps at each stage
+_TOLERANCE = 1e-7  # of the radius of the stop and of the height of the image, in float64
+_FEW = 1000  # rays that cost less to trace in copies than to differentiate more than once
+_LOST = 1e-2  # a root missed by more at one stage is abandoned
+_CLOSE = 1e-3  # of the tolerance: the last, attached step then ends at rounding
+
+_length = partial(torch.linalg.vector_norm, dim=0)
+
+#: Residuals (n, ...) of unknowns (n, ...) at a fraction of the field, and whether the rays reach the target surface.
+Residual = Callable[[Tensor, float], tuple[Tensor, Tensor]]
+
+
+def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
+    (stop,), arrives = _crossings(lens, rays, wavelength, (lens.stop,))
+    return stop, arrives
+
+
+def aim_at_stop(
+    lens: Lens,
+    through: Callable[[Tensor, float], Rays],
+    pupil: Tensor,
+    target: Tensor,
+    wavelength: Tensor,
+    radius: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Entrance pupil points (2, ...) whose rays pass the stop at `target` times `radius`; and whether found (...).
+
+    pupil: (2, ...), initial points; radius: mm, negative where the entrance pupil is an inverted image of the stop;
+    through(pupil, fraction): rays of a fraction of the field.
+    """
+    # The radius may have an axis of object distances that pupil points lack.
+    pupil, target = (with_batch_axes(points, radius.dim()) for points in (pupil, target))
+
+    def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        position, arrives = at_stop(lens, through(aim, fraction), wavelength)
+        return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
+
+    aim, found = _root(missed, pupil, origin=lambda start: start)
+    return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
+
+
+def aim_at_middle(
+    lens: Lens, through: Callable[[Tensor], Rays], start: Tensor, wavelength: Tensor, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points (2, ...) whose rays pass the centre of the stop, else the start; and whether found (...).
+
+    through(points): rays; size: () mm, the scale of the residual. Second derivatives are exact too.
+    """
+
+    def missed(point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        position, arrives = at_stop(lens, through(point), wavelength)
+        return position / size, arrives
+
+    root, found = _root(missed, start, origin=lambda start: start)
+    root = root - _solve(_error_and_jacobian(missed, root.detach(), 1.0)[1], missed(root, 1.0)[0])
+    return torch.where(found, root, start), found
+
+
+def aim_at_image(
+    lens: Lens, through: Callable[[Tensor, Tensor], Rays], height: Tensor, estimate: Tensor, radius: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Fields (2, ...) whose chief rays, at the primary wavelength, meet the image at `height`; and whether found (...).
+
+    A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), initial field;
+    radius: of the stop, whose centre the chief ray passes, or None if it passes that of the paraxial entrance pupil.
+    """
+    wavelength = lens.primary
+    size = torch.linalg.vector_norm(height.detach(), dim=0)
+    size = torch.where(size > 0, size, 1.0)
+
+    def missed(unknown: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        pupil = torch.zeros_like(unknown[:2]) if radius is None else unknown[2:]
+        rays = through(unknown[:2], pupil)
+        (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
+        off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
+        return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
+
+    start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
+    unknown, found = _root(missed, start, origin=torch.zeros_like)
+    return torch.where(found, unknown[:2], 0.0), found
+
+
+def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
+    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
+    points, arrives, last = [], rays.valid, numbers[-1]
+    indices = media(lens, wavelength)[: last + 1]
+    surfaces = lens.surfaces[1 : last + 1]
+    for number, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
+        arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
+        points += [crossing.rays.position[:2]] * numbers.count(number)
+    return points, arrives
+
+
+def _root(residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Unknowns (n, ...) where the residuals (n, ...) of the full field vanish, and whether found (...).
+
+    The last step is attached: first derivatives are exact. origin: from the initial point to the root on axis.
+    """
+    with torch.no_grad():
+        batch = broadcast_shape(residual(start, 1.0)[0].shape[1:], start.shape[1:])
+    start = torch.stack([part.expand(batch) for part in start.detach()])
+    tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
+    # Roots not found are evaluated on the axis, where every derivative is finite.
+    root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
+    for stages in _STAGES:
+        followed = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
+        error, rows, arrives = _error_and_jacobian(residual, followed, 1.0)
+        close = (error.abs() <= tolerance).all(0) & arrives
+        root, found = torch.where(close & ~found, followed, root), found | close
+        if bool(found.all()):
+            break
+    if stages != _STAGES[0]:
+        rows = _error_and_jacobian(residual, root, 1.0)[1]
+    return root - _solve(rows, residual(root, 1.0)[0]), found
+
+
+def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float) -> Tensor:
+    """The roots at the full field, by continuation from the axis in `stages` steps.
+
+    Each stage starts from the extrapolation of the two before it or, if better, from the last root. A Newton step that
+    loses the ray or increases the residual is shortened and rejected; a root within `close` is final.
+    """
+    before, root = origin, origin + (start - origin) / stages
+    sought = torch.ones_like(root[0], dtype=torch.bool)
+    for stage in range(1, stages + 1):
+        fraction = stage / stages
+        error, rows, arrives = _error_and_jacobian(residual, root, fraction)
+        size, step = torch.where(arrives, _length(error), torch.inf), _solve(rows, error)
+        if stage > 1:
+            ahead = 2 * root - before
+            error, rows, arrives = _error_and_jacobian(residual, ahead, fraction)
+            nearer = arrives & (_length(error) < size)
+            before, root = root, torch.where(nearer, ahead, root)
+            size = torch.where(nearer, _length(error), size)
+            step = torch.where(nearer, _solve(rows, error), step)
+        share = torch.ones_like(size)
+        for _ in range(_STEPS):
+            moving = sought & (size > close)
+            if not bool(moving.any()):
+                break
+            error, rows, arrives = _error_and_jacobian(residual, root - share * step, fraction)
+            better = moving & arrives & (_length(error) < size)
+            root = torch.where(better, root - share * step, root)
+            size, step = (
+                torch.where(better, _length(error), size),
+                torch.where(better, _solve(rows, error), step),
+            )
+            share = torch.where(better, 1.0, share / 4)
+        sought = sought & (size <= _LOST)
+        if not bool(sought.any()):
+            break
+    return root
+
+
+def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> tuple[Tensor, list[Tensor], Tensor]:
+    """r(p) (n, ...), the rows ∂r_i/∂p, each (n, ...), of each entry's own Jacobian, and whether its ray arrives.
+
+    Outside the graph. A few rays are traced in n copies, one for every row: one backward pass costs less than n.
+    """
+    count = len(point)
+    if point[0].numel() <= _FEW:
+        copies = point[:, None].expand(count, count, *point.shape[1:])
+        value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), copies)
+        units = torch.eye(count, dtype=value.dtype, device=value.device)
+        jacobian = pull(units.reshape(count, count, *(1,) * (point.dim() - 1)).expand_as(value).contiguous())
+        return value[:, 0], list(jacobian.unbind(1)), arrives[0]
+    value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), point)
+    rows = []
+    for i in range(count):
+        unit = torch.zeros_like(value)
+        unit[i] = 1.0
+        rows.append(pull(unit))
+    return value, rows, arrives
+
+
+def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
+    """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph.
+
+    `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
+    """
+    if torch._C._are_functorch_transforms_active():
+        value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
+        return value.detach(), lambda v: pull(v)[0].detach(), arrives
+    with torch.enable_grad():
+        point = point.detach().requires_grad_()
+        value, arrives = function(point)
+    return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], arrives
+
+
+def _solve(rows: list[Tensor], error: Tensor) -> Tensor:
+    """Solve the n × n systems, by Cramer's rule if n is 2; 0 where singular."""
+    if len(rows) == 2:
+        of_x, of_y = rows
+        determinant = of_x[0] * of_y[1] - of_x[1] * of_y[0]
+        return torch.stack(
+            [
+                safe_divide(error[0] * of_y[1] - of_x[1] * error[1], determinant),
+                safe_divide(of_x[0] * error[1] - error[0] * of_y[0], determinant),
+            ]
+        )
+    matrix, error = torch.stack([row.movedim(0, -1) for row in rows], -2), error.movedim(0, -1)[..., None]
+    trial, singular = torch.linalg.solve_ex(matrix, error.detach())
+    usable = ((singular == 0) & torch.isfinite(trial).all(-1).all(-1))[..., None, None]
+    safe = torch.where(usable, matrix, torch.eye(len(rows), dtype=matrix.dtype, device=matrix.device))
+    return torch.linalg.solve_ex(safe, torch.where(usable, error, 0.0))[0][..., 0].movedim(-1, 0)
+
+
+_STRAIGHT = 1e-9  # mm and direction cosines: smaller deviations of an axial ray are ignored
+
+
+def is_round_about_axis(lens: Lens) -> bool:
+    """Whether the lens is rotationally symmetric, by the kinds and poses of its surfaces, whatever their values."""
+    return all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
+
+
+def is_bent(lens: Lens) -> bool:
+    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
+    return _bends(lens, lens.surfaces)
+
+
+def aiming_of(lens: Lens) -> str:
+    """The ray aiming of a lens, "off", "paraxial" or "real".
+
+    "auto" resolves to "real" if a surface in front of the stop bends the axis, or the stop is tilted or decentred (the
+    straightened entrance pupil is then no image of the stop), and else to "off".
+    """
+    if lens.ray_aiming != "auto":
+        return lens.ray_aiming
+    stop = lens.surfaces[lens.stop]
+    moved = stop.is_break or stop.before is not None
+    return "real" if moved or _bends(lens, lens.surfaces[: lens.stop]) else "off"
+
+
+def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
+    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    if any(map(is_posed, surfaces)):
+        return True
+    if all(map(is_round, surfaces)):
+        return False
+    if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
+        # Values are hidden inside a transform.
+        phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
+        return any(not kind.is_round and not kind.slopes for kind in phases)
+    with torch.no_grad():
+        lens = detached(lens)
+        axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
+        off = [0 * axis[:2]]
+        for crossing in islice(lens_steps(lens, Rays(0 * axis, axis, axis[2] > 0), lens.primary), len(surfaces) - 1):
+            off += [crossing.rays.position[:2], crossing.rays.direction[:2]]
+        return bool((torch.stack(off).abs() > _STRAIGHT).any())
+
+
+class Bent(ValueError):
+    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
+
+
+def need_axis(lens: Lens, what: str, instead: str = "") -> None:
+    """Raise Bent for a lens whose axis bends. what: the quantity; instead: an alternative for the message."""
+    if not is_bent(lens):
+        return
+    posed = [k for k, surface in enumerate(lens.surfaces) if is_posed(surface)]
+    other = [k for k, surface in enumerate(lens.surfaces) if not is_round(surface)]
+    reason = "it bends"
+    if posed:
+        surface = lens.surfaces[posed[0]]
+        reason = f"surface {posed[0]} is " + ("a coordinate break" if surface.is_break else "tilted or decentred")
+    elif other:
+        surface = lens.surfaces[other[0]]
+        part = surface.sag_terms if surface.phase is None else surface.phase
+        reason = f"surface {other[0]} ({named(part)}) takes light off it"
+    message = f"{what} needs one straight axis, but {reason}"
+    raise Bent(f"{message}; {instead}" if instead else message)

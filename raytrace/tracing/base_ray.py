@@ -1,0 +1,374 @@
+"""Base ray: the axial chief ray of a lens whose axes bend, and first-order data about it, in both sections.
+
+The ray of the axial object point through the middle of the stop is traced at the primary wavelength; rays beside it
+are its derivatives, by forward differentiation of the trace. Of four of them, moved and turned in the section of the
+local x and in that of the local y of the start, every first-order figure is made, as of (y, n u) in a straight lens.
+First derivatives of the figures are exact; second ones lack the third derivatives of where rays cross a surface, and
+were off by 0.3 % where that was measured.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.utils import _pytree as pytree
+
+from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit
+from raytrace.maths.value import value
+from raytrace.system.lens import Lens
+from raytrace.system.poses import Gap, Pose, direction_in, point_in
+from raytrace.system.rays import Rays, start
+from raytrace.system.surface import Surface, gap_behind
+from raytrace.tracing.aiming import aim_at_middle, is_bent
+from raytrace.tracing.paraxial import cone_angle, first_order, object_distance_of
+from raytrace.tracing.trace import media, steps
+
+_PARALLEL = 1e-15  # rad per mm, and other quantities that are 0 but for rounding
+
+
+@value
+class BaseRay:
+    """The axial chief ray on the image, and first-order data about it at one wavelength; mm.
+
+    valid: (...) whether it gets there. position, direction: (3, ...) on the image and in front of it, in its frame.
+    Entries (2, ...) are those of the tangential section, of rays turned about the local x of the start, and of the
+    sagittal one across it. Distances count along the base ray, positive the way light travels.
+
+    focal_length: of a parallel beam, -y/u′ with u′ behind the lens, in its medium: positive where it converges; its
+        sign follows the section through mirrors and turned axes.
+    way_to_image: (...) from where the ray meets the last surface before the image that is no coordinate break.
+    back_focal_distance, image_distance: from there to where rays beside it, from infinity or from the object, come
+        closest to it.
+    entrance_pupil_position: from the plane of the vertex of surface 1 to the image of the stop in object space.
+    exit_pupil_position: from the image surface to that in image space; diameters > 0.
+    paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
+    magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
+    A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
+    """
+
+    valid: Tensor
+    position: Tensor
+    direction: Tensor
+    way_to_image: Tensor
+    focal_length: Tensor
+    back_focal_distance: Tensor
+    entrance_pupil_position: Tensor
+    entrance_pupil_diameter: Tensor
+    exit_pupil_position: Tensor
+    exit_pupil_diameter: Tensor
+    image_distance: Tensor
+    paraxial_working_f_number: Tensor
+    magnification: Tensor
+
+
+@value
+class Entrance:
+    """Where rays go in that fill the stop, to first order about the base ray.
+
+    position: (...) mm, of the plane that they are aimed at, along z from the vertex of surface 1; centre: (2, ...) mm,
+    the base ray's point of it; spread: (2, 2, ...) mm, from pupil points to those of the plane; turn: (2, 2, ...), from
+    pupil points to those of the stop that they stand for: turned, or mirrored, as the stop's image is; radius: (...) mm
+    of the stop.
+    """
+
+    position: Tensor
+    centre: Tensor
+    spread: Tensor
+    turn: Tensor
+    radius: Tensor
+
+
+def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
+    """The axial chief ray and first-order data about it; wavelength: (...) µm, the primary one by default.
+
+    `first_order` has the straightened figures, as OpticStudio prints them; the two agree in a lens with an axis.
+    First derivatives by every number of the lens are exact; second ones lack the third derivatives of the trace.
+    """
+    wavelength = lens.primary if wavelength is None else wavelength
+    near = _near(lens, wavelength)
+    one, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
+    parallel = near.behind(one, 0 * one)
+    fan = near.behind(one, kappa * one)
+    chief = near.behind(-near.E, one)
+    # Moved at the start so that the ray meets the rim of the stop, from the axial object point.
+    move = near.radius[..., None, None] * _inverse(near.A + kappa * near.B) @ near.Q
+    rim = near.behind(move, kappa * move)
+    exit_pupil, image = _closest(chief), _closest(fan)
+    across = _at(rim, exit_pupil)
+    return BaseRay(
+        valid=near.valid,
+        position=near.position,
+        direction=near.direction,
+        way_to_image=near.last,
+        focal_length=_first(_sign(near.carried, -parallel[1]) * _over(1.0, _length(parallel[1]))),
+        back_focal_distance=_first(_closest(parallel) + near.last[..., None]),
+        entrance_pupil_position=_first(torch.diagonal(near.E, dim1=-2, dim2=-1)),
+        entrance_pupil_diameter=_first(2 * near.radius[..., None] * _length(near.H_inverse)),
+        exit_pupil_position=_first(exit_pupil),
+        exit_pupil_diameter=_first(2 * _length(across)),
+        image_distance=_first(image + near.last[..., None]),
+        paraxial_working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
+        magnification=_first(_magnification(near, image)),
+    )
+
+
+def _magnification(near: "_Near", image: Tensor) -> Tensor:
+    """Of chief rays of object points 1 mm off the base ray, (..., 2)."""
+    kappa = near.vergence[..., None, None]
+    if not bool((kappa != 0).any()):
+        return torch.zeros_like(image)
+    one = torch.eye(2, dtype=near.X.dtype, device=near.X.device)
+    turn = -kappa * _inverse(one + kappa * near.E)
+    height = _at(near.behind(-near.E @ turn, turn), image)
+    return _sign(near.carried, height) * _length(height)
+
+
+def entrance_of(lens: Lens) -> Entrance:
+    """Where rays of the primary wavelength go in that fill the stop of a bent lens."""
+    near = _near(lens, lens.primary)
+    kappa = near.vergence
+    first, second = torch.diagonal(near.E, dim1=-2, dim2=-1).unbind(-1)
+    # The plane halfway between the images of the stop in both sections, if those are one; else that of the vertex.
+    middle = 0.5 * (first + second)
+    middle = torch.where((kappa * (first - second)).abs() < 0.5 * (1 + kappa * middle).abs(), middle, 0.0)
+    wide = (near.radius * (1 + kappa * middle))[..., None, None]
+    spread = wide * _inverse(near.A + kappa[..., None, None] * near.B) @ near.Q
+    spread, turn = (torch.movedim(m.flip(-1, -2), (-2, -1), (0, 1)) for m in (spread, near.Q))
+    return Entrance(middle * near.begun[2], near.aim + middle * near.begun[:2], spread, turn, near.radius)
+
+
+class _Near(NamedTuple):
+    """The base ray, and the derivatives of the rays near it by how they start: matrices (..., rows, columns).
+
+    Columns are tangential and sagittal: of rays moved across the base ray along the local y and x of the start, mm, or
+    turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop; X: (..., 3, 4)
+    from both to the way across the base ray where it meets the image, D: to the direction in front of it.
+    E: a ray turned by u meets the middle of the stop if it is moved by -E u. Q, H_inverse: A = Q H (polar).
+    aim: (2, ...) mm, where the base ray meets the plane of the vertex of surface 1, begun: (3, ...) its
+    direction there; position, direction: (3, ...), valid: (...) of it on the image; last: (...) mm, its way there from
+    the last real surface before; carried: (..., 3, 2) the local y and x of the start as mirrors and turned axes leave
+    them.
+    vergence: (...) 1/mm, of the object from that plane along the ray; radius: (...) mm of the stop; index: (...) n′.
+    """
+
+    A: Tensor
+    B: Tensor
+    X: Tensor
+    D: Tensor
+    E: Tensor
+    Q: Tensor
+    H_inverse: Tensor
+    aim: Tensor
+    begun: Tensor
+    position: Tensor
+    direction: Tensor
+    valid: Tensor
+    last: Tensor
+    carried: Tensor
+    vergence: Tensor
+    radius: Tensor
+    index: Tensor
+
+    def behind(self, move: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+        """X and D (..., 3, k) of k rays that are moved and turned at the start, (..., 2, k) each."""
+        return tuple(m[..., :2] @ move + m[..., 2:] @ turn for m in (self.X, self.D))
+
+
+def _near(lens: Lens, wavelength: Tensor) -> _Near:
+    distance = object_distance_of(lens)
+    aim = _aim(lens, wavelength)
+    begun = _begun(aim, distance)
+    indices = media(lens, wavelength)
+    indices = [*indices[:-1], indices[-2]]  # what bends rays in the image does not tell where they came from
+    axes, image = _axes(begun), len(lens.surfaces) - 1
+    real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
+
+    def traced(change: Tensor):
+        t, s, turn_t, turn_s = change
+        up, right = (axis[:, None] for axis in axes)
+        position = torch.stack([*aim, torch.zeros_like(aim[0])])[:, None]
+        rays = start(position + t * up + s * right, begun[:, None] + turn_t * up + turn_s * right)
+        arrives, ways = rays.valid, []
+        for crossing in steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength):
+            arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
+            ways.append(crossing.rays)
+        stop, last, image = ways[lens.stop - 1], ways[real - 1], ways[-1]
+        moving = stop.position[:2].flip(0), image.position, image.direction
+        return moving, (arrives, last.position, [way.direction for way in ways])
+
+    batch = broadcast_shape(aim.shape[1:], distance.shape, wavelength.shape)
+    one = torch.eye(4, dtype=aim.dtype, device=aim.device).reshape(4, 4, *(1,) * len(batch)).expand(4, 4, *batch)
+    (_, position, direction), (to_stop, moved, D), (valid, last, ways) = _pushed(traced, one)
+    X = moved - dot(moved, direction) * direction
+    X, D, to_stop = (torch.movedim(part, (0, 1), (-2, -1)) for part in (X, D, to_stop))
+    A, B = to_stop[..., :2], to_stop[..., 2:]
+    Q, H_inverse = _polar(A)
+    # Not 1/(distance · length), whose derivative by the length is 0 · inf for an object at infinity.
+    vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
+    position, direction, last, *ways = (part[:, 0] for part in (position, direction, last, *ways))
+    return _Near(
+        A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, begun, position, direction, valid[0],
+        last=_way_to_image(lens.surfaces[real:], last, position, direction),
+        carried=_carried(lens, begun, axes, ways),
+        vergence=vergence,
+        radius=_stop_radius(lens, H_inverse, _over(A, vergence[..., None, None])[..., 0] + B[..., 0]),
+        index=indices[-1],
+    )  # fmt: skip
+
+
+def _aim(lens: Lens, wavelength: Tensor) -> Tensor:
+    """Where the base ray meets the plane of the vertex of surface 1, (2, ...) mm: so that it passes the stop's middle.
+
+    The axis where that is straight, where chief rays are parallel to it, or where no ray finds the middle of the stop.
+    """
+    distance = object_distance_of(lens)
+    axis = distance.new_zeros(2, *broadcast_shape(distance.shape, wavelength.shape))
+    if lens.fields.telecentric or not is_bent(lens):
+        return axis
+
+    def through(aim: Tensor) -> Rays:
+        position = torch.stack([*aim, torch.zeros_like(aim[0])])
+        return start(position, _begun(aim, distance))
+
+    size = 0.5 * first_order(lens).entrance_pupil_diameter.detach()
+    size = torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
+    return aim_at_middle(lens, through, axis, wavelength, size)[0]
+
+
+def _begun(aim: Tensor, distance: Tensor) -> Tensor:
+    """Direction (3, ...) of the ray of the axial object point to the aim (2, ...) in the plane z = 0."""
+    x, y = aim / distance
+    return unit(torch.stack([x, y, torch.ones_like(x)]))
+
+
+def _axes(begun: Tensor) -> tuple[Tensor, Tensor]:
+    """Local y and x (3, ...) across a direction (3, ...)."""
+    L, M, N = begun
+    up = unit(torch.stack([-M * L, 1 - M * M, -M * N]))
+    return up, torch.linalg.cross(up, begun, dim=0)
+
+
+def _pushed(function: Callable, change: Tensor) -> tuple:
+    """f(0), its derivatives along the change, both as f's first result has them, and f's second result.
+
+    Forward differentiation, which can be differentiated again. `torch.func` only where its transforms are under way.
+    """
+    at = torch.zeros_like(change)
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        return torch.func.jvp(function, (at,), (change,), has_aux=True)
+    with forward_ad.dual_level():
+        found, beside = function(forward_ad.make_dual(at, change))
+        pairs = [forward_ad.unpack_dual(part) for part in found]
+        beside = pytree.tree_map(lambda part: forward_ad.unpack_dual(part).primal, beside)
+    values = tuple(pair.primal for pair in pairs)
+    tangents = (torch.zeros_like(pair.primal) if pair.tangent is None else pair.tangent for pair in pairs)
+    return values, tuple(tangents), beside
+
+
+def _way_to_image(surfaces: Sequence[Surface], place: Tensor, position: Tensor, direction: Tensor) -> Tensor:
+    """Way (...) in mm along the base ray from its place (3, ...) on the first of these surfaces to the image."""
+    for surface, next_one in itertools.pairwise(surfaces):
+        for pose, thickness in ((surface.after, surface.thickness), (next_one.before, None)):
+            place = place if pose is None else _told(point_in, pose, place)
+            place = place if thickness is None else torch.stack([place[0], place[1], place[2] - thickness])
+    return dot(position - place, direction)
+
+
+def _told(how: Callable, pose: Pose, vector: Tensor) -> Tensor:
+    return torch.stack(torch.broadcast_tensors(*how(pose, vector.unbind(0))))
+
+
+@torch.no_grad()
+def _carried(lens: Lens, begun: Tensor, axes: Sequence[Tensor], ways: Sequence[Tensor]) -> Tensor:
+    """The axes (..., 3, 2) across the base ray as it carries them to the image: reflected by every mirror, elsewhere
+    turned by the least angle. ways: its direction (3, ...) behind every surface."""
+    d, gap, axes = begun, None, list(axes)
+    for surface, after in zip(lens.surfaces[1:], ways, strict=True):
+        for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
+            if pose is not None:
+                d, *axes = (_told(direction_in, pose, v) for v in (d, *axes))
+        step = after - d
+        across = unit(step) if surface.is_mirror else step / (1 + dot(d, after))
+        for k, axis in enumerate(axes):
+            # A mirror: v - 2 (v·n) n; else Rodrigues' turn of v ⟂ d towards d': v - (v·d')(d + d')/(1 + d·d').
+            bent = 2 * dot(axis, across) * across if surface.is_mirror else dot(axis, after) * _mean(d, after)
+            axes[k] = axis - bent
+        d, gap = after, gap_behind(surface)
+    return torch.movedim(torch.stack(axes, 1), (0, 1), (-2, -1))
+
+
+def _mean(d: Tensor, after: Tensor) -> Tensor:
+    return (d + after) / (1 + dot(d, after))
+
+
+def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
+    """Radius (...) of the stop: that of the file, of the paraxial marginal ray where rays are aimed by it; or such that
+    the tangential rays of the object's cone, of_turn (..., 2) mm from the middle at 1 rad, meet its rim, or that its
+    tangential image is as wide as the entrance pupil."""
+    batch = H_inverse[..., 0, 0]
+    if lens.aperture.kind == "float_by_stop":
+        return lens.aperture.value + 0 * batch
+    straight = first_order(lens)
+    if lens.aperture.kind in ("object_na", "object_cone_angle"):
+        found = torch.tan(cone_angle(lens, media(lens, lens.primary)[0]))
+        found = found * _length(of_turn, -1)
+    else:
+        found = _over(0.5 * straight.entrance_pupil_diameter, _length(H_inverse)[..., 0])
+    straightened = straight.stop_height.abs() + 0 * batch
+    return torch.where(torch.isfinite(straightened), straightened, found) if lens.ray_aiming == "paraxial" else found
+
+
+def _inverse(m: Tensor) -> Tensor:
+    """Inverse of matrices (..., 2, 2); infinite where there is none."""
+    a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
+    adjugate = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
+    return _over(adjugate, (a * d - b * c)[..., None, None])
+
+
+def _polar(m: Tensor) -> tuple[Tensor, Tensor]:
+    """Q and H⁻¹ of m = Q H (..., 2, 2), Q orthogonal, held fixed, and H symmetric above 0.
+
+    Q = (m + s cof m)/|…| with s the sign of det m.
+    """
+    a, b, c, d = (part.detach() for part in (m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]))
+    side = torch.where(a * d - b * c < 0, -1.0, 1.0).to(a.dtype)
+    p, q = a + side * d, b - side * c
+    size = torch.hypot(p, q)
+    p, q = (torch.where(size > 0, part / torch.where(size > 0, size, 1.0), one) for part, one in ((p, 1.0), (q, 0.0)))
+    Q = torch.stack([torch.stack([p, q], -1), torch.stack([-side * q, side * p], -1)], -2)
+    return Q, _inverse(m) @ Q
+
+
+def _closest(ray: tuple[Tensor, Tensor]) -> Tensor:
+    """Where rays of X, D (..., 3, k) come closest to the base ray, mm from the image along it, (..., k)."""
+    X, D = ray
+    size = _length(D)
+    return torch.where(size > _PARALLEL, -_over((X * D).sum(-2), (D * D).sum(-2)), torch.inf)
+
+
+def _at(ray: tuple[Tensor, Tensor], place: Tensor) -> Tensor:
+    """Where rays of X, D (..., 3, k) are across the base ray at places (..., k) along it."""
+    return ray[0] + place[..., None, :] * ray[1]
+
+
+def _sign(carried: Tensor, vectors: Tensor) -> Tensor:
+    return torch.where((carried * vectors).sum(-2).detach() < 0, -1.0, 1.0).to(vectors.dtype)
+
+
+def _length(vectors: Tensor, axis: int = -2) -> Tensor:
+    return safe_sqrt((vectors * vectors).sum(axis))
+
+
+def _over(numerator: Tensor | float, denominator: Tensor) -> Tensor:
+    """A quotient that is infinite, without a derivative, where the denominator is 0."""
+    there = denominator.abs() > _PARALLEL
+    return torch.where(there, numerator / torch.where(there, denominator, 1.0), torch.inf)
+
+
+def _first(figures: Tensor) -> Tensor:
+    """(2, ...) of (..., 2); infinite what is not a number."""
+    found = torch.movedim(figures, -1, 0)
+    return torch.where(torch.isnan(found), torch.inf, found)

@@ -1,0 +1,52 @@
+"""The F/# of the real cone of light."""
+
+import torch
+from torch import Tensor
+
+from raytrace.system.lens import Lens
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import media
+
+
+def working_f_number(lens: Lens) -> Tensor:
+    """1/(2 n′ sin θ′) of the real marginal ray of the axial object point at the primary wavelength, ().
+
+    The ray goes through the rim of the (aimed) pupil, θ′ is its angle to the axis behind the lens: what diffraction and
+    light depend on. `FirstOrder.paraxial_working_f_number` has the slope of the paraxial ray. inf where it runs along
+    the axis, nan where it is lost. Where the axis bends θ′ is half the angle between two rays of opposite rims.
+    """
+    if is_bent(lens):
+        return _between_rims(lens)
+    rim = lens.wavelengths.new_tensor([[0.0], [1.0]])
+    wavelength = lens.primary[None]
+    rays = image_rays(lens, rim, fields=torch.zeros_like(rim), wavelengths=wavelength)
+    n_image = media(lens, wavelength)[-2]
+    L, M, _ = rays.direction[:, 0, 0, 0]
+    found = 0.5 / (n_image * torch.hypot(L, M))[0]
+    return torch.where(rays.valid[0, 0, 0], found, torch.nan)
+
+
+def axial_f_number(lens: Lens) -> Tensor:
+    """1/(2 n′ |u′|) (...) of the paraxial rays of the axial object point at the primary wavelength.
+
+    Where the axis bends, of rays beside the base ray: the geometric mean of both sections, as wide as the ellipse that
+    light fills; that of one where the other is parallel.
+    """
+    if not is_bent(lens):
+        return first_order(lens).paraxial_working_f_number
+    tangential, sagittal = base_ray(lens).paraxial_working_f_number
+    both = torch.isfinite(tangential) & torch.isfinite(sagittal)
+    mean = torch.sqrt(torch.where(both, tangential * sagittal, 1.0))
+    return torch.where(both, mean, torch.minimum(tangential, sagittal))
+
+
+def _between_rims(lens: Lens) -> Tensor:
+    rims = lens.wavelengths.new_tensor([[0.0, 0.0], [1.0, -1.0]])
+    wavelength = lens.primary[None]
+    rays = image_rays(lens, rims, fields=torch.zeros_like(rims[:, :1]), wavelengths=wavelength)
+    step = rays.direction[:, 0, 0, 0] - rays.direction[:, 0, 0, 1]
+    found = 1 / (media(lens, wavelength)[-2][0] * torch.linalg.vector_norm(step))
+    return torch.where(rays.valid.all(), found, torch.nan)

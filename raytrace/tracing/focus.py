@@ -1,0 +1,496 @@
+"""Focus: the sensor distance of the smallest spot, and the verb `focus`.
+
+Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
+square radius about each spot's own centroid is a parabola in s, and its minimum over objects, fields and wavelengths of
+weights W needs no second trace:
+
+    s = -Σ W cov(x, m) / Σ W var(m)
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from os import PathLike
+
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from raytrace.io import write_lens
+from raytrace.maths import pupil
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import Result, number, numbers
+from raytrace.maths.value import value
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_points,
+    name_of_field,
+    vector,
+    wavelengths_of,
+    with_object_distance,
+    with_sensor_distance,
+)
+from raytrace.system.poses import direction_in
+from raytrace.system.rays import Rays
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.tracing.ray_failures import LostRays, warn_of_failures
+from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
+from raytrace.words import calling_level
+
+_RINGS = 12  # of the pupil, where focus on the axis is found
+
+
+class NoImage(ValueError):
+    """An object without a real image."""
+
+
+class NoFocus(ValueError):
+    """The light of an object has no focus; the message says why and what helps."""
+
+
+class VirtualImage(UserWarning):
+    """The best sensor distance is on the side that light comes from."""
+
+
+def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:
+    """cov(x, m) in mm and var(m) of hits x and slopes m = (L, M)/N over the last axis of rays (3, ..., P).
+
+    weights: (P,) or (..., P); empty: as for `spot_of`.
+    """
+    points, slopes = _points_and_slopes(rays)
+    weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
+    weights = torch.where(rays.valid, weights, 0.0)
+    total = weights.sum(-1, keepdim=True)
+    share = safe_divide(weights, total)
+    centred = points - (share * points).sum(-1, keepdim=True)
+    tilted = slopes - (share * slopes).sum(-1, keepdim=True)
+    moments = (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
+    return where_lit(total[..., 0] != 0, *moments, empty=empty)
+
+
+def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
+    """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
+
+    rays: (3, ..., P) of `image_rays`; empty: as for `spot_of`.
+    """
+    return spot_of(rays, weights, empty=empty).mean_square_radius, *focus_moments(rays, weights)
+
+
+def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm along its own normal.
+
+    rays: (3, ..., P) on the sensor; empty: as for `spot_of`.
+    """
+    points, slopes = _points_and_slopes(rays)
+    shifts = shifts.reshape(-1, *(1,) * (points.dim() - 1))
+    moved = points[:, None] + shifts * slopes[:, None]
+    return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
+
+
+def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+    """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
+
+    pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
+    lens. empty: "nan" ignores spots without rays; without any ray, or with parallel rays, the distance is nan with
+    gradient 0. "error" raises EmptySpot for either.
+    """
+    covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
+    for rays, share in bundles(lens, pupil, **scene):
+        moments = focus_moments(rays, weights, empty=empty)
+        covariance, variance = (
+            total + torch.where(_lit(rays, weights), share * moment, 0.0).sum()
+            for total, moment in zip((covariance, variance), moments, strict=True)
+        )
+    if empty == "error" and not bool(variance > 0):
+        raise EmptySpot("no sensor distance is best: the rays are parallel, or there is only one")
+    shift = safe_divide(covariance, variance) / along_normal(lens)
+    return torch.where(variance > 0, lens.surfaces[-2].thickness - shift, torch.nan)
+
+
+def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
+    """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
+
+    Arguments as for `focus_of_rms`, whose result starts the search. Rays are traced once, to the sensor's present
+    position; those that its rim clips there stay clipped. Not differentiable. Raises EmptySpot if the rays have no
+    focus, ValueError as `focus_of_merit`.
+    """
+    with torch.no_grad():
+        start = focus_of_rms(lens, pupil, weights, **scene)
+        traced = list(bundles(lens, pupil, **scene))
+    if not bool(torch.isfinite(start)):
+        raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
+
+    def merit(sensor: Tensor) -> Tensor:
+        total = torch.zeros_like(sensor)
+        for rays, share in traced:
+            shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
+            spots = through_focus(rays, shift.reshape(1), weights)
+            x, y = torch.where(spots.valid, spots.points - spots.centroid[..., None], 0.0)
+            light = torch.where(rays.valid, weights, 0.0)
+            radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
+            total = total + (share * radius).sum()
+        return total
+
+    return focus_of_merit(merit, start).detach()
+
+
+def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+    """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
+
+    Arguments as for `focus_of_rms`, which minimises it. Spots without rays are ignored; without any ray it is nan or,
+    with empty = "error", raises EmptySpot.
+    """
+    total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
+    for rays, share in bundles(lens, pupil, **scene):
+        lit = _lit(rays, weights)
+        square = spot_of(rays, weights, empty=empty).mean_square_radius
+        total = total + torch.where(lit, share * square, 0.0).sum()
+        sum_of_shares = sum_of_shares + torch.where(lit, share, 0.0).sum()
+    return where_lit(sum_of_shares > 0, safe_sqrt(safe_divide(total, sum_of_shares)), empty=empty)[0]
+
+
+def _lit(rays: Rays, weights: Tensor) -> Tensor:
+    """Whether a ray of any weight arrives, (...)."""
+    return (rays.valid & (weights != 0)).any(-1)
+
+
+def bundles(
+    lens: Lens,
+    pupil: Tensor,
+    *,
+    object_distances: Sequence[Tensor | float] | None = None,
+    distance_weights: Sequence[float] | None = None,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    field_weights: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
+) -> Iterator[tuple[Rays, Tensor]]:
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and the weights (F, W) of their spots.
+
+    fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
+    """
+    distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
+    distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
+    for distance, distance_weight in zip(distances, distance_weights, strict=True):
+        rays = image_rays(with_object_distance(lens, distance), pupil, fields=fields, wavelengths=wavelengths)
+        share = rays.position.new_full(rays.shape[:-1], distance_weight)
+        share = share if field_weights is None else share * field_weights[:, None]
+        yield rays, share if wavelength_weights is None else share * wavelength_weights
+
+
+def best_focus(lens: Lens) -> Tensor:
+    """Sensor distance (scalar, mm) of least RMS spot on the axis, over the lens's wavelengths by their weights.
+
+    Raises EmptySpot where no ray arrives.
+    """
+    axis, weights = lens.wavelengths.new_zeros(2, 1), lens.wavelength_weights
+    return focus_of_rms(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
+
+
+def along_normal(lens: Lens) -> Tensor | float:
+    """Motion of the sensor along its own normal per mm of sensor distance: cos of the tilt of the image surface."""
+    pose = lens.surfaces[-1].before
+    if pose is None:
+        return 1.0
+    zero = torch.zeros_like(lens.surfaces[-2].thickness)
+    return direction_in(pose, [zero, zero, torch.ones_like(zero)])[2]
+
+
+def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
+    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm, inf allowed.
+
+    Where the axis bends: the mean of the images of both sections along the base ray, or the only one.
+    """
+    if not is_bent(lens):
+        return paraxial_image_distance(lens, object_distances)
+    base = base_ray(with_object_distance(lens, object_distances))
+    there = torch.isfinite(base.image_distance)
+    total, count = torch.where(there, base.image_distance, 0.0).sum(0), there.sum(0)
+    ahead = torch.where(count > 0, total / count.clamp_min(1), torch.inf) - base.way_to_image
+    return lens.surfaces[-2].thickness + ahead * base.direction[2] / along_normal(lens)
+
+
+def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
+    """`paraxial_sensor`; raises NoImage for an image that is not behind the lens."""
+    images = paraxial_sensor(lens, object_distances)
+    wrong = ~(_behind(lens, images) & torch.isfinite(images))
+    if bool(wrong.any()):
+        distance, image = (float(part[wrong][0]) for part in (object_distances.detach(), images.detach()))
+        raise NoImage(
+            f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
+            f"(paraxial image at {image:g} mm)"
+        )
+    return images
+
+
+def is_behind(lens: Lens, distance: Tensor) -> bool:
+    """Whether a sensor distance (mm) lies on the side of the last surface that the light travels to."""
+    return bool(_behind(lens, distance).all())
+
+
+def _behind(lens: Lens, distance: Tensor) -> Tensor:
+    if is_bent(lens):
+        base = base_ray(lens)
+        ahead = (distance - lens.surfaces[-2].thickness) * along_normal(lens) / base.direction[2]
+        return (base.way_to_image + ahead > 0).detach()
+    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
+    return (side * distance > 0).detach()
+
+
+def focused(lens: Lens, object_distance: float, *, on: str = "paraxial") -> Lens:
+    """The lens with an object at a distance (mm, inf allowed) and the sensor at its image on the axis.
+
+    on: "paraxial", or "rms", the least RMS spot. Raises NoImage where the image is not real.
+    """
+    lens = with_object_distance(lens, object_distance)
+    sensor = real_image_distance(lens, lens.wavelengths.new_tensor([object_distance]))
+    lens = with_sensor_distance(lens, sensor[0].detach())
+    return with_sensor_distance(lens, best_focus(lens).detach()) if on == "rms" else lens
+
+
+def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Hits (2, ...) mm and slopes (L, M)/N (2, ...), zero for lost rays."""
+    slopes = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
+    return torch.where(rays.valid, rays.position[:2], 0.0), torch.where(rays.valid, slopes, 0.0)
+
+
+def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
+    """Sensor distance (scalar, mm) that minimises a differentiable merit of it.
+
+    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
+    step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's
+    method (scipy); one Newton step attaches the implicit derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so that the result is
+    differentiable once. Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    """
+
+    def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
+        s = s if s.requires_grad else s.detach().requires_grad_()
+        return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
+
+    first, slope_at = float(start), lambda s: float(slope(start.new_tensor(s)))
+    here = slope_at(first)
+    if here != 0:
+        direction = -step if here > 0 else step
+        for doubling in range(20):
+            last = first + direction * 2**doubling
+            if slope_at(last) * here <= 0:
+                break
+        else:
+            raise ValueError(f"the merit has no minimum within {abs(last - first):g} mm of sensor distance {first:g}")
+        low, high = sorted((first, last))
+        first = scipy.optimize.brentq(slope_at, low, high, xtol=tolerance, rtol=8.9e-16)
+    s = start.new_tensor(first).requires_grad_()
+    gradient = slope(s, create_graph=True)
+    if not gradient.requires_grad:
+        return s.detach()
+    (bend,) = torch.autograd.grad(gradient, s, retain_graph=True)
+    if float(bend) <= 0:
+        return s.detach()
+    return s.detach() - (gradient - gradient.detach()) / bend.detach()
+
+
+@value
+class Focus(Result):
+    """The refocused lens, and the sensor distances by other criteria, mm.
+
+    lens, before: with the new and the old sensor distance; paraxial: (D,) of the paraxial image of every object; rms:
+    of least RMS spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their
+    weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated.
+    """
+
+    lens: Lens
+    before: Lens
+    paraxial: Tensor
+    rms: Tensor
+    object_distances: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+    distance_weights: Tensor | None
+    field_weights: Tensor | None
+    wavelength_weights: Tensor | None
+    points: Tensor
+    weights: Tensor
+    criterion: str = "rms"
+
+    FIGURE = "plotting.report.focus_report"
+
+    @property
+    def sensor_distance(self) -> Tensor:
+        """mm from the last surface before the image; differentiable in the lens, but for the criterion "mean"."""
+        return self.lens.surfaces[-2].thickness
+
+    @property
+    def is_real(self) -> bool:
+        """Whether the image is real: behind the lens."""
+        return is_behind(self.lens, self.sensor_distance)
+
+    def rms_radius(self, sensor_distance: Tensor | float | None = None) -> Tensor:
+        """Weighted RMS radius (mm) over distances, fields and wavelengths, by default at the new sensor distance."""
+        lens = self.lens if sensor_distance is None else with_sensor_distance(self.before, sensor_distance)
+        return mean_rms_radius(
+            lens,
+            self.points,
+            self.weights,
+            object_distances=self.object_distances,
+            distance_weights=self.distance_weights,
+            fields=self.fields,
+            field_weights=self.field_weights,
+            wavelengths=self.wavelengths,
+            wavelength_weights=self.wavelength_weights,
+        )
+
+    def columns(self) -> dict[str, Tensor]:
+        sensors = torch.stack([sensor for _, sensor in self._sensors()])
+        radii = torch.stack([self.rms_radius(sensor) for sensor in sensors])
+        return {"place": torch.arange(len(sensors)), "sensor_distance": sensors, "rms_radius": radii}
+
+    def words(self) -> dict:
+        return {"place": [words for words, _ in self._sensors()]}
+
+    def units(self) -> dict[str, str]:
+        return {"sensor_distance": "mm", "rms_radius": "mm"}
+
+    def document(self) -> dict:
+        alone = len(self.object_distances) == 1
+        before = self.before.surfaces[-2].thickness
+        return {
+            "object_distance": numbers(self.object_distances)[0] if alone else numbers(self.object_distances),
+            "sensor_before": number(before),
+            "sensor_paraxial": numbers(self.paraxial)[0] if alone else numbers(self.paraxial),
+            "sensor_rms": number(self.rms),
+            "sensor_after": number(self.sensor_distance),
+            "rms_before": number(self.rms_radius(before)),
+            "rms_after": number(self.rms_radius()),
+            "is_real": self.is_real,
+        }
+
+    def __str__(self) -> str:
+        data, kind = first_order(self.before), self.before.fields.kind
+        diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
+        focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
+        objects = ", ".join(_words(d) for d in self.object_distances.tolist())
+        fields = ", ".join(name_of_field(field) for field in self.fields.unbind(1))
+        colours = ", ".join(f"{w:g}" for w in self.wavelengths.tolist())
+        lines = [
+            self.before.name,
+            f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
+            f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
+            f"  object at {objects}; field {fields} {FIELD_UNITS[kind]}; {colours} µm; criterion {self.criterion}\n",
+            f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
+        ]
+        for words, sensor in self._sensors():
+            rms = number(self.rms_radius(sensor))
+            radius = "no rays" if rms is None else f"{1000 * rms:>15.4f} µm"
+            lines.append(f"  {words:<28} {float(sensor):>15.6f} mm {radius}")
+        return "\n".join(lines)
+
+    def _sensors(self) -> list[tuple[str, Tensor]]:
+        """Sensor distances with their names."""
+        several = len(self.object_distances) > 1
+        named = [f"paraxial image of {_words(d)}" if several else "paraxial" for d in self.object_distances.tolist()]
+        both = [("before", self.before.surfaces[-2].thickness), ("after", self.sensor_distance)]
+        return [*both, *zip(named, self.paraxial, strict=True), ("best RMS", self.rms)]
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the lens with its new sensor distance."""
+        write_lens(self.lens, path)
+
+
+def focus(
+    lens: Lens,
+    *,
+    object_distances: Sequence[float] | Tensor | None = None,
+    distance_weights: Sequence[float] | Tensor | None = None,
+    fields: Tensor | Sequence = (0.0,),
+    field_weights: Sequence[float] | Tensor | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | Tensor | None = None,
+    criterion: str = "rms",
+    sampling: str = "gauss",
+    rings: int | None = None,
+    points: int | None = None,
+    seed: int = 0,
+) -> Focus:
+    """The lens with its sensor at the best distance for weighted objects, fields and wavelengths.
+
+    criterion: "rms", least RMS spot radius, in closed form and differentiable; "paraxial", the paraxial image, or the
+    weighted mean of those of several objects; "mean", least mean distance from the centroid.
+    object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
+    wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
+    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
+    """
+    if criterion not in ("rms", "paraxial", "mean"):
+        raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
+    distances = vector(lens.surfaces[0].thickness if object_distances is None else object_distances, like=lens)
+    fields = field_points(fields, like=lens)
+    primary = lens.primary[None]
+    wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
+    warn_of_filling(with_object_distance(lens, distances.min()), fields)
+    like = lens.surfaces[-2].thickness
+    at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    paraxial = paraxial_sensor(lens, distances)
+    scene = {
+        "object_distances": distances,
+        "fields": fields,
+        "wavelengths": wavelengths,
+        "distance_weights": _weights(lens, distance_weights, len(distances), "`distance_weights`"),
+        "field_weights": _weights(lens, field_weights, fields.shape[1], "`field_weights`"),
+        "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), "`wavelength_weights`"),
+    }
+    if not bool(torch.isfinite(paraxial).all()):
+        raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
+    rms = focus_of_rms(lens, at, weights, **scene)
+    _check_rays(lens, at, distances, fields, wavelengths)
+    if not bool(torch.isfinite(rms)):
+        raise NoFocus("one ray, or parallel rays, have no focus; give more `rings` or `points`")
+    best = rms
+    if criterion == "mean":
+        best = focus_of_mean_radius(lens, at, weights, **scene)
+    elif criterion == "paraxial":
+        shares = scene["distance_weights"]
+        best = paraxial.mean() if shares is None else (shares * paraxial).sum() / shares.sum()
+    result = Focus(
+        with_sensor_distance(lens, best), lens, paraxial, rms, points=at, weights=weights, criterion=criterion,
+        **scene,
+    )  # fmt: skip
+    if not result.is_real:
+        message = (
+            f"the image is virtual, at {float(best):g} mm, on the side of the last surface that the light comes from"
+        )
+        warnings.warn(f"{message}: move the object further away", VirtualImage, stacklevel=calling_level())
+    return result
+
+
+def _weights(lens: Lens, weights, count: int, option: str) -> Tensor | None:
+    if weights is None:
+        return None
+    weights = vector(weights, like=lens)
+    if len(weights) != count:
+        raise ValueError(f"{option}: {len(weights)} given, expected {count}, one for each")
+    return weights
+
+
+def _check_rays(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, wavelengths: Tensor) -> None:
+    """Warn of rays that do not reach the image. Raises NoFocus if none does."""
+    arrived = []
+    for distance in distances:
+        trial = with_object_distance(lens, distance)
+        with torch.no_grad():
+            valid = image_rays(trial, points, fields=fields, wavelengths=wavelengths).valid
+        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
+        arrived.append(valid.double().mean())
+    lost = 1 - float(sum(arrived)) / len(arrived)
+    if lost == 1:
+        raise NoFocus("no ray reaches the image")
+    if lost > 0:
+        message = f"{lost:.2%} of the rays fail or are vignetted; the focus is that of the others"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
+
+
+def _words(distance: float) -> str:
+    return "infinity" if distance == float("inf") else f"{distance:g} mm"

@@ -1,0 +1,235 @@
+"""Geometry: surfaces and gaps of a lens that cannot be made.
+
+A surface whose conic closes before its semi-diameter h, |c| h √(1+k) ≥ 1; a negative gap, or surfaces that cross,
+between two surfaces that refract, reflect or diffract, along the light; glass whose edge thickness is negative.
+
+
+Frames: where the vertex of every surface stands, and how it is turned, in the axes that rays start in.
+"""
+
+import dataclasses
+import math
+import warnings
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.value import detached, value
+from raytrace.system.lens import Lens
+from raytrace.system.poses import Pose, direction_out, point_out
+from raytrace.system.shapes import KINDS
+from raytrace.system.surface import Surface, is_freeform, sag_at
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import lens_steps, media
+from raytrace.words import calling_level
+
+#: Points of the pupil whose rays are highest on a surface.
+_ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
+
+_HEIGHTS = 65  # at which two surfaces are compared
+_LEAST = 1e-6  # mm: an overlap that counts
+
+
+class Unbuildable(UserWarning):
+    """A lens that cannot be made as its numbers say."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Defect:
+    """Part of a lens that cannot be made. surface: its number; kind: reach, gap, crossing or edge; amount: mm."""
+
+    surface: int
+    kind: str
+    amount: float
+    words: str
+
+    def __str__(self) -> str:
+        return self.words
+
+    def document(self) -> dict:
+        return {"surface": self.surface, "kind": self.kind, "amount": self.amount, "words": self.words}
+
+
+@torch.no_grad()
+def defects(lens: Lens) -> tuple[Defect, ...]:
+    """Everything of a lens, in its configuration, that cannot be made."""
+    lens = detached(lens)
+    heights = _semi_diameters(lens)
+    found = [_closed(k, surface, heights[k]) for k, surface in enumerate(lens.surfaces) if k]
+    for k, end, side in _gaps(lens):
+        found += _of_gap(lens, k, end, side, heights)
+    return tuple(one for one in found if one is not None)
+
+
+def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
+    """`defects`, each with a warning Unbuildable."""
+    found = defects(lens)
+    for one in found:
+        warnings.warn(one.words, Unbuildable, stacklevel=calling_level())
+    return found
+
+
+def _semi_diameters(lens: Lens) -> list[float]:
+    """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
+    optimization_data, last = lens.optimization_data, len(lens.surfaces) - 1
+    given = range(last + 1) if optimization_data is None else optimization_data.semi_diameters
+    found = [(s.semi_diameter or math.nan) if k in given else math.nan for k, s in enumerate(lens.surfaces)]
+    if all(map(math.isfinite, found[1:last])):
+        return found
+    percent, length = (0.0, 0.0) if optimization_data is None else optimization_data.semi_diameter_margin
+    for k, reach in enumerate(_reaches(lens), 1):
+        if math.isnan(found[k]):
+            bare = k in (lens.stop, last)
+            found[k] = reach if bare else (1 + percent / 100) * reach + length
+    stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
+    return [own if math.isnan(reach) else reach for reach, own in zip(found, stored, strict=True)]
+
+
+def _reaches(lens: Lens) -> list[float]:
+    """Largest √(x² + y²) mm of the outermost rays on every surface from 1; nan where none arrives."""
+    points = lens.wavelengths.new_tensor(_ENDS, dtype=torch.float64).T
+    try:
+        rays, found = launch(lens, points, wavelengths=lens.wavelengths), []
+        for crossing in lens_steps(lens, rays, lens.wavelengths[:, None]):
+            x, y, _ = crossing.rays.position
+            reach = torch.where(crossing.rays.valid, torch.hypot(x, y), -1.0).max()
+            found.append(float(reach) if reach >= 0 else math.nan)
+    except (ValueError, RuntimeError):
+        return [math.nan] * (len(lens.surfaces) - 1)
+    return found
+
+
+def _closed(k: int, surface: Surface, height: float) -> Defect | None:
+    """The defect of a surface that does not reach its semi-diameter."""
+    if surface.is_break or math.isnan(height):
+        return None
+    edge = _edge_radius(surface)
+    if not height >= edge:
+        return None
+    words = (
+        f"surface {k} does not reach its semi-diameter of {height:.6g} mm: it closes at {edge:.6g} mm "
+        f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
+    )
+    return Defect(k, "reach", height - edge, words)
+
+
+def edge_radius(surface: Surface) -> float:
+    """Largest radius in mm at which the conic of a surface exists: 1/(|c| √(1+k)) where it closes, else inf.
+
+    Of a toroid or a biconic it is that of the section along y.
+    """
+    curvature = 0.0 if surface.curvature is None else abs(float(surface.curvature))
+    shape = 1.0 if surface.conic is None else 1 + float(surface.conic)
+    return 1 / (curvature * math.sqrt(shape)) if curvature > 0 and shape > 0 else math.inf
+
+
+def _edge_radius(surface: Surface) -> float:
+    """mm at which a surface closes, along x or along y; inf where it does not."""
+    if not is_freeform(surface):
+        return edge_radius(surface)
+    a = surface.coefficients.double()
+    c, k = (a.new_zeros(()) if number is None else number.double() for number in (surface.curvature, surface.conic))
+    far = a.new_tensor(1e9)
+    ends = KINDS[surface.kind].form.extent(c, k, a, far)
+    return min(float(end) if end < far else math.inf for end in ends)
+
+
+def _gaps(lens: Lens) -> list[tuple[int, int, float]]:
+    """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
+    indices = media(lens, lens.primary)
+    surfaces, found, before, side = lens.surfaces, [], None, 1.0
+    for k, surface in enumerate(surfaces[:-1]):
+        if k == 0:
+            continue
+        posed = surface.is_break or surface.before is not None
+        if posed:
+            before = None
+        if surface.is_mirror or surface.phase is not None or not torch.equal(indices[k], indices[k - 1]):
+            if before is not None:
+                found.append((before, k, side))
+            before = k
+        side = -side if surface.is_mirror else side
+        if surface.after is not None:
+            before = None
+    return found
+
+
+def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> list[Defect]:
+    """The defects of the gap between two surfaces."""
+    front, back = lens.surfaces[k], lens.surfaces[end]
+    gap = side * sum(float(surface.thickness) for surface in lens.surfaces[k:end])
+    index = abs(float(media(lens, lens.primary)[k]))
+    medium = "glass" if index > 1.01 else "air"
+    if gap < -_LEAST:
+        return [Defect(k, "gap", gap, f"the {medium} between surfaces {k} and {end} is {gap:.6g} mm thick: negative")]
+    common = min(heights[k], heights[end])
+    if math.isnan(common) or not math.isfinite(gap):
+        return []
+    for x, y in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)):
+        r = torch.linspace(0.0, common, _HEIGHTS, dtype=torch.float64)
+        left = gap + side * (_sag(back, x * r, y * r) - _sag(front, x * r, y * r))
+        if left.min() < -_LEAST:
+            at, least = float(r[left < 0][0]), float(left.min())
+            words = (
+                f"surfaces {k} and {end} cross {at:.4g} mm from the axis: {medium} of {least:.4g} mm within the edge"
+            )
+            return [Defect(k, "crossing", least, words)]
+        own = [r.new_tensor(heights[one]) for one in (k, end)]
+        edge = gap + side * float(_sag(back, x * own[1], y * own[1]) - _sag(front, x * own[0], y * own[0]))
+        if medium == "glass" and edge < -_LEAST:
+            words = f"the glass between surfaces {k} and {end} is {edge:.4g} mm thick at its edge: negative"
+            return [Defect(k, "edge", edge, words)]
+    return []
+
+
+def _sag(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+    """The sag, beyond where the surface closes that of its edge."""
+    edge = 0.999999 * _edge_radius(surface)
+    r = torch.hypot(x, y)
+    held = torch.where(r > edge, edge / torch.where(r > edge, r, 1.0), 1.0) if math.isfinite(edge) else 1.0
+    return sag_at(surface, held * x, held * y)
+
+
+@value
+class Frame:
+    """The axes of a surface: its vertex (3,) mm, and by columns (3, 3) the directions of its x, y and z."""
+
+    origin: Tensor
+    axes: Tensor
+
+    def outside(self, point: Tensor) -> Tensor:
+        """A point (3, ...) mm of the surface, told in the axes that rays start in."""
+        return self.along(point) + self.origin.reshape(3, *(1,) * (point.dim() - 1))
+
+    def along(self, direction: Tensor) -> Tensor:
+        """A direction (3, ...), told in the axes that rays start in."""
+        return torch.tensordot(self.axes, direction, dims=1)
+
+    def inside(self, point: Tensor) -> Tensor:
+        """A point (3, ...) mm, told in the axes of the surface."""
+        moved = point - self.origin.reshape(3, *(1,) * (point.dim() - 1))
+        return torch.tensordot(self.axes.T, moved, dims=1)
+
+
+def frames(lens: Lens) -> list[Frame]:
+    """The frame of every surface after its pose, in that of surface 1 before its own; the object's may be at -inf."""
+    distance = lens.surfaces[0].thickness
+    axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
+    here = Frame(torch.zeros_like(axes[0]), axes)
+    found = [Frame(-distance * axes[2], axes)]
+    for surface in lens.surfaces[1:]:
+        here = _posed(here, surface.before)
+        found.append(here)
+        here = _posed(here, surface.after)
+        here = Frame(here.origin + surface.thickness * here.axes[:, 2], here.axes)
+    return found
+
+
+def _posed(frame: Frame, pose: Pose | None) -> Frame:
+    if pose is None:
+        return frame
+    one = torch.eye(3, dtype=frame.axes.dtype, device=frame.axes.device)
+    zero = list(torch.zeros_like(one[0]))
+    vertex = torch.stack(list(point_out(pose, zero)))
+    turned = torch.stack([torch.stack(list(direction_out(pose, list(axis)))) for axis in one], 1)
+    return Frame(frame.outside(vertex), frame.axes @ turned)

@@ -1,0 +1,335 @@
+"""Paraxial optics: the y-nu trace, focal lengths, pupils, principal planes and conjugates.
+
+A ray is (y, ω) with ω = n u, u = dy/dz the slope and n the *signed* index, negative while light travels towards -z.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.dual import quotient, select, value_of
+from raytrace.maths.value import value
+from raytrace.system.lens import Lens
+from raytrace.system.phases import power_of
+from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
+from raytrace.tracing.trace import media
+
+
+@value
+class FirstOrder:
+    """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
+
+    power: -ω′/y₁ in 1/mm.
+    effective_focal_length: -y₁/u′ in image space, u′ taken along the light: positive for a concave mirror.
+    back_focal_distance: from the last surface before the image to the rear focal point.
+    front_focal_distance: from surface 1 to the front focal point.
+    entrance_pupil_position: from surface 1; entrance_pupil_diameter > 0.
+    exit_pupil_position: from the image surface; exit_pupil_diameter > 0.
+    stop_height: of the marginal ray at the stop; negative where the entrance pupil is an inverted image of the stop.
+    f_number: |EFL| / entrance pupil diameter; paraxial_working_f_number: 1/(2 n′ |u′|) of the marginal ray.
+    paraxial_image_distance: from the last surface before the image to the paraxial image of the object.
+    magnification: of that image (0 for an object at infinity).
+    angular_magnification: ū′/ū of the chief ray, the slopes through the centres of the pupils.
+    optical_invariant: |H| = |n (ū y - u ȳ)| of the marginal ray and the chief ray of the largest field, Lagrange's; the
+        field of a lens whose fields are image heights is that height in the paraxial image.
+    object_na, image_na: n sin θ of the paraxial marginal ray.
+    petzval_radius: radius of the Petzval surface, signed like a surface's.
+    front_principal_plane, rear_principal_plane: from surface 1, and from the last surface before the image.
+    """
+
+    power: Tensor
+    effective_focal_length: Tensor
+    back_focal_distance: Tensor
+    front_focal_distance: Tensor
+    entrance_pupil_position: Tensor
+    entrance_pupil_diameter: Tensor
+    exit_pupil_position: Tensor
+    exit_pupil_diameter: Tensor
+    stop_height: Tensor
+    f_number: Tensor
+    paraxial_working_f_number: Tensor
+    paraxial_image_distance: Tensor
+    magnification: Tensor
+    angular_magnification: Tensor
+    optical_invariant: Tensor
+    object_na: Tensor
+    image_na: Tensor
+    petzval_radius: Tensor
+    front_principal_plane: Tensor
+    rear_principal_plane: Tensor
+
+
+def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tensor]:
+    """Indices made negative where light travels towards -z; arguments and order as for `trace.steps`."""
+    side, result = 1, [indices[0]]
+    for surface, n in zip(surfaces, indices[1:], strict=True):
+        side = -side if surface.is_mirror else side
+        result.append(side * n)
+    return result
+
+
+def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
+    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
+
+    powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
+    """
+    rays = [(y, omega)]
+    for k, power in enumerate(powers):
+        omega = omega - power * y
+        y = y + gaps[k] * omega if k < len(gaps) else y
+        rays.append((y, omega))
+    return rays
+
+
+def brackets(powers: Sequence, gaps: Sequence) -> tuple:
+    """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω; arguments as for `ynu`. Gauss's brackets (Herzberger 1943)."""
+    (A, C), (B, D) = (ynu(y, omega, powers, gaps)[-1] for y, omega in ((1.0, 0.0), (0.0, 1.0)))
+    return A, B, C, D
+
+
+class Gaussian(NamedTuple):
+    """System matrices of a lens at one wavelength, and the first-order data that follow; tensors or dual numbers.
+
+    A, B, C, D: y′ = A y + B ω, ω′ = C y + D ω from surface 1 to behind the last surface before the image; front: A and
+    B to the vertex of the stop; rear: B and D from the stop; n_object, n_image: signed indices. vergence: n over the
+    object distance, 0 for an object at infinity. Source: Welford, Aberrations, ch. 3.
+    """
+
+    A: object
+    B: object
+    C: object
+    D: object
+    front: tuple
+    rear: tuple
+    n_object: object
+    n_image: object
+
+    @property
+    def effective_focal_length(self):
+        return -abs(self.n_image) / self.C
+
+    @property
+    def entrance_pupil_position(self):
+        """mm from surface 1."""
+        return self.n_object * self.front[1] / self.front[0]
+
+    @property
+    def exit_pupil_distance(self):
+        """mm from the last surface before the image."""
+        return quotient(-self.n_image * self.rear[0], self.rear[1])
+
+    @property
+    def pupil_magnification(self):
+        """Diameter of the exit pupil over that of the entrance pupil."""
+        return abs(quotient(self.front[0], self.rear[1]))
+
+    @property
+    def angular_magnification(self):
+        return quotient(self.n_object * self.rear[1], self.n_image * self.front[0])
+
+    def omega_behind(self, vergence):
+        """ω′ per mm of height at surface 1 of an axial ray."""
+        return self.C + self.D * vergence
+
+    def image_distance(self, vergence):
+        return quotient(-self.n_image * (self.A + self.B * vergence), self.omega_behind(vergence))
+
+    def magnification(self, vergence):
+        return quotient(vergence, self.omega_behind(vergence))
+
+    def pupil_reach(self, vergence):
+        """Height of an axial ray in the entrance pupil per mm of height at surface 1."""
+        return 1 + self.entrance_pupil_position * vergence / self.n_object
+
+    def entrance_pupil_diameter(self, kind: str, number, distance, vergence, tan_cone):
+        """The diameter in mm that an aperture means; distance: mm, of the object; tan_cone: of its half angle there."""
+        if kind == "entrance_pupil_diameter":
+            return number
+        if kind == "image_f_number":
+            return abs(self.effective_focal_length) / number
+        if kind == "float_by_stop":
+            return 2 * number / abs(self.front[0])
+        if kind == "paraxial_working_f_number":
+            slope = 0.5 / (number * abs(self.n_image))
+            return 2 * abs(slope * self.n_image / self.omega_behind(vergence) * self.pupil_reach(vergence))
+        return 2 * abs((distance + self.entrance_pupil_position) * tan_cone)
+
+    def marginal_height(self, kind: str, diameter, distance, vergence, tan_cone):
+        """Height in mm at surface 1 of the ray from the axial object point through the edge of the entrance pupil.
+
+        The cone of an object NA or angle needs no pupil, which may lie at infinity.
+        """
+        reach = self.pupil_reach(vergence)
+        if kind not in CONES:
+            return 0.5 * diameter / reach
+        height = abs(distance * tan_cone)
+        return select(value_of(reach) < 0, -height, height)
+
+
+#: Kinds of aperture that are given at the object.
+CONES = "object_na", "object_cone_angle"
+
+
+def field_scale(kind: str, *, at_infinity: bool, distance, entrance_pupil, power, magnification):
+    """Slope of the chief ray at the object, or object height in mm, per tan θ or per mm of a field of some kind.
+
+    kind: of `Fields`; power: -C/n of the object space, for an object at infinity; magnification: for a finite one.
+    """
+    if kind == "angle":
+        return 1.0 if at_infinity else -(distance + entrance_pupil)
+    if kind == "object_height":
+        return 1.0
+    return power if at_infinity else 1 / magnification
+
+
+def chief_ray(extent, *, at_infinity: bool, distance, entrance_pupil, parallel: bool) -> tuple:
+    """(ȳ, ū) before surface 1 of a field whose extent is a slope, or an object height in mm.
+
+    parallel: the entrance pupil of a finite object is at infinity.
+    """
+    if at_infinity:
+        return -entrance_pupil * extent, extent
+    if parallel:
+        return extent, 0.0 * extent
+    slope = -extent / (distance + entrance_pupil)
+    return -entrance_pupil * slope, slope
+
+
+def petzval_sum(curvatures: Sequence, indices: Sequence):
+    """Σ c (n′ - n)/(n n′) in 1/mm; indices: signed, one more than curvatures. Any number type."""
+    pairs = zip(curvatures, indices[:-1], indices[1:], strict=True)
+    return sum(c * ((behind - before) / (before * behind)) for c, before, behind in pairs)
+
+
+def system_matrix(
+    surfaces: Sequence[Surface],
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
+    *,
+    to_next: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω from the first vertex, before it, to behind the last surface.
+
+    to_next: up to the vertex that follows it.
+
+    The axis is straightened: tilts, decentres and the mean slope of a grating are left out, and what bends differently
+    along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
+    µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
+    """
+    powers = [power(s, n1, n2, wavelength) for s, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True)]
+    gaps = [surface.thickness / n for surface, n in zip(surfaces, indices[1:], strict=True)]
+    gaps = gaps if to_next else gaps[:-1]
+    one = torch.ones_like(indices[0])
+    return tuple(one * part for part in brackets(powers, gaps))
+
+
+def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor | None = None) -> Tensor:
+    """Power (...) in 1/mm of a surface between signed indices (...), by its section along y."""
+    found = vertex_curvature(surface) * (behind - before)
+    return found if surface.phase is None else found + power_of(surface.phase, wavelength)[1]
+
+
+def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
+    """First-order data; wavelength: (...) µm, the primary one by default. Source: Welford, Aberrations, ch. 3.
+
+    A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
+    """
+    wavelength = lens.primary if wavelength is None else wavelength
+    surfaces = lens.surfaces[1:-1]
+    n = signed(surfaces, media(lens, wavelength)[:-1])
+    n_object, n_image = n[0], n[-1]
+    # The stop seen from the front (transfer to its vertex) and from the back.
+    before, behind = surfaces[: lens.stop - 1], surfaces[lens.stop - 1 :]
+    A1, B1, _, _ = system_matrix(before, n[: lens.stop], wavelength, to_next=True)
+    _, B2, _, D2 = system_matrix(behind, n[lens.stop - 1 :], wavelength)
+    data = Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n_object, n_image)
+    A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
+    vergence = n_object / object_distance_of(lens)  # 0 for an object at infinity
+    kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
+    diameter = data.entrance_pupil_diameter(kind, lens.aperture.value, distance, vergence, tan_cone)
+    diameter = diameter * torch.ones_like(focal_length) if kind == "entrance_pupil_diameter" else diameter
+    scale = data.marginal_height(kind, diameter, distance, vergence, tan_cone)
+    slope_object, slope_image = scale * vergence / n_object, scale * data.omega_behind(vergence) / n_image
+    petzval = petzval_sum([vertex_curvature(s) for s in surfaces], n) * torch.ones_like(n_object)
+    return FirstOrder(
+        power=-C,
+        effective_focal_length=focal_length,
+        back_focal_distance=-n_image * A / C,
+        front_focal_distance=n_object * D / C,
+        entrance_pupil_position=data.entrance_pupil_position,
+        entrance_pupil_diameter=diameter,
+        exit_pupil_position=data.exit_pupil_distance - surfaces[-1].thickness,
+        exit_pupil_diameter=diameter * data.pupil_magnification,
+        stop_height=0.5 * diameter * A1,
+        f_number=focal_length.abs() / diameter,
+        paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
+        paraxial_image_distance=data.image_distance(vergence),
+        magnification=data.magnification(vergence),
+        angular_magnification=data.angular_magnification,
+        optical_invariant=_optical_invariant(lens, 0.5 * diameter, n_object, slope_object, n_image * slope_image),
+        object_na=(n_object * torch.sin(torch.atan(slope_object))).abs(),
+        image_na=(n_image * torch.sin(torch.atan(slope_image))).abs(),
+        petzval_radius=-1 / (n_image * petzval),
+        front_principal_plane=n_object * (D - 1) / C,
+        rear_principal_plane=n_image * (1 - A) / C,
+    )
+
+
+def object_distance_of(lens: Lens) -> Tensor:
+    """The distance (...) mm of the object; of one at surface 1 so little that all is what it is in the limit."""
+    distance = lens.surfaces[0].thickness
+    return torch.where(distance == 0, torch.finfo(distance.dtype).tiny ** 0.5, distance)
+
+
+def largest_field(lens: Lens) -> Tensor:
+    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit.
+
+    Where not every surface is round about one axis it is the outermost itself: directions are not alike.
+    """
+    size = torch.hypot(lens.fields.x, lens.fields.y)
+    if all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces):
+        largest = size.amax()
+        return torch.stack([torch.zeros_like(largest), largest])[:, None]
+    outermost = size.argmax()
+    return torch.stack([lens.fields.x[outermost], lens.fields.y[outermost]])[:, None]
+
+
+def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
+    """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
+    n_object, data = media(lens, lens.primary)[0], first_order(lens)
+    vergence = n_object / object_distance_of(lens)
+    front = Gaussian(None, None, None, None, (1.0, data.entrance_pupil_position / n_object), None, n_object, None)
+    kind, distance = lens.aperture.kind, lens.surfaces[0].thickness
+    tan_cone = _tan_cone(lens, n_object)
+    y = front.marginal_height(kind, data.entrance_pupil_diameter, distance, vergence, tan_cone)
+    return y, y * vergence
+
+
+def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
+    """Paraxial image distance (...) mm from the last surface before the image; object_distance: (...) mm or inf."""
+    wavelength = lens.primary if wavelength is None else wavelength
+    surfaces = lens.surfaces[1:-1]
+    n = signed(surfaces, media(lens, wavelength)[:-1])
+    A, B, C, D = system_matrix(surfaces, n, wavelength)
+    vergence = n[0] / object_distance
+    return -n[-1] * (A + B * vergence) / (C + D * vergence)
+
+
+def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
+    """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+    kind, number = lens.aperture.kind, lens.aperture.value
+    return torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
+
+
+def _tan_cone(lens: Lens, n_object: Tensor) -> Tensor | None:
+    return torch.tan(cone_angle(lens, n_object)) if lens.aperture.kind in CONES else None
+
+
+def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
+    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, as the largest field is told."""
+    largest = torch.hypot(*largest_field(lens))[0]
+    if lens.fields.kind == "angle":
+        return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()
+    return ((n_object * slope_object if lens.fields.kind == "object_height" else omega_image) * largest).abs()

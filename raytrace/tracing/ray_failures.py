@@ -1,0 +1,188 @@
+"""Losses: where the rays of every field and wavelength end, and why; and what is said of those that all are lost."""
+
+import warnings
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from raytrace.budget import RAY_BYTES, afford
+from raytrace.maths.pupil import hexapolar
+from raytrace.maths.value import value
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.system.rays import Rays
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import Crossing, lens_steps
+from raytrace.words import calling_level
+
+#: What becomes of a ray, by its number, and how that is said of a surface.
+FATES = {
+    "ok": "arrived",
+    "vignetted": "vignetted at surface {}",
+    "miss": "missed surface {}",
+    "tir": "totally reflected at surface {}",
+    "unaimed": "not aimed at the stop",
+}
+STATUS = tuple(FATES)
+_OK = STATUS.index("ok")
+#: What may happen to a ray at a surface, in the order that it is told.
+LOST = ("miss", "tir", "vignetted")
+_RINGS = 8  # of the rays that try a field
+
+
+class LostRays(UserWarning):
+    """Rays do not reach the sensor; the message says which, where they end and what helps."""
+
+
+class OutOfReach(ValueError):
+    """No ray of a field reaches the sensor; the message says where they end and what helps."""
+
+
+@value
+class Losses:
+    """How many rays end at every surface, each counted where it was lost first.
+
+    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) never set out, for no
+    ray through their pupil point was found; launched: how many there were of each field and wavelength.
+    """
+
+    lost: Tensor
+    unaimed: Tensor
+    launched: int
+
+    @property
+    def arrived(self) -> Tensor:
+        """How many rays (F, W) reach the image."""
+        return self.launched - self.lost.sum((0, 1)) - self.unaimed
+
+    def words(self, field: int, wavelength: int) -> str:
+        """What became of the rays of one field and wavelength, as "all 648 rays lost: 648 vignetted at surface 6"."""
+        arrived = int(self.arrived[field, wavelength])
+        parts = [f"{n} {FATES['unaimed']}"] if (n := int(self.unaimed[field, wavelength])) else []
+        for k, of_surface in enumerate(self.lost[:, :, field, wavelength].T.tolist(), 1):
+            parts += [f"{n} {FATES[name].format(k)}" for name, n in zip(LOST, of_surface, strict=True) if n]
+        if not parts:
+            return f"all {self.launched} rays arrive"
+        lost = f"all {self.launched}" if arrived == 0 else f"{self.launched - arrived} of {self.launched}"
+        return f"{lost} rays lost: " + (parts[0].split(" ", 1)[1] if len(parts) == 1 else ", ".join(parts))
+
+
+def ray_status(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing, Tensor]]:
+    """What happens at each surface in turn, as `trace.steps` tells it, and the status (...) of every ray behind it.
+
+    wavelength: (...) µm; status: place in STATUS of what befell the ray first.
+    """
+    status = torch.where(rays.valid, _OK, STATUS.index("unaimed"))
+    for crossing in lens_steps(lens, rays, wavelength):
+        for name, fate in zip(LOST, (crossing.missed, crossing.totally_reflected, crossing.clipped), strict=True):
+            status = torch.where((status == _OK) & fate, STATUS.index(name), status)
+        yield crossing, status
+
+
+@torch.no_grad()
+def ray_failures(
+    lens: Lens,
+    pupil: Tensor,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    ray_aiming: str | None = None,
+) -> Losses:
+    """Where rays are lost on their way to the image; arguments as for `launch`."""
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
+    codes = [STATUS.index(name) for name in LOST]
+    ended = [
+        torch.stack([(status == code).expand(rays.shape).sum(-1) for code in codes])
+        for _, status in ray_status(lens, rays, wavelengths[:, None])
+    ]
+    so_far = torch.stack(ended, 1)
+    return Losses(so_far.diff(dim=1, prepend=torch.zeros_like(so_far[:, :1])), (~rays.valid).sum(-1), pupil.shape[-1])
+
+
+def warn_of_failures(
+    lens: Lens,
+    pupil: Tensor,
+    dark: Tensor,
+    *,
+    fields: Tensor,
+    wavelengths: Tensor | None = None,
+    ray_aiming: str | None = None,
+    at: str = "",
+) -> None:
+    """Warn LostRays for every field that loses all its rays at a wavelength, where and why; and of too wide a beam.
+
+    pupil: (2, P), through which rays are traced once more; dark: (F, W), which of the fields (2, F) and wavelengths
+    (W,), the lens's by default; at: what else is told of the place, as the object distance.
+    """
+    if not bool(dark.any()):
+        return
+    some = dark.any(1)
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
+    for place, (field, lost) in enumerate(zip(fields[:, some].unbind(1), dark[some].tolist(), strict=True)):
+        said: dict[str, list[str]] = {}
+        for w, wavelength in enumerate(wavelengths.tolist()):
+            if lost[w]:
+                said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
+        for words, colours in said.items():
+            _warn(f"{at}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
+    if hint := beam_hint(lens):
+        _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")
+
+
+def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> None:
+    """Tell of fields (2, F) of which no ray reaches the sensor at the primary wavelength, why, and what helps.
+
+    fields: by default the lens's own. Raises OutOfReach if there is one and every field is needed, else if no field is
+    left; else warns LostRays.
+    """
+    tried = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    primary = lens.primary[None]
+    F, P = tried.shape[1], pupil.shape[1]
+    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what follows tells itself what aiming has to say
+        found = ray_failures(lens, pupil, fields=tried, wavelengths=primary)
+    dark = (found.arrived[:, 0] == 0).nonzero()[:, 0].tolist()
+    told = [
+        f"no ray of field {_named(lens, tried[:, f])} reaches the sensor: {found.words(f, 0)}; {_help(lens, fields)}"
+        for f in dark
+    ]
+    if dark and (every or len(dark) == tried.shape[1]):
+        raise OutOfReach(told[0])
+    for words in told:
+        _warn(words)
+
+
+def _help(lens: Lens, fields: Tensor | None) -> str:
+    """What to do about a field out of reach."""
+    if hint := beam_hint(lens):
+        return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
+    if fields is not None:
+        largest = float(torch.hypot(lens.fields.x, lens.fields.y).amax())
+        return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
+    return "give other fields by `fields`, a smaller beam by `f_number` or `entrance_pupil_diameter`"
+
+
+def beam_hint(lens: Lens) -> str:
+    """What to do about a beam that grows with the object distance, "" where the aperture is no cone at the object."""
+    if lens.aperture.kind not in ("object_na", "object_cone_angle"):
+        return ""
+    number = float(lens.aperture.value)
+    what = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
+    distance, diameter = float(lens.surfaces[0].thickness), float(first_order(lens).entrance_pupil_diameter)
+    return (
+        f"the aperture is an {what}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
+        "an F-number, an entrance pupil diameter or another aperture that the lens keeps would hold its beam"
+    )
+
+
+def _named(lens: Lens, field: Tensor) -> str:
+    return f"{name_of_field(field)} {FIELD_UNITS[lens.fields.kind]}"
+
+
+def _warn(words: str) -> None:
+    warnings.warn(words, LostRays, stacklevel=calling_level())

@@ -1,0 +1,238 @@
+"""Spot: centroid, RMS and geometric radius of the points where rays meet a surface.
+
+Arrivals: where every ray of a spot meets the sensor, from which field, colour and point of the pupil.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.budget import RAY_BYTES, afford
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.value import value
+from raytrace.system.lens import Lens, field_points
+from raytrace.system.rays import Rays
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.launch import launch
+from raytrace.tracing.ray_failures import STATUS, ray_status
+from raytrace.tracing.trace import lens_steps, media, sequence_of, trace_surfaces
+
+
+@value
+class Spot:
+    """Statistics over the last axis of a batch of rays; entries (...), mm.
+
+    centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about it, or about another point.
+    mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
+    points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
+
+    A spot that no ray of any weight reaches is nan, with gradient 0: it spoils the sum that it is added to, and no
+    derivative of the others. A merit that leaves it out (`nansum`, a mask by `rays`) is rewarded for losing it: keep
+    the lens where `rays` does not fall, add what a lost spot is to cost, or ask for an error (`empty`).
+    """
+
+    centroid: Tensor
+    mean_square_radius: Tensor
+    rms_radius: Tensor
+    geometric_radius: Tensor
+    points: Tensor
+    valid: Tensor
+    rays: Tensor
+
+
+class EmptySpot(ValueError):
+    """No ray of a spot arrives: it has no centroid and no radius."""
+
+
+def spot_of(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan") -> Spot:
+    """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default.
+
+    about: (2, ...) mm, from where radii count, the centroid by default. Equally weighted hexapolar rays about the
+    primary wavelength's chief ray are the default of OpticStudio; by the area that a ray stands for, about the
+    centroid, a spot has the moments of the light.
+    empty: what a spot without rays is: "nan", or "error", which raises EmptySpot and looks at the numbers to do so.
+    """
+    return spot_of_points(rays.position[:2], rays.valid, weights, about=about, empty=empty)
+
+
+def spot_of_points(
+    points: Tensor, valid: Tensor, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan"
+) -> Spot:
+    """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot_of`.
+
+    One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
+    of one ray has radius 0 and gradient 0.
+    """
+    weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
+    weights = torch.where(valid, weights, 0.0)
+    total = weights.sum(-1, keepdim=True)
+    share = safe_divide(weights, total)
+    first = valid & (valid.to(torch.int64).cumsum(-1) == 1)
+    reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
+    offset = torch.where(valid, points - reference, 0.0)
+    mean = (share * offset).sum(-1, keepdim=True)
+    centre = mean if about is None else about[..., None] - reference
+    centred = torch.where(valid, offset - centre, 0.0)
+    mean_square = (share * (centred[0] ** 2 + centred[1] ** 2)).sum(-1)
+    # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
+    scale = _power_of_two(centred)
+    square = (centred[0] / scale) ** 2 + (centred[1] / scale) ** 2
+    scaled_mean = (share * square).sum(-1)
+    largest = square.amax(-1) if square.shape[-1] else scaled_mean
+    rms, geometric = (scale[..., 0] * safe_sqrt(t) for t in (scaled_mean, largest))
+    found = where_lit(total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric, empty=empty)
+    return Spot(*found, points=points, valid=valid, rays=valid.sum(-1))
+
+
+def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
+    """The numbers (..., *lit.shape) of spots where light arrives; elsewhere nan with gradient 0.
+
+    empty: "nan", or "error": then EmptySpot is raised if a spot is dark. Raises ValueError for another word.
+    """
+    if empty not in ("nan", "error"):
+        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', what a spot without rays is")
+    if empty == "error" and not bool(lit.all()):
+        first = tuple(torch.nonzero(~lit)[0].tolist())
+        raise EmptySpot(
+            f"no ray reaches {int((~lit).sum())} of {lit.numel()} spots, first that of index {first}: "
+            "it has no centroid and no radius"
+        )
+    return tuple(torch.where(lit, number, torch.nan) for number in numbers)
+
+
+def _power_of_two(vectors: Tensor) -> Tensor:
+    """The power of two above the largest entry of (2, ..., P) over the first and last axes, (..., 1); 1 if none."""
+    if not vectors.shape[-1]:
+        return vectors.new_ones((*vectors.shape[1:-1], 1))
+    largest = vectors.detach().abs().amax(0).amax(-1, keepdim=True)
+    usable = (largest > 0) & torch.isfinite(largest)
+    return torch.ldexp(torch.ones_like(largest), torch.frexp(torch.where(usable, largest, 0.5)).exponent)
+
+
+def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
+    """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
+
+    The sensor may touch glass: what bends rays there does not tell where they came from. Raises budget.OverBudget for
+    more rays than memory holds.
+    """
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    F, W, P = lens.fields.y.numel() if fields is None else fields.shape[1], len(wavelengths), pupil.shape[-1]
+    afford(
+        RAY_BYTES * F * W * P,
+        f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} of the pupil)",
+        helps="ask for fewer fields, wavelengths or pupil points",
+    )
+    indices = media(lens, wavelengths[:, None])
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
+    indices = [*indices[:-1], indices[-2]]
+    return trace_surfaces(sequence_of(lens), rays, indices=indices, wavelength=wavelengths[:, None])
+
+
+_KEPT_BYTES = 100  # of a ray on the sensor, with its status
+
+
+@value
+class Arrivals(Result):
+    """Rays (3, F, W, P) on the sensor, every ray of the pupil for every field and wavelength.
+
+    status: (F, W, P), place in STATUS of what befell it first; reached: (F, W, P), whether it has a place on the
+    sensor, as a vignetted ray that goes on may have. weight: (W, P), 1 in all for a field.
+    pupil: (2, P); fields: (2, F); wavelengths: (W,) µm.
+    The table has a row a ray, its status in words; x and y are empty where it is not on the sensor.
+    """
+
+    rays: Rays
+    status: Tensor
+    reached: Tensor
+    weight: Tensor
+    pupil: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        return {
+            "field_x": axis(self.fields[0], 0, 3),
+            "field_y": axis(self.fields[1], 0, 3),
+            "wavelength": axis(self.wavelengths, 1, 3),
+            "pupil_x": axis(self.pupil[0], 2, 3),
+            "pupil_y": axis(self.pupil[1], 2, 3),
+            "x": masked(self.rays.position[0], self.reached),
+            "y": masked(self.rays.position[1], self.reached),
+            "weight": self.weight,
+            "status": self.status,
+        }
+
+    def words(self) -> dict:
+        return {"status": STATUS}
+
+
+def arrivals(
+    lens: Lens,
+    pupil: Tensor,
+    weights: Tensor,
+    *,
+    fields: Tensor | None = None,
+    ray_aiming: str | None = None,
+    progress: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter,
+) -> Arrivals:
+    """Trace points (2, P) of the pupil and their weights (P,) to the sensor, field by field.
+
+    fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does. Raises
+    budget.OverBudget for more rays than memory holds.
+    """
+    fields = field_points(fields, like=lens)
+    F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
+    count = f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points)"
+    afford(RAY_BYTES * W * P + _KEPT_BYTES * F * W * P, count, helps="ask for fewer, or by `rays`, which keeps none")
+    each = [_field(lens, pupil, field[:, None], ray_aiming) for field in progress(fields.unbind(1))]
+    joined = Rays(
+        torch.cat([rays.position for rays, *_ in each], 1),
+        torch.cat([rays.direction for rays, *_ in each], 1),
+        torch.cat([rays.valid for rays, *_ in each]),
+    )
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    weight = shares[:, None] * weights / weights.sum()
+    status, reached = (torch.cat(found) for found in zip(*(rest for _, *rest in each), strict=True))
+    return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
+
+
+def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> tuple[Rays, Tensor, Tensor]:
+    """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
+    rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
+    reached = rays.valid
+    for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
+        reached = reached & ~crossing.missed & ~crossing.totally_reflected
+        found = crossing.rays, status, reached
+    return found
+
+
+def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
+    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    if is_bent(lens):
+        return rays.position[:2, ..., 0], unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
+    on_axis = (fields == 0).all(0)[:, None]
+    return rays.position[:2, ..., 0], (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
+
+
+@torch.no_grad()
+def unclipped(lens: Lens, pupil: Tensor, fields: Tensor, wavelengths: Tensor) -> Tensor:
+    """Which rays (F, W, P) of pupil points (2, P) reach the sensor, or would if nothing clipped any."""
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
+    reached = rays.valid
+    for crossing in lens_steps(lens, rays, wavelengths[:, None]):
+        reached = reached & ~crossing.missed & ~crossing.totally_reflected
+    return reached
+
+
+def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
+    """Where the primary wavelength's chief rays of fields (2, F) meet the sensor, (2, F, 1) mm; nan where none does."""
+    points, valid = chief_points(lens, fields, lens.primary[None])
+    return torch.where(valid, points, torch.nan)
+
+
+def keeps_coordinates(direction: Tensor) -> Tensor:
+    """Whether rays keep their coordinates, if the axis is straight: one that missed a surface has become axial."""
+    return (direction[:2] != 0).any(0)

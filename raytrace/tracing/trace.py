@@ -1,0 +1,314 @@
+"""Sequential ray tracing: transfer, intersection, deflection and clipping at one surface after the other.
+
+The trace is a generator: to record, draw or find where a ray failed, consume `steps`; to resume from stored rays, pass
+them with the remaining surfaces. `trace_surfaces` and `trace_lens` return the last rays only, through the compiled
+engine where that is available and pays. `media` and `sequence_of` give the indices and surfaces a lens is traced as.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.materials import glass
+from raytrace.maths.numerics import dot
+from raytrace.maths.value import value
+from raytrace.system.apertures import inside
+from raytrace.system.intersection import meet
+from raytrace.system.lens import Lens, index_behind
+from raytrace.system.phases import IdealLens, power_of
+from raytrace.system.poses import Gap, Turn, direction_in, point_in
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface, gap_behind, vertex_curvature
+from raytrace.tracing.compiled.library import uses_compiled
+from raytrace.tracing.compiled.run import trace_compiled
+from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.refraction import deflect
+
+
+@value
+class Crossing:
+    """Rays behind one surface, in its vertex frame, and the reasons why rays end there.
+
+    missed, totally_reflected: (...) bool, also of a ray that was vignetted before, which is traced on.
+    clipped: (...) bool, the ray is vignetted here and was valid before.
+    """
+
+    rays: Rays
+    missed: Tensor
+    totally_reflected: Tensor
+    clipped: Tensor
+
+
+class _Ray(NamedTuple):
+    """Rays by components, as the loop over surfaces carries them."""
+
+    position: Sequence[Tensor]
+    direction: Sequence[Tensor]
+    valid: Tensor
+    opl: Tensor | None
+
+    @staticmethod
+    def of(rays: Rays) -> "_Ray":
+        return _Ray(rays.position.unbind(0), rays.direction.unbind(0), rays.valid, rays.opl)
+
+    def rays(self) -> Rays:
+        x, y, z, L, M, N = torch.broadcast_tensors(*self.position, *self.direction)
+        return Rays(torch.stack([x, y, z]), torch.stack([L, M, N]), self.valid, self.opl)
+
+
+def cross(
+    surface: Surface,
+    rays: Rays,
+    gap: Tensor | Gap | None,
+    side: int,
+    n1: Tensor,
+    n2: Tensor,
+    wavelength: Tensor | None = None,
+) -> Crossing:
+    """Carry rays over the gap before a surface and through the surface.
+
+    rays: in the frame of the surface before or, if gap is None, of this one before its pose; gap: mm between the two
+    vertices, or a `gap_behind`; side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and
+    behind; wavelength: (...) µm, needed by surfaces with a phase. n2 the same tensor as n1: a dummy surface.
+    """
+    return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2, wavelength))
+
+
+def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, clear: Tensor | None) -> Crossing:
+    survives = met if passes is None else met & passes
+    return Crossing(
+        after.rays(),
+        ~met,
+        torch.zeros_like(met) if passes is None else met & ~passes,
+        torch.zeros_like(after.valid) if clear is None else before.valid & survives & ~clear,
+    )
+
+
+def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None):
+    """Rays behind the surface, and whether those before it meet it, are not totally reflected, pass its apertures."""
+    if isinstance(gap, Gap) or surface.before is not None or surface.is_break:
+        rays, gap = _in_axes_of(surface, rays, gap, side, n1), None
+        if surface.is_break:
+            return rays, torch.ones_like(rays.valid), None, None
+    direction = rays.direction
+    x, y, z = rays.position
+    meeting = meet(surface, rays.position if gap is None else (x, y, z - gap), direction)
+    hit, met, opl = meeting.hit, meeting.met, rays.opl
+    if opl is not None:
+        opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
+    direction, passes, added = deflect(surface, meeting, direction, n1, n2, wavelength)
+    opl = opl if opl is None or added is None else opl + added
+    survives = met if passes is None else met & passes
+    clear = inside(surface.apertures, hit) if surface.apertures else None
+    valid = rays.valid & survives
+    after = _Ray(
+        position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],
+        direction=[torch.where(survives, d, axis) for d, axis in zip(direction, (0.0, 0.0, 1.0), strict=True)],
+        valid=valid if clear is None else valid & clear,
+        opl=opl if opl is None else torch.where(survives, opl, 0.0),
+    )
+    return after, met, passes, clear
+
+
+def _in_axes_of(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Ray:
+    """Rays in the axes of the surface; their path less that of the axial ray in the gap, n1 T σ."""
+    position, direction, opl = rays.position, rays.direction, rays.opl
+    thickness = gap
+    if isinstance(gap, Gap):
+        position, direction = point_in(gap.pose, position), direction_in(gap.pose, direction)
+        thickness = gap.thickness
+    if thickness is not None:
+        x, y, z = position
+        position = x, y, z - thickness
+        opl = opl if opl is None else opl - n1 * (thickness * side)
+    if surface.before is not None:
+        position, direction = point_in(surface.before, position), direction_in(surface.before, direction)
+        if isinstance(surface.before, Turn) and opl is not None:
+            opl = opl - surface.before.path
+    return _Ray(position, direction, rays.valid, opl)
+
+
+def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
+    """Path from start (old frame) to hit (new frame) less the axial ray's T σ, without forming either.
+
+    t - T σ = (hit - start)·d + T (N - σ),   N - σ = -σ (L² + M²)/(1 + σ N)
+    """
+    path = dot([a - b for a, b in zip(hit, start, strict=True)], direction)
+    if gap is None:
+        return path
+    L, M, N = direction
+    forward = side * N > 0
+    lag = torch.where(forward, -side * (L * L + M * M) / torch.where(forward, 1 + side * N, 1.0), N - side)
+    return path + gap * lag
+
+
+def steps(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
+    side: int = 1,
+    gap: Tensor | Gap | None = None,
+) -> Iterator[Crossing]:
+    """Yield the `Crossing` of each surface in turn.
+
+    rays: before surfaces[0], in its frame before its pose or, with `gap`, in that of the surface before it (mm, or its
+    `surface.gap_behind`); indices: len(surfaces) + 1 media (...), the first before surfaces[0]; wavelength: (...) µm,
+    needed by surfaces with a phase; side: axial direction of light before surfaces[0] (-1 behind an odd number of
+    mirrors).
+    """
+    for before, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
+        yield _crossing(before, *crossed)
+
+
+def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], wavelength: Tensor | None, side, gap):
+    before = _Ray.of(rays)
+    for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
+        crossed = _cross(surface, before, gap, side, n1, n2, wavelength)
+        yield before, crossed
+        before, gap = crossed[0], gap_behind(surface)
+        side = -side if surface.is_mirror else side
+
+
+def trace_surfaces(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
+    side: int = 1,
+    gap: Tensor | Gap | None = None,
+) -> Rays:
+    """The rays behind the last of the surfaces; arguments as for `steps`.
+
+    The compiled engine traces the runs of surfaces that it supports, where it pays: see `compiled.run`.
+    """
+    if torch.compiler.is_compiling():
+        return _eager(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap)
+    first = 0
+    for expressible, run in itertools.groupby(surfaces, is_expressible):
+        last = first + len(list(run))
+        arguments = {"indices": indices[first : last + 1], "wavelength": wavelength, "side": side, "gap": gap}
+        end = None
+        if expressible and uses_compiled(rays, indices[first], last - first):
+            end = trace_compiled(surfaces[first:last], rays, **arguments, eager=_eager)
+        rays = _eager(surfaces[first:last], rays, **arguments) if end is None else end
+        side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
+        gap, first = gap_behind(surfaces[last - 1]), last
+    return rays
+
+
+def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None, side: int, gap) -> Rays:
+    after = None
+    for _, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
+        after = crossed[0]
+    return rays if after is None else after.rays()
+
+
+def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
+    """Rays traced from the frame of surface 1 to the image surface, in its frame.
+
+    wavelength: µm, broadcast against the batch shape of the rays.
+    """
+    return trace_surfaces(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
+
+
+def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]:
+    """The crossings of rays before surface 1 with every surface after the object; wavelength: (...) µm."""
+    return steps(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
+
+
+def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:
+    """Σ n T σ (...) in mm of the axial ray, first to last vertex: add it to `Rays.opl` for the full path."""
+    total = torch.zeros_like(indices[0])
+    for surface, n in zip(surfaces[:-1], indices[1:-1], strict=True):
+        side = -side if surface.is_mirror else side
+        total = total + n * surface.thickness * side
+    return total
+
+
+def sequence_of(lens: Lens) -> tuple[Surface, ...]:
+    """The surfaces after the object as they are traced: ideal lenses with the vergence of the axial object point.
+
+    It is that of the paraxial ray on the straightened axis, at the primary wavelength.
+    """
+    surfaces = lens.surfaces[1:]
+    if not any(isinstance(surface.phase, IdealLens) for surface in surfaces):
+        return surfaces
+    wavelength, side, sequence = lens.primary, 1, []
+    indices = media(lens, wavelength)
+    y, omega = torch.ones_like(indices[0]), indices[0] / lens.surfaces[0].thickness
+    for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
+        behind = -side if surface.is_mirror else side
+        power = vertex_curvature(surface) * (behind * n2 - side * n1)
+        power = power if surface.phase is None else power + power_of(surface.phase, wavelength)[1]
+        if isinstance(surface.phase, IdealLens):
+            vergence = omega / (n1 * torch.where(y == 0, torch.finfo(y.dtype).tiny ** 0.5, y))
+            phase = dataclasses.replace(surface.phase, vergence=vergence)
+            surface = dataclasses.replace(surface, phase=phase)
+        sequence.append(surface)
+        omega = omega - power * y
+        y, side = y + surface.thickness * omega / (behind * n2), behind
+    return tuple(sequence)
+
+
+def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
+    """Refractive index behind every surface, object first; positive also behind a mirror.
+
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
+    break keeps the medium. A medium that does not change is the same tensor, so that `cross` refracts nothing there.
+    """
+    dtype = lens.surfaces[-2].thickness.dtype
+    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
+        return _media_in_environment(lens, wavelength, dtype)
+    glasses: list[glass.Glass] = []
+    for surface in lens.surfaces:
+        keeps = glasses and (surface.is_mirror or surface.is_break or _same(surface.glass, glasses[-1]))
+        glasses.append(glasses[-1] if keeps else surface.glass)
+    # Air lies between all elements: each medium is evaluated once.
+    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in glasses}
+    indices = _refractive_indices(list(distinct.values()), wavelength)
+    by_medium = dict(zip(distinct, (n.to(dtype) for n in indices), strict=True))
+    return [by_medium[medium.formula, id(medium.coefficients)] for medium in glasses]
+
+
+def _same(a: glass.Glass, b: glass.Glass) -> bool:
+    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
+
+
+def _media_in_environment(lens: Lens, wavelength: Tensor, dtype: torch.dtype) -> list[Tensor]:
+    """`media` of a lens at a temperature and a pressure."""
+    indices: list[Tensor] = []
+    by_medium: dict[tuple, Tensor] = {}
+    for number, surface in enumerate(lens.surfaces):
+        if indices and (surface.is_mirror or surface.is_break):
+            indices.append(indices[-1])
+            continue
+        key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
+        if key not in by_medium:
+            by_medium[key] = index_behind(lens, number, wavelength).to(dtype)
+        indices.append(by_medium[key])
+    return indices
+
+
+def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
+    """`refractive_index` of each glass; glasses of one formula are evaluated together."""
+    groups: dict[object, list[int]] = {}
+    for number, medium in enumerate(glasses):
+        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
+        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    indices: dict[int, Tensor] = {}
+    for numbers in groups.values():
+        if len(numbers) == 1:
+            indices[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
+            continue
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
+        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        group = dataclasses.replace(glasses[numbers[0]], coefficients=stacked)
+        indices |= dict(zip(numbers, glass.refractive_index(group, wavelength[None]).unbind(0), strict=True))
+    return [indices[number] for number in range(len(glasses))]

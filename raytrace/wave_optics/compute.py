@@ -1,0 +1,433 @@
+"""The wave camera as one call: an element, a sensor behind it, and its PSFs over depth and colour.
+
+PSFs of a wave scene: depth × wavelength, integrated over the pixels of the sensor, by the engine that fits."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from raytrace.budget import afford, allowed_bytes, forewarn
+from raytrace.files import write_atomically
+from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_table
+from raytrace.maths.grid import Grid, centres, grid
+from raytrace.maths.result import Result, number, object_text, rows
+from raytrace.maths.value import value
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import plan as planning
+from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
+from raytrace.wave_optics.element import Element, EvenPowers, height_range
+from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
+from raytrace.wave_optics.height_maps import FORMATS
+from raytrace.wave_optics.plan import Plan, plan
+from raytrace.wave_optics.scene import WaveScene, aperture
+from raytrace.words import did_you_mean
+
+_KEPT = 8  # sums that a memo keeps
+
+
+@value
+class ElementPsf(Result):
+    """PSFs of an element for points on the axis, over depth and colour.
+
+    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
+    was computed, with the predicted error, relative L2 of the worst kernel; element: its name.
+    axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
+    None where it was not computed, or is a pixel of the window.
+    """
+
+    FIGURE: ClassVar[str] = "plotting.wave.element_figure"
+
+    kernel: Tensor
+    scene: WaveScene
+    plan: Plan
+    element: str = ""
+    axial: Tensor | None = None
+
+    @property
+    def depths(self) -> Tensor:
+        return self.scene.depths
+
+    @property
+    def wavelengths(self) -> Tensor:
+        return self.scene.wavelengths
+
+    @property
+    def grid(self) -> Grid:
+        return self.scene.grid
+
+    @property
+    def pitch(self) -> Tensor:
+        return self.grid.pitch
+
+    @property
+    def engine(self) -> str:
+        return self.plan.engine
+
+    @property
+    def error(self) -> float:
+        return self.plan.error
+
+    @property
+    def energy(self) -> Tensor:
+        """(D, W): light inside the window."""
+        return self.kernel.sum((-2, -1))
+
+    @property
+    def peak(self) -> Tensor:
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis.
+
+        Light that is brightest on the axis has the same peak in windows of an even and of an odd number of pixels.
+        """
+        brightest = self.kernel.amax((-2, -1))
+        return brightest if self.axial is None else torch.maximum(brightest, self.axial)
+
+    @property
+    def half_energy_radius(self) -> Tensor:
+        """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
+
+        Pixels count by the distance of their centres: good to half a pixel.
+        """
+        x, y = centres(self.grid)
+        distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
+        inside = (self.kernel.flatten(-2)[..., order].cumsum(-1) < 0.5).sum(-1)
+        return torch.where(inside < len(distance), distance[inside.clamp(max=len(distance) - 1)], math.inf)
+
+    def columns(self) -> dict[str, Tensor]:
+        return {
+            "depth": self.depths[:, None],
+            "wavelength": self.wavelengths,
+            "energy": self.energy,
+            "peak": self.peak,
+            "half_energy_radius": self.half_energy_radius,
+        }
+
+    def document(self) -> dict:
+        return {
+            "element": self.element,
+            "height_range": [[*height_range(element)] for element in self.scene.elements],
+            "engine": self.plan.engine,
+            "samples": self.plan.samples,
+            "error": number(self.plan.error),
+            "pixel_pitch": number(self.pitch),
+            "size": self.grid.rows,
+            "exact": self.scene.exact,
+            "results": rows(self.columns()),
+        }
+
+    @property
+    def title(self) -> str:
+        across, z = 2 * float(aperture(self.scene)), float(self.scene.sensor_distance)
+        return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
+
+    def __str__(self) -> str:
+        return "\n".join(
+            [
+                self.title,
+                *map(_heights, self.scene.elements),
+                f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
+                f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
+                f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
+                f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
+                *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
+            ]
+        )
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
+        if Path(path).suffix.lower() != ".npz":
+            raise ValueError(f"{path}: expected a name that ends in .npz")
+        arrays = {
+            "psf": self.kernel.detach().numpy(),
+            "pixel_pitch": float(self.pitch),
+            "centre": self.grid.centre.detach().numpy(),
+            "energy": self.energy.detach().numpy(),
+            "depths": self.depths.detach().numpy(),
+            "wavelengths": self.wavelengths.detach().numpy(),
+            "engine": self.plan.engine,
+            "samples": self.plan.samples,
+            "error": self.plan.error,
+            "element": self.element,
+        }
+        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def _heights(element: Element) -> str:
+    low, high = height_range(element)
+    return f"{element.kind.words} of {element.glass.name or 'constant index'}, heights over {1e3 * (high - low):.4g} µm"
+
+
+def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:
+    half = "–" if half_energy_radius is None else f"{1e3 * half_energy_radius:.2f}"
+    place = object_text(math.inf if depth is None else depth)
+    return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
+
+
+def psf(
+    scene: WaveScene,
+    *,
+    engine: str = "auto",
+    samples: int | None = None,
+    nodes: int | None = None,
+    tol: float = 1e-3,
+    pad: float = 2.0,
+    band_limit: bool = True,
+    plan: Plan | None = None,
+    memo: Memo | None = None,
+) -> ElementPsf:
+    """PSFs of a scene, differentiable in every number of it.
+
+    engine, samples, nodes, tol, pad, band_limit: as `plan.plan` takes them. plan: of an earlier call, instead of them:
+    for loops, nothing is estimated. memo: sums that do not depend on the heights, which are not made again while the
+    rest of the scene stays as it is.
+    Raises what `plan.plan` raises.
+    """
+    if plan is None:
+        plan = planning.plan(
+            scene, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
+        )
+    return ElementPsf(_engine_kernels(scene, plan, memo), scene, plan)
+
+
+def _engine_kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
+    engine = planning.ENGINES[plan.engine]
+    if engine.prepare is None:
+        return engine.kernels(scene, None, plan)
+    sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
+    return engine.kernels(scene, sums, plan)
+
+
+def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
+    """`make(scene, plan)` without graph, from memory where nothing but heights and coefficients has changed."""
+    numbers, structure = _constants(scene)
+    if torch._C._are_functorch_transforms_active() or any(n.requires_grad for n in numbers):
+        memo.made += 1
+        return make(scene, plan)
+    with torch.no_grad():
+        return memo.find(numbers, (structure, plan), lambda: make(scene, plan), most=_KEPT)
+
+
+def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
+    """All numbers of a scene that sums depend on, and its structure."""
+    leaves, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
+    for element in scene.elements:
+        profile = element.profile
+        free = element.numbers
+        # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
+        jumps = isinstance(profile, EvenPowers) and element.period is not None
+        held = [free.detach()] if jumps else []
+        parts = [element.radius, getattr(profile, "pitch", None), element.period]
+        leaves += [t for t in (*parts, *held) if t is not None]
+        own = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
+        structure = (structure, *own)
+    return leaves, structure
+
+
+COLOURS = (0.46, 0.55, 0.64)
+_DESIGN = 0.55  # µm
+_PIECE = 1e9  # bytes: what would take more is computed kernel by kernel
+_RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
+_PLANES, _RANGE, _ACROSS = 121, (0.8, 1.2), 0.05  # of a caustic: over the sensor distance, and of the aperture
+
+#: Shows how far a loop has come: (what is gone through, its unit) -> the same.
+Progress = Callable[[Sequence, str], Iterable]
+
+
+def _silent(items: Sequence, unit: str) -> Sequence:
+    return items
+
+
+def wave_psf(
+    element: str | os.PathLike | Element | Sequence[Element] = "singlet",
+    *,
+    aperture: float = 5.0,
+    sensor: float = 35.5,
+    focus: float = 1000.0,
+    design_wavelength: float | None = None,
+    levels: int | None = None,
+    exact: bool = False,
+    glass: str | Glass | None = None,
+    index: Sequence[float] | None = None,
+    pitch: float | None = None,
+    span: Sequence[float] | None = None,
+    catalog: Sequence[str | os.PathLike] = (),
+    depths: Sequence[float] = (500.0, 1000.0, math.inf),
+    wavelengths: Sequence[float] = COLOURS,
+    pixel: float = 0.00369,
+    size: int = 128,
+    engine: str = "auto",
+    samples: int | None = None,
+    tol: float = 1e-3,
+    progress: Progress = _silent,
+) -> ElementPsf:
+    """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
+
+    element, and all up to catalog: as for `elements`; or one that was made already, in whose numbers the kernels are
+    differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around the axis.
+    engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
+    What would take too much memory at once is computed kernel by kernel.
+    Raises ValueError for what makes no sense together, budget.OverBudget where one kernel alone would take too much.
+    """
+    made = _made(element)
+    parts = made or elements(
+        element,
+        aperture=aperture,
+        sensor=sensor,
+        focus=focus,
+        design_wavelength=design_wavelength,
+        levels=levels,
+        exact=exact,
+        glass=glass,
+        index=index,
+        wavelengths=wavelengths,
+        pitch=pitch,
+        span=span,
+        catalog=catalog,
+    )
+    _check_colours(parts, wavelengths)
+    scene = WaveScene(
+        elements=parts,
+        sensor_distance=_double(sensor),
+        depths=_double(depths),
+        wavelengths=_double(wavelengths),
+        grid=grid(_double(pixel), size),
+        exact=exact,
+    )
+    chosen = plan(scene, engine=engine, samples=samples, tol=tol)
+    name = str(element) if not made else " + ".join(part.kind.words for part in parts)
+    kernel, axial = _kernels(scene, chosen, progress), None
+    if size % 2 == 0:  # a corner of four pixels lies on the axis
+        axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
+    return ElementPsf(kernel, scene, chosen, name, axial)
+
+
+def elements(
+    element: str | os.PathLike = "singlet",
+    *,
+    aperture: float = 5.0,
+    sensor: float = 35.5,
+    focus: float = 1000.0,
+    design_wavelength: float | None = None,
+    levels: int | None = None,
+    exact: bool = False,
+    glass: str | Glass | None = None,
+    index: Sequence[float] | None = None,
+    wavelengths: Sequence[float] = COLOURS,
+    pitch: float | None = None,
+    span: Sequence[float] | None = None,
+    catalog: Sequence[str | os.PathLike] = (),
+) -> tuple[Element, ...]:
+    """The elements in contact that have a name, one of `wave_optics.designs.BASELINES`, or that of a file of heights.
+
+    aperture: diameter, mm. Of a named one sensor, focus: mm, the distances that it is made for; design_wavelength: µm,
+    0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file what `read_element` takes; index:
+    its refractive indices at `wavelengths` instead of a glass.
+    Raises ValueError for options that do not belong together, and what `read_element` raises.
+    """
+    name = str(element)
+    of_files = {"glass": glass, "index": index, "pitch": pitch, "span": span}
+    if name in BASELINES:
+        for option, given in of_files.items():
+            if given is not None:
+                raise ValueError(f"`{option}` belongs to a height map; the element {name} has its own")
+        if levels and name not in STEPPED:
+            raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
+        made_for = aim(
+            radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=design_wavelength or _DESIGN, exact=exact
+        )
+        return baseline(name, made_for, **({"levels": levels} if levels else {}))
+    if Path(name).suffix.lower() not in ELEMENT_FORMATS:
+        raise ValueError(
+            f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
+            f"({', '.join(FORMATS)}) nor a smooth element ({SMOOTH}){did_you_mean(name, BASELINES)}"
+        )
+    if index is not None:
+        if glass:
+            raise ValueError("`glass` and `index` both name the material: give one of them")
+        try:
+            glass = from_table(wavelengths, index)
+        except ValueError as error:
+            raise ValueError(f"`index`: {error}") from error
+    made_of = {"glass": glass, "pitch": pitch, "span": span, "catalog": catalog}
+    wrap = {"design_wavelength": design_wavelength, "levels": levels or 0}
+    return (read_element(element, aperture=aperture, **made_of, **wrap),)
+
+
+def _made(element) -> tuple[Element, ...]:
+    """Elements that were made already; none of a name."""
+    if isinstance(element, Element):
+        return (element,)
+    return () if isinstance(element, str | os.PathLike) else tuple(element)
+
+
+def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
+    """Raises ValueError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
+    for glass in {id(element.glass.coefficients): element.glass for element in parts}.values():
+        check_unit(torch.tensor(wavelengths), [glass])
+        if glass.formula == "constant":
+            continue
+        low, high = glass.wavelength_range or (0.0, math.inf)
+        outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
+        if outside:
+            listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
+            raise ValueError(f"{glass.name or 'the material'} is known from {low:g} to {high:g} µm, not at {listed} µm")
+        check_wavelengths(glass, wavelengths)
+
+
+def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
+    """All kernels at once, or one after the other where that would take too much memory."""
+    D, W = len(scene.depths), len(scene.wavelengths)
+    whole = chosen.memory < min(_PIECE, allowed_bytes())
+    helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
+    needed = chosen.memory if whole else chosen.memory / (D * W)
+    afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
+    forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
+    if whole:
+        return psf(scene, plan=chosen).kernel
+    parts = [(d, w) for d in range(D) for w in range(W)]
+    found = [
+        psf(
+            dataclasses.replace(scene, depths=scene.depths[d : d + 1], wavelengths=scene.wavelengths[w : w + 1]),
+            plan=chosen,
+        ).kernel
+        for d, w in progress(parts, "kernel")
+    ]
+    return torch.cat(found).reshape(D, W, *scene.grid.shape)
+
+
+@torch.no_grad()
+def caustic(
+    scene: WaveScene,
+    distances: Tensor | None = None,
+    *,
+    half: float | None = None,
+    columns: int = 201,
+    tol: float = 1e-2,
+    progress: Progress = _silent,
+) -> tuple[Tensor, Tensor, float]:
+    """The caustic of a scene: light per mm² (D, W, Z, columns), 1 = all through the aperture, on y = 0 from -half to
+    half mm; its distances (Z,) mm; and half.
+
+    distances: from element to plane, by default from four fifths of the sensor distance to six fifths; half: by default
+    a tenth of the radius. Pixels and sensor do not count. Light is the mean over squares 2·half/columns wide.
+    """
+    z = scene.sensor_distance
+    distances = z * torch.linspace(*_RANGE, _PLANES, dtype=z.dtype) if distances is None else distances.to(z)
+    half = 2 * _ACROSS * float(aperture(scene)) if half is None else half
+    line = grid(torch.as_tensor(2 * half / columns).to(z), (1, columns))
+    planes = [
+        psf(dataclasses.replace(scene, sensor_distance=distance, grid=line), tol=tol).kernel[..., 0, :] / line.pitch**2
+        for distance in progress(distances, "plane")
+    ]
+    return torch.stack(planes, -2), distances, half
+
+
+def _double(numbers) -> Tensor:
+    return torch.as_tensor(numbers, dtype=torch.float64)

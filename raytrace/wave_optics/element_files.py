@@ -1,0 +1,197 @@
+"""An element in files: its heights, and beside them what else belongs to it: heights.npy has heights.npy.json.
+
+Heights are a lens only in their material: the same heights in another glass bend light by another n - 1. The label
+holds the whole glass, so that it needs no catalog, the wavelength that the heights were made for, and their size.
+A smooth element is a few coefficients: it stands in its label alone, smooth.json.
+"""
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from raytrace.files import read_bytes, write_json
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.formulas import FORMULAS
+from raytrace.materials.glass import Glass
+from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
+from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
+
+#: Suffix of smooth elements, and their profiles by the name that they have there.
+SMOOTH = ".json"
+_PROFILES = {"even powers of r, mm^(1 - 2k)": EvenPowers, "Noll's polynomials, mm RMS": Zernike}
+
+_MOST = 1 << 26  # bytes of a label
+
+#: Suffixes of all files that hold an element.
+ELEMENT_FORMATS = (*FORMATS, SMOOTH)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Label:
+    """glass: the material; design_wavelength: µm; pitch, aperture: mm, of the heights and the element's diameter.
+
+    profile: of a smooth element, which has no pitch.
+    """
+
+    glass: Glass
+    design_wavelength: float
+    aperture: float
+    pitch: float | None = None
+    profile: EvenPowers | Zernike | None = None
+
+
+def write_element(element: Element, path: str | os.PathLike, *, design_wavelength: float) -> tuple[Path, Path]:
+    """Write the heights of an element in the format of the suffix, and its label next to them; both paths. A smooth
+    element's name ends in .json: it is its own label.
+
+    Heights are those of `fabricated`: modulo the period, in steps, as light sees them; the file has no period. The
+    label has their range in the aperture, mm. Raises HeightMapError for what the format cannot hold.
+    """
+    path, glass = Path(path), element.glass
+    if is_flat(element) or path.suffix.lower() != SMOOTH:
+        write_heights((fabricated(element) if is_flat(element) else element).profile, path)
+        own = {"pitch": float(element.profile.pitch.detach())}
+    elif element.period is not None:
+        raise HeightMapError("a smooth profile that is wrapped is no smooth one; take as_rings or as_pixels", str(path))
+    else:
+        name = next(name for name, kind in _PROFILES.items() if isinstance(element.profile, kind))
+        own = {"profile": name, "coefficients_of_profile": element.numbers.detach().tolist()}
+    document = {
+        "material": glass.name,
+        "catalog": glass.catalog,
+        "formula": glass.formula,
+        "coefficients": glass.coefficients.detach().tolist(),
+        "wavelength_range": glass.wavelength_range,
+        "design_wavelength": design_wavelength,
+        "aperture": 2 * float(element.radius.detach()),
+        "height_range": height_range(element),
+        **own,
+    }
+    write_json(_label_of(path), document)
+    return path, _label_of(path)
+
+
+def read_element(
+    path: str | os.PathLike,
+    *,
+    aperture: float,
+    glass: Glass | str | None = None,
+    pitch: float | None = None,
+    span: Sequence[float] | None = None,
+    design_wavelength: float | None = None,
+    levels: int = 0,
+    catalog: Sequence[str | os.PathLike] = (),
+) -> Element:
+    """The element of a file of heights, or of a smooth one, in an aperture of so many mm.
+
+    glass: its material, by default that of its label; a name is looked up, first in the catalogs (.agf) given. pitch,
+    span: mm, of a file that does not say them (`read_heights`), nor its label. design_wavelength (µm), levels: the
+    heights are wrapped there, in so many steps, if either is given.
+    Raises HeightMapError for a file that cannot be read, ValueError for heights that do not fill the aperture or whose
+    material or design wavelength nobody knows.
+    """
+    label = read_label(path)
+    if isinstance(glass, str):
+        glass = find_glass(glass, user=tuple(catalog))
+    if Path(path).suffix.lower() == SMOOTH:
+        element = _smooth(str(path), label, aperture, glass, pitch, span)
+    else:
+        element = _flat(path, label, aperture, glass, pitch, span)
+    if not (design_wavelength or levels):
+        return element
+    design = design_wavelength or (label and label.design_wavelength)
+    if not design:
+        raise ValueError(f"{path}: does not say what it was made for; give `design_wavelength`")
+    return wrapped(element, design, levels=levels)
+
+
+def _smooth(file: str, label: Label | None, aperture: float, glass: Glass | None, *of_heights) -> Element:
+    if label is None or label.profile is None:
+        raise HeightMapError("is no smooth element: expected the coefficients of one", file)
+    if any(given is not None for given in of_heights):
+        raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
+    fixed = isinstance(label.profile, Zernike)
+    if aperture > label.aperture * (1 + 1e-9) or (fixed and aperture < label.aperture * (1 - 1e-9)):
+        raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
+    return Element(label.profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
+
+
+def _flat(path, label: Label | None, aperture: float, glass: Glass | None, pitch, span) -> Element:
+    profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
+    profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
+    counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
+    across = min(counts) * float(profile.pitch)
+    # What is cut to whole features may miss the rim by one of them.
+    if across + 2 * float(profile.pitch) < aperture:
+        raise ValueError(
+            f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
+            f"give `aperture={across:.6g}`"
+        )
+    if glass is None and label is None:
+        raise ValueError(
+            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass=NAME`, as "
+            "PMMA, or `index=N` for each wavelength where that is taken"
+        )
+    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
+
+
+def read_label(path: str | os.PathLike) -> Label | None:
+    """The label of a height map, None where there is none. Raises HeightMapError for one that cannot be read."""
+    file = _label_of(path)
+    if not file.exists():
+        return None
+    try:
+        found = _label(parsed(read_bytes(file, _MOST)))
+    except (OSError, Unfit) as error:
+        line = error.line or None if isinstance(error, Unfit) else None
+        raise HeightMapError(f"is no label of a height map ({error}); remove it", str(file), line) from error
+    sizes = ("design_wavelength", "aperture", *([] if "profile" in found else ["pitch"]))
+    span = found["wavelength_range"]
+    glass = Glass(
+        found["material"],
+        found["formula"],
+        torch.tensor(found["coefficients"], dtype=torch.float64),
+        found["catalog"],
+        wavelength_range=None if span is None else tuple(span),
+    )
+    profile = None
+    if "profile" in found:
+        coefficients = torch.tensor(found["coefficients_of_profile"], dtype=torch.float64)
+        profile = _PROFILES[found["profile"]](coefficients)
+    return Label(glass, **{name: found[name] for name in sizes}, profile=profile)
+
+
+_ABOVE_0 = number(math.ulp(0.0))
+_GLASS = {
+    "material": text,
+    "catalog": text,
+    "formula": exactly(*FORMULAS),
+    "coefficients": listed(number()),
+    "wavelength_range": either(exactly(None), listed(_ABOVE_0, 2, 2)),
+    "design_wavelength": _ABOVE_0,
+    "aperture": _ABOVE_0,
+}
+_INFORMATION = {"height_range": listed(number(), 2, 2)}  # older labels have none
+_OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0}, _INFORMATION)
+_PROFILE = {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)}
+_SMOOTH = record(_GLASS | _PROFILE, _INFORMATION)
+
+
+def _label(value: object) -> dict:
+    """A label as JSON has it. Raises Unfit."""
+    found = (_SMOOTH if isinstance(value, dict) and "profile" in value else _OF_HEIGHTS)(value)
+    count, span = FORMULAS[found["formula"]].count, found["wavelength_range"]
+    if len(found["coefficients"]) != count:
+        raise Unfit(f"coefficients: found a list of {len(found['coefficients'])}, expected {count} of them")
+    if span is not None and not span[0] < span[1]:
+        raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
+    return found
+
+
+def _label_of(path: str | os.PathLike) -> Path:
+    return Path(path) if Path(path).suffix.lower() == SMOOTH else Path(f"{path}.json")

@@ -1,0 +1,385 @@
+"""Height maps as files: the suffix names the format; what is written comes back in mm.
+
+| suffix        | holds                                                            | heights come back     |
+|---------------|------------------------------------------------------------------|-----------------------|
+| .npy          | the heights, then in a second array the pitch                    | bit for bit           |
+| .csv          | x, y, sag or r, sag of every pixel or ring, mm                   | bit for bit           |
+| .png, .tif(f) | 16-bit grey, scale and pitch in JSON as description              | to 1/131,070 of range |
+| .dat, .grd    | grid sag of Zemax OpticStudio, pixels only, at least 5 × 5       | bit for bit           |
+
+Steps of a quantised element, up to 256, come back bit for bit from every format. Rows of pictures and of grid sags run
+from the largest y down, as one sees them; those of `Pixels` and of the other files from the smallest y up. A sag is the
+height: that of the rear face of a plate, light going towards +z. Glass, aperture and period are not in the files.
+"""
+
+import io
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image, PngImagePlugin
+
+from raytrace.files import read_bytes, write_atomically
+from raytrace.io.pictures import PictureError, decoded
+from raytrace.maths.arrays import LARGEST, ArrayError, read_npy
+from raytrace.wave_optics.element import Pixels, Rings
+
+Map = Pixels | Rings
+
+#: The largest grey value of 16 bits.
+_WHITE = 65535
+#: At most so many different heights are listed in a picture's description, to come back exactly.
+_LISTED = 256
+#: TIFF tag of the description.
+_DESCRIPTION = 270
+_NO_PITCH = "does not say its pitch; give pitch in mm"
+#: Length unit of a grid sag, in mm, by its flag.
+_UNITS = {0: 1.0, 1: 10.0, 2: 25.4, 3: 1000.0}
+
+
+class HeightMapError(ValueError):
+    """A height map that cannot be read or written, said in one line: where, what was found, what to do."""
+
+    def __init__(self, message: str, file: str, line: int | None = None):
+        place = file if line is None else f"{file}:{line}"
+        super().__init__(f"{place}: {message}")
+        self.file, self.line = file, line
+
+
+class Known(NamedTuple):
+    """What the reader of a file was told: pitch mm, and the heights mm of black and white. None: the file must say."""
+
+    pitch: float | None = None
+    span: tuple[float, float] | None = None
+
+
+class Format(NamedTuple):
+    """read(content, file, known) -> profile; write(profile, file) -> content."""
+
+    read: Callable[[bytes, str, Known], Map]
+    write: Callable[[Map, str], bytes]
+
+
+def read_heights(
+    path: str | os.PathLike, *, pitch: float | None = None, span: tuple[float, float] | None = None
+) -> Map:
+    """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings where it holds rings.
+
+    pitch: mm, for a file that does not say it; span: heights mm of grey 0 and 65535, for a picture that does not say.
+    Raises HeightMapError naming file and line.
+    """
+    file = str(path)
+    form = _format(file)
+    try:
+        content = read_bytes(path, LARGEST)
+    except OSError as error:
+        raise HeightMapError(f"cannot be read: {error.strerror or error}", file) from error
+    if not content:
+        raise HeightMapError("is empty", file)
+    found = form.read(content, file, Known(pitch, span))
+    _check(found, file)
+    return found
+
+
+def write_heights(profile: Map, path: str | os.PathLike) -> None:
+    """Write a height map in the format of the suffix. The file is replaced as a whole or not at all.
+
+    Raises HeightMapError for what the format cannot hold and where the file cannot be written.
+    """
+    file = str(path)
+    form = _format(file)
+    if not isinstance(profile, Pixels | Rings):
+        kind = type(profile).__name__
+        raise HeightMapError(f"a profile of {kind} is no height map; sample it with as_pixels or as_rings first", file)
+    _check(profile, file)
+    content = form.write(profile, file)
+    try:
+        write_atomically(path, lambda stream: stream.write(content))
+    except OSError as error:
+        raise HeightMapError(error.strerror or str(error), file) from error
+
+
+# -- arrays -----------------------------------------------------------------------------------------------------------
+
+
+def _write_npy(profile: Map, file: str) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, _array(profile), allow_pickle=False)
+    np.save(stream, np.array([float(profile.pitch)]), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _read_npy(content: bytes, file: str, known: Known) -> Map:
+    try:
+        heights, *rest = read_npy(content)
+    except ArrayError as error:
+        raise HeightMapError(f"is no .npy file of heights: {error}", file) from error
+    if heights.dtype.kind not in "fiu" or heights.dtype.itemsize > 8:
+        raise HeightMapError(f"holds numbers of type {heights.dtype}; expected heights in mm", file)
+    if rest and (rest[0].shape != (1,) or rest[0].dtype.kind != "f" or len(rest) > 1):
+        raise HeightMapError("holds more than heights and one pitch in mm; is it damaged?", file)
+    # A file of another program ends with the heights.
+    pitch = float(rest[0][0]) if rest else known.pitch
+    heights = heights if heights.dtype in (np.float32, np.float64) else heights.astype(np.float64)
+    return _profile(heights.astype(heights.dtype.newbyteorder("=")), pitch, file)
+
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def _write_png(profile: Map, file: str) -> bytes:
+    grey, description = _grey(profile)
+    info = PngImagePlugin.PngInfo()
+    info.add_text("Description", description)
+    stream = io.BytesIO()
+    Image.fromarray(grey).save(stream, "PNG", pnginfo=info)
+    return stream.getvalue()
+
+
+def _write_tiff(profile: Map, file: str) -> bytes:
+    grey, description = _grey(profile)
+    stream = io.BytesIO()
+    Image.fromarray(grey).save(stream, "TIFF", tiffinfo={_DESCRIPTION: description})
+    return stream.getvalue()
+
+
+def _grey(profile: Map) -> tuple[np.ndarray, str]:
+    """Grey values (rows, columns) of 16 bits, the largest y on top, and what they mean."""
+    heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
+    low, high = float(heights.min()), float(heights.max())
+    scale = (high - low) / _WHITE
+    grey = np.zeros(heights.shape) if scale == 0 else np.rint((heights - low) / (high - low) * _WHITE)
+    meaning = {"unit": "mm", "offset": low, "scale": scale, "pitch": float(profile.pitch)}
+    meaning["profile"] = "rings" if isinstance(profile, Rings) else "pixels"
+    steps = np.unique(heights)
+    if len(steps) <= _LISTED and len(np.unique(grey)) == len(steps):
+        meaning["heights"] = steps.tolist()
+    return grey.astype(np.uint16), json.dumps(meaning)
+
+
+def _read_picture(content: bytes, file: str, known: Known) -> Map:
+    try:
+        picture = decoded(content)
+    except PictureError as error:
+        raise HeightMapError(f"cannot be read as a picture ({error})", file) from error
+    if not picture.mode.startswith("I"):
+        raise HeightMapError(f"is a picture of mode {picture.mode}; expected grey values of 16 bits", file)
+    text = picture.info.get("Description") or getattr(picture, "tag_v2", {}).get(_DESCRIPTION) or ""
+    meaning = _meaning(text, file, known)
+    grey = np.array(picture).astype(np.int64)
+    with np.errstate(all="ignore"):  # heights that are not finite are refused below
+        heights = meaning["offset"] + meaning["scale"] * grey
+    if "heights" in meaning:  # as many as there are different grey values, in the same order
+        values, place = np.unique(grey, return_inverse=True)
+        if len(values) != len(meaning["heights"]):
+            count = len(meaning["heights"])
+            raise HeightMapError(f"has {len(values)} grey values, but its description lists {count} heights", file)
+        heights = np.array(meaning["heights"], np.float64)[place.reshape(grey.shape)]
+    if meaning["profile"] == "rings" and len(heights) != 1:
+        raise HeightMapError(f"is said to hold rings, but has {len(heights)} rows", file)
+    heights = heights[0] if meaning["profile"] == "rings" else heights[::-1]
+    return _profile(heights, meaning["pitch"], file)
+
+
+def _meaning(text: str, file: str, known: Known) -> dict:
+    """The description of a picture; for one of another program, what the caller knows."""
+    try:
+        found = json.loads(text)
+        numbers = {key: float(found[key]) for key in ("offset", "scale", "pitch")}
+        listed = {"heights": [float(h) for h in found["heights"]]} if "heights" in found else {}
+        if found["profile"] not in ("rings", "pixels"):
+            raise KeyError(found["profile"])
+        return {"profile": found["profile"], **numbers, **listed}
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        if known.span is None:
+            message = "does not say which heights its grey values mean; give span (mm of black and white) and pitch"
+            raise HeightMapError(message, file) from error
+    low, high = known.span
+    return {"profile": "pixels", "offset": low, "scale": (high - low) / _WHITE, "pitch": known.pitch}
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _write_csv(profile: Map, file: str) -> bytes:
+    pitch, heights = float(profile.pitch), _array(profile)
+    if isinstance(profile, Rings):
+        lines = ["r_mm,sag_mm", *(f"{(k + 0.5) * pitch!r},{h!r}" for k, h in enumerate(heights.tolist()))]
+        return ("\n".join(lines) + "\n").encode()
+    y, x = ([(i - 0.5 * (count - 1)) * pitch for i in range(count)] for count in heights.shape)
+    across = [repr(place) for place in x]
+    lines = ["x_mm,y_mm,sag_mm"]
+    for place, row in zip(y, heights.tolist(), strict=True):
+        lines += [f"{at},{place!r},{h!r}" for at, h in zip(across, row, strict=True)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _read_csv(content: bytes, file: str, known: Known) -> Map:
+    lines = _text(content, file).split("\n")
+    head = [name.strip().lower().removesuffix("_mm") for name in lines[0].split(",")]
+    if head not in (["r", "sag"], ["x", "y", "sag"]):
+        found = lines[0][:60]
+        raise HeightMapError(f"begins with {found!r}; expected the header x_mm,y_mm,sag_mm or r_mm,sag_mm", file, 1)
+    table = _numbers(lines[1:], file, first=2, counts=(len(head),), separator=",")
+    if not np.isfinite(table[:, :-1]).all():
+        row = int(np.flatnonzero(~np.isfinite(table[:, :-1]).all(1))[0])
+        raise HeightMapError(f"reads {lines[row + 1][:60]!r}; expected finite places", file, row + 2)
+    if len(head) == 2:
+        pitch = 2 * float(table[0, 0])
+        _expect(table[:, 0], (np.arange(len(table)) + 0.5) * pitch, pitch, "r", file, np.arange(len(table)) + 2)
+        return _profile(table[:, 1], pitch, file)
+    columns = int((table[:, 1] == table[0, 1]).sum())
+    rows, rest = divmod(len(table), columns)
+    if rest:
+        raise HeightMapError(f"has {len(table)} points, no whole number of rows of {columns}", file, len(table) + 1)
+    pitch = _pitch_between(table, rows, columns, known, file)
+    if pitch is None:
+        raise HeightMapError(_NO_PITCH, file)
+    line = np.arange(len(table)) + 2
+    x, y = np.tile(np.arange(columns), rows), np.repeat(np.arange(rows), columns)
+    _expect(table[:, 0], (x - 0.5 * (columns - 1)) * pitch, pitch, "x", file, line)
+    _expect(table[:, 1], (y - 0.5 * (rows - 1)) * pitch, pitch, "y", file, line)
+    return _profile(table[:, 2].reshape(rows, columns), pitch, file)
+
+
+def _pitch_between(table: np.ndarray, rows: int, columns: int, known: Known, file: str) -> float | None:
+    """The pitch of a table of pixels, to 15 digits; a single pixel has none."""
+    if rows == columns == 1:
+        return known.pitch
+    axis, count = (0, columns) if columns > 1 else (1, rows)
+    pitch = float(f"{(table[-1, axis] - table[0, axis]) / (count - 1):.15g}")
+    if pitch <= 0:
+        message = f"has {'xy'[axis]} from {table[0, axis]:g} to {table[-1, axis]:g} mm; expected it to rise"
+        raise HeightMapError(message, file)
+    return pitch
+
+
+def _expect(found: np.ndarray, wanted: np.ndarray, pitch: float, name: str, file: str, lines: np.ndarray) -> None:
+    wrong = np.flatnonzero(~(np.abs(found - wanted) <= 1e-3 * abs(pitch)))
+    if len(wrong):
+        k = wrong[0]
+        message = f"has {name} = {found[k]:g} mm; expected {wanted[k]:g} on an even grid around the axis, x first"
+        raise HeightMapError(message, file, int(lines[k]))
+
+
+# -- grid sag ---------------------------------------------------------------------------------------------------------
+
+
+def _write_grid(profile: Map, file: str) -> bytes:
+    """nx ny delx dely unitflag xdec ydec; then a line z dz/dx dz/dy d²z/dxdy nodata a point, from (-x, +y) on, x first.
+
+    (OpticStudio Help, "Grid Sag".) Where all slopes are 0 the program estimates them; nodata 0 is a valid point.
+    """
+    if isinstance(profile, Rings):
+        raise HeightMapError("a grid sag holds no rings; sample the element with as_pixels first", file)
+    heights, pitch = _array(profile), float(profile.pitch)
+    rows, columns = heights.shape
+    if min(rows, columns) < 5:
+        raise HeightMapError(f"a grid sag needs 5 × 5 points at least; found {rows} × {columns}", file)
+    lines = [f"{columns} {rows} {pitch!r} {pitch!r} 0 0 0"]
+    lines += [f"{height!r} 0 0 0 0" for row in heights[::-1].tolist() for height in row]
+    return ("\r\n".join(lines) + "\r\n").encode()
+
+
+def _read_grid(content: bytes, file: str, known: Known) -> Map:
+    kept = [(k, line) for k, line in enumerate(_text(content, file).split("\n"), 1) if not line.startswith("!")]
+    if not kept:
+        raise HeightMapError("holds comments only; expected a grid sag", file)
+    first, head = kept[0]
+    nx, ny, delx, dely, unit, *decentre = _numbers([head], file, first=first, counts=(5, 7), separator=None)[0].tolist()
+    if unit not in _UNITS:
+        raise HeightMapError(f"has the unit flag {unit:g}; expected 0 mm, 1 cm, 2 inch or 3 m", file, first)
+    if abs(delx) != abs(dely) or any(decentre):
+        message = (
+            f"has steps of {delx:g}, {dely:g} and decentres {decentre}; only square grids around the axis are read"
+        )
+        raise HeightMapError(message, file, first)
+    if nx * ny != len(kept) - 1 or min(nx, ny) < 1 or nx % 1 or ny % 1:
+        raise HeightMapError(f"announces {nx:g} × {ny:g} points, but holds {len(kept) - 1}", file, first)
+    table = _numbers([line for _, line in kept[1:]], file, first=kept[1][0], counts=(1, 4, 5), separator=None)
+    missing = table[:, 4] != 0 if table.shape[1] == 5 else np.zeros(len(table), bool)
+    # Points without data count as none of the sag, as in the program that wrote them.
+    heights = np.where(missing, 0.0, table[:, 0] * _UNITS[unit]).reshape(int(ny), int(nx))
+    return _profile(heights[::-1], abs(delx) * _UNITS[unit], file)
+
+
+# -- what they share --------------------------------------------------------------------------------------------------
+
+#: The formats by suffix, in lower case.
+FORMATS = {
+    ".npy": Format(_read_npy, _write_npy),
+    ".png": Format(_read_picture, _write_png),
+    ".tif": Format(_read_picture, _write_tiff),
+    ".tiff": Format(_read_picture, _write_tiff),
+    ".csv": Format(_read_csv, _write_csv),
+    ".dat": Format(_read_grid, _write_grid),
+    ".grd": Format(_read_grid, _write_grid),
+}
+
+
+def _format(file: str) -> Format:
+    suffix = Path(file).suffix.lower()
+    if suffix not in FORMATS:
+        found = f"the suffix {suffix!r} names no format" if suffix else "has no suffix to name its format"
+        raise HeightMapError(f"{found} of height maps; expected one of {', '.join(FORMATS)}", file)
+    return FORMATS[suffix]
+
+
+def _array(profile: Map) -> np.ndarray:
+    return profile.heights.detach().cpu().numpy()
+
+
+def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Map:
+    if pitch is None:
+        raise HeightMapError(_NO_PITCH, file)
+    tensor = torch.from_numpy(np.array(heights, order="C"))
+    kind = Rings if heights.ndim == 1 else Pixels
+    return kind(tensor, torch.tensor(pitch, dtype=tensor.dtype))
+
+
+def _check(profile: Map, file: str) -> None:
+    """Refuse what is no height map: another number of axes, no points, numbers that are not finite, no pitch."""
+    heights, axes = profile.heights, 1 if isinstance(profile, Rings) else 2
+    if heights.ndim != axes or not heights.numel():
+        kind = "rings (R,)" if axes == 1 else "pixels (rows, columns)"
+        raise HeightMapError(f"has heights of the shape {tuple(heights.shape)}; expected {kind}", file)
+    wrong = int((~torch.isfinite(heights)).sum())
+    if wrong:
+        raise HeightMapError(f"has {wrong} heights that are not finite; replace them first", file)
+    if not 0 < float(profile.pitch) < math.inf:
+        raise HeightMapError(f"has a pitch of {float(profile.pitch):g} mm; expected a positive one", file)
+
+
+def _text(content: bytes, file: str) -> str:
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise HeightMapError(f"is no text at byte {error.start}; save it as UTF-8", file) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n").rstrip()
+
+
+def _numbers(lines: list[str], file: str, *, first: int, counts: tuple[int, ...], separator: str | None) -> np.ndarray:
+    """Numbers (lines, count) of lines that all hold the same count, one of `counts`. first: the number of lines[0]."""
+    if not lines:
+        raise HeightMapError("holds no points", file)
+    try:  # at once; where that fails, line by line to say where
+        table = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
+        if table.shape[0] == len(lines) and table.shape[1] in counts:
+            return table
+    except ValueError:
+        pass
+    rows = []
+    for number, line in enumerate(lines, first):
+        try:
+            rows.append([float(part) for part in line.split(separator)])
+        except ValueError as error:
+            raise HeightMapError(f"reads {line[:60]!r}; expected numbers", file, number) from error
+        if len(rows[-1]) != len(rows[0]) or len(rows[0]) not in counts:
+            expected = len(rows[0]) if len(rows[0]) in counts else " or ".join(map(str, counts))
+            raise HeightMapError(f"has {len(rows[-1])} numbers; expected {expected}", file, number)
+    return np.array(rows)

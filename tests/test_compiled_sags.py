@@ -1,0 +1,200 @@
+"""Sags that are not round in the compiled trace: rays, adjoint and tangents as torch finds them."""
+
+import dataclasses
+
+import pytest
+import torch
+from compiled_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
+from problems import scalar, vector
+from torch.autograd import gradcheck, gradgradcheck
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
+
+from raytrace.materials.glass import MIRROR
+from raytrace.maths.value import to
+from raytrace.system.rays import Rays
+from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
+from raytrace.system.shapes import SAG_TERMS
+from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.jacobian import hit_jacobian
+from raytrace.tracing.trace import trace_surfaces
+
+
+def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(thickness), c, k, vector(*coefficients), kind=kind, **others)
+
+
+def departed(sag_terms, curvature=None, conic=None, *coefficients: float) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(4.0), c, k, vector(*coefficients) if coefficients else None, sag_terms=sag_terms)
+
+
+def drawn(count: int, size: float, seed: int = 3) -> torch.Tensor:
+    return size * torch.randn(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+#: Each with what it stands in: indices before and behind. Steep enough for rays of `some_rays` to miss some of them.
+FACES = {
+    "toroid": freeform("toroidal", 1 / 14, -0.7, -1 / 11, 1e-3, -2e-5, 1e-7),
+    "toroid of one curve": freeform("toroidal", 1 / 12, None, 1 / 9),
+    "cylinder along x": freeform("toroidal", None, None, 1 / 7),
+    "cylinder along y": freeform("toroidal", 1 / 14, None, 0.0),
+    "biconic": freeform("biconic", 1 / 12, -1.0, -1 / 15, 0.5),
+    "biconic of positive curvatures": freeform("biconic", 1 / 12, 0.3, 1 / 9, -2.5),
+    "tilted plane": departed(TiltSag(scalar(0.3), scalar(-0.2))),
+    "polynomial": departed(PolynomialSag(drawn(9, 0.3), scalar(6.0)), 1 / 14, -0.7),
+    "polynomial on an asphere": departed(PolynomialSag(drawn(5, 0.3), scalar(6.0)), 1 / 14, None, 1e-3, 2e-5, -1e-7),
+    "polynomial without terms": departed(PolynomialSag(vector(), scalar(6.0)), 1 / 14),
+    "irregular": departed(IrregularSag(*map(scalar, (0.2, -0.3, 0.1, 30.0, 7.0))), -1 / 20),
+    "fringe": departed(FringeSag(drawn(11, 0.02), *map(scalar, (14.0, 0.5, -0.7))), 1 / 20, None, 1e-4),
+    "Zernike": departed(ZernikeSag(drawn(11, 0.02), scalar(9.0)), 1 / 20, 0.4),
+}
+each = pytest.mark.parametrize("name", FACES)
+
+#: Two by whom derivatives that take seconds, one number after the other by torch, are compared in every run.
+QUICK = "toroid", "biconic"
+two_of_each = pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in FACES]
+)
+END = Surface(scalar(0.0))
+
+
+def systems(name: str) -> list[Surface]:
+    """The surface refracting into glass and out of it, and reflecting."""
+    face = FACES[name]
+    mirror = dataclasses.replace(face, glass=MIRROR, thickness=scalar(-9.0), semi_diameter=5.0)
+    return [face, dataclasses.replace(face, curvature=scalar(-0.02), thickness=scalar(6.0)), mirror]
+
+
+def indices(dtype=torch.float64) -> list[torch.Tensor]:
+    air, glass = scalar(1.0).to(dtype), scalar(1.6).to(dtype)
+    return [air, glass, air, air]
+
+
+@each
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_rays_of_all_fates_are_traced_as_by_torch(name, dtype, with_path):
+    surfaces, rays = to(systems(name), dtype=dtype), some_rays(dtype=dtype)
+    assert all(is_expressible(surface) for surface in surfaces)
+    rays = rays if with_path else dataclasses.replace(rays, opl=None)
+    compiled, eager = both(lambda: trace_surfaces(surfaces, rays, indices=indices(dtype)))
+    assert 5 < int((~eager.valid).sum()) < 690
+    assert_same_rays(compiled, eager, 10 * CLOSE[dtype])
+
+
+@each
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
+    rays, given_surfaces = some_rays(dtype=dtype), to(systems(name), dtype=dtype)
+    weights = torch.randn(7, 700, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+
+    def gradients():
+        surfaces, media, leaves = with_leaves(given_surfaces, indices(dtype))
+        given = [rays.position.clone().requires_grad_(), rays.direction.clone().requires_grad_()]
+        opl = rays.opl.clone().requires_grad_() if with_path else None
+        end = trace_surfaces(surfaces, Rays(*given, rays.valid, opl), indices=media)
+        out = [end.position, end.direction, *([end.opl[None]] if with_path else [])]
+        merit = sum((w * x).sum() for w, x in zip(weights.split([3, 3, 1]), out, strict=False))
+        return torch.autograd.grad(merit, [*leaves, *given, *([opl] if with_path else [])], allow_unused=True)
+
+    for f, e in zip(*both(gradients), strict=True):
+        if e is None:
+            assert f is None or not f.any()
+            continue
+        assert torch.isfinite(f).all()
+        assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
+
+
+@two_of_each
+@pytest.mark.parametrize(
+    ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
+)
+def test_the_tangents_are_those_of_torch(name, dtype, close):
+    rays = some_rays(200, dtype=dtype)
+    surfaces, media, leaves = with_leaves(to(systems(name), dtype=dtype), indices(dtype))
+    compiled, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=media))
+    for f, e in zip(compiled, eager, strict=True):
+        assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
+
+
+@two_of_each
+def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
+    face = FACES[name]
+    rays = Rays(*(part[..., 46:54] for part in (some_rays().position, some_rays().direction, some_rays().valid)))
+
+    def hits(curvature, conic, *others):
+        changed = tree_unflatten(list(others), kinds)
+        if "coefficients" in changed:
+            changed["coefficients"] = changed["coefficients"] * share
+        surfaces = [dataclasses.replace(face, curvature=curvature, conic=conic, **changed), END]
+        end = trace_surfaces(surfaces, rays, indices=[*indices()[:2], indices()[1]])
+        return torch.where(end.valid, end.position[:2], 0.0)
+
+    numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic)]
+    more = {name: getattr(face, name) for name in ("coefficients", "sag_terms") if getattr(face, name) is not None}
+    if "coefficients" in more:
+        share = 3.0 ** (-2 * torch.arange(len(more["coefficients"]), dtype=torch.float64))  # so that all weigh alike
+        more["coefficients"] = more["coefficients"] / share
+    others, kinds = tree_flatten(more)
+    numbers = tuple(number.clone().requires_grad_() for number in (*numbers, *others))
+    with trace_engine("compiled"):
+        assert gradcheck(hits, numbers, atol=1e-6)
+        assert gradgradcheck(hits, numbers, atol=1e-5, fast_mode=True)
+
+
+@each
+def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
+    rays = some_rays(40_000)
+
+    def gradient(threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            surfaces, media, leaves = with_leaves(systems(name), indices())
+            end = trace_surfaces(surfaces, rays, indices=media)
+            return torch.autograd.grad((end.position**2).sum(), leaves, allow_unused=True)
+        finally:
+            torch.set_num_threads(before)
+
+    with trace_engine("compiled"):
+        for a, b in zip(gradient(1), gradient(2), strict=True):
+            assert a is b is None or torch.equal(a, b)
+        some = slice(1237, 1300)
+        few = Rays(rays.position[:, some], rays.direction[:, some], rays.valid[some], rays.opl[some])
+        alone, among = (trace_surfaces(systems(name), given, indices=indices()) for given in (few, rays))
+    assert torch.equal(alone.position, among.position[:, some])
+    assert torch.equal(alone.direction, among.direction[:, some])
+
+
+@pytest.mark.parametrize("name", [name for name, face in FACES.items() if face.sag_terms is not None])
+def test_powers_are_the_sag_terms(name):
+    """At points all over and beyond its disc, with slopes and second derivatives."""
+    sag_terms = FACES[name].sag_terms
+    kind = SAG_TERMS[type(sag_terms).__name__]
+    powers = kind.powers(sag_terms)
+    x, y = drawn(200, 6.0, seed=1), drawn(200, 6.0, seed=2)
+    given, expected = (
+        row.sag(tree_leaves(row.prepare(of)), x, y, 2)
+        for row, of in ((SAG_TERMS["PowerSag"], powers), (kind, sag_terms))
+    )
+    for g, e in zip(given, expected, strict=True):
+        assert float((g - e).abs().max()) <= 1e-11 * (1.0 + float(e.abs().max()))
+    bound = SAG_TERMS["PowerSag"].size(tree_leaves(powers), torch.hypot(x, y))
+    assert bool((expected.z.abs() <= bound * (1 + 1e-12)).all())
+
+
+def test_what_stays_with_torch():
+    """Heights on a grid, terms of a degree whose powers would lose digits, odd bases, and powers that differ by ray."""
+    faces = [
+        departed(GridSag(torch.zeros(4, 4, dtype=torch.float64), scalar(5.0))),
+        departed(ZernikeSag(drawn(92, 1e-3), scalar(9.0))),
+        departed(PowerSag(*(scalar(n) for n in (0.0, 0.0, 1.0, 0.0)), torch.zeros(2, 3, 1, dtype=torch.float64))),
+        dataclasses.replace(departed(TiltSag(scalar(0.1), scalar(0.0)), 0.01, None, 1e-3), kind="odd asphere"),
+    ]
+    assert not any(is_expressible(face) for face in faces)
+    with pytest.raises(ValueError, match="no Jacobian for height maps"):
+        hit_jacobian(faces[:1], some_rays(5), [faces[0].thickness.clone().requires_grad_()], indices=indices()[:2])
