@@ -93,7 +93,7 @@ def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
         return error
     return RuntimeError(
         f"{verb} does not work under torch.func.vmap: it reads numbers that vmap hides. Call it for each lens in a "
-        "loop; under vmap work first_order, rays, base_ray, and launch, trace_lens and spot_of of raytrace.optics"
+        "loop; under vmap work first_order, rays, base_ray, and launch, trace_lens and spot_of of raytrace.tracing"
     )
 
 

@@ -12,9 +12,9 @@ import torch
 
 import raytrace as rt
 from raytrace import public
-from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
+from raytrace.tracing.launch import launch
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import trace_lens
 
 NAN = float("nan")
 VERBS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
