@@ -109,7 +109,7 @@ def test_a_range_of_distances_is_remembered_behind_surfaces_that_do_not_bend():
     memo = Memo(object_distances=(10e3, 50e3))
     with trace_engine("eager"):
         kept, traced = trace_bundle(bundle, memo), trace_bundle(bundle)
-    assert [(one.found.count, one.found.smooth) for one in memo._kept] == [(1, True)]
+    assert [(stored.result.count, stored.result.smooth) for stored in memo._stored] == [(1, True)]
     assert float((kept.position - traced.position).detach().abs().max()) < 1e-8  # mm
     assert float((kept.opl - traced.opl).detach().abs().max()) < 1e-8
 

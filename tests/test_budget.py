@@ -91,7 +91,7 @@ def test_analyses_in_pieces_are_those_of_all_at_once(lens, monkeypatch):
     found = {}
     for pieces in (False, True):
         if pieces:
-            for module in ("aperture", "mtf", "wavefronts", "encircled"):
+            for module in ("pupil_autocorrelation", "mtf", "wavefronts", "encircled"):
                 each = importlib.import_module(f"raytrace.analysis.{module}")
                 monkeypatch.setattr(each, "piece", lambda each: 1 if each > 1e4 else 5000)
         found_map = rt.wavefront(lens, size=9, fields=fields)

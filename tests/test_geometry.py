@@ -13,6 +13,7 @@ from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import Unbuildable, defects
+from raytrace.tracing.lens_report import Info
 
 GLASS = model_glass(1.6, 50.0)
 
@@ -124,4 +125,4 @@ def test_commands_warn_with_one_wording(command, tmp_path, capsys):
 def test_python_warns_too():
     with pytest.warns(Unbuildable, match="negative"):
         rt.info(CASES["gap"][0]())
-    assert rt.optics.views.Info(CASES["reach"][0]()).document()["geometry"][0]["kind"] == "reach"
+    assert Info(CASES["reach"][0]()).document()["geometry"][0]["kind"] == "reach"

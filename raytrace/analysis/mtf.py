@@ -262,7 +262,7 @@ def _gridded(scene: Scene, frequencies: Tensor, seconds: float | None) -> tuple[
 
 
 def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
-    """The same by the quadrature of `shear.py`, where a fine grid would take longer and polynomials give the wave.
+    """The same by the quadrature of `pupil_autocorrelation.py`, where the wave is polynomial and the grid is slower.
 
     The grid needs points for all that the blur could modulate, the quadrature for the frequencies that are listed.
     """

@@ -406,7 +406,7 @@ class Variables(Owned):
                 getattr(self, variable.name).clamp_(min(low, high), max(low, high))
 
     def violation(self) -> Tensor:
-        """How far the lens is from its limits, mm² (`limits.violation`), and what is solved for from its bounds."""
+        """How far the lens is from its limits, mm² (`violation`), and what is solved for from its bounds."""
         lens = self()
         lacks = violation(lens, self.limits)
         if self.held is None:

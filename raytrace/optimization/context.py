@@ -1,6 +1,6 @@
 """Plan: what the rows of a merit function need, found once; `EvaluationContext` gives it at variables.
 
-An operand is a row of a table (`operands.OPERANDS`); all rows of one operand in one configuration are evaluated
+An operand is a row of a table (`table.OPERANDS`); all rows of one operand in one configuration are evaluated
 together.
 """
 

@@ -1,7 +1,7 @@
 """Damped least squares: variables to where a sum of squares is least, under bounds and conditions.
 
 Every cycle takes the exact Jacobian J of the residuals r, scales variables by its columns and tries the step of the
-damped linear model (`step.py`), bent by the second derivative along it (geodesic acceleration); how much of what the
+damped linear model, bent by the second derivative along it (geodesic acceleration); how much of what the
 model foretold came true sets the damping of the next.
 
 Source: Levenberg 1944, Marquardt 1963, Moré 1978; Nielsen 1999 (damping by the gain); Transtrum & Sethna 2012 (geodesic

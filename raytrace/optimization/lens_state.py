@@ -140,7 +140,7 @@ _STILL = 1e-15  # relative
 
 
 class LensState:
-    """view: `model.View`; variables: (n,) numbers, or a Dual of them."""
+    """view: `lens_model.View`; variables: (n,) numbers, or a Dual of them."""
 
     def __init__(self, view, variables):
         self.view, self.lens, self.variables = view, view.lens, variables

@@ -1,7 +1,7 @@
 """Merit functions as values: the rows of a file, of a list or of a default, which can be joined and weighed anew.
 
 rt.Merit.of(lens)                      the file's own
-rt.Merit.default(lens, "spot")         `default.rows_of`
+rt.Merit.default(lens, "spot")         `default_merit.rows_of`
 one + other, 2 * one                   joined; with all weights doubled
 one.with_weights(EFFL=1)               of all rows of an operand; with_targets likewise
 """
@@ -38,7 +38,7 @@ class Merit:
 
     @classmethod
     def default(cls, lens: Lens, kind: str = "spot", **how) -> "Merit":
-        """A default merit function of the lens, in mm; how: as for `default.rows_of`."""
+        """A default merit function of the lens, in mm; how: as for `default_merit.rows_of`."""
         return cls(rows_of(lens, kind, **how))
 
     def __len__(self) -> int:
@@ -119,7 +119,7 @@ def merit_for(
     """The merit function that is meant: a value, rows, the name of a default one, or by default the file's.
 
     glass_thickness, air_thickness, edge: boundaries in mm, also as words "2:15", beside the rows that there are. how:
-    as for `default.rows_of`, of a default one; what is None is left to it. Raises BadMerit.
+    as for `default_merit.rows_of`, of a default one; what is None is left to it. Raises BadMerit.
     """
     how = {name: given for name, given in how.items() if given is not None}
     glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))

@@ -147,7 +147,7 @@ def optimize(
 
     merit: `Merit`, rows, by default the file's, or the kind of a default merit function: "spot", "wavefront",
     "angular", "mtf", which rings, arms, reference, frequencies (cycles/mm) and the weights of fields and wavelengths
-    belong to, as in `default.rows_of`; boundaries in mm beside it: glass_thickness, air_thickness (least, greatest),
+    belong to, as in `default_merit.rows_of`; boundaries, mm: glass_thickness, air_thickness (least, greatest),
     edge (least); or any function of a lens that gives one number (), to be least, which L-BFGS descends on.
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`optimization.constraints`). cycles,

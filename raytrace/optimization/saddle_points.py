@@ -1,6 +1,6 @@
 """Insertion: from a minimum over saddles to the minima of lenses with one element more, two from every surface.
 
-A meniscus without thickness makes a saddle of the minimum (`meniscus.py`). Down either side of it all but the new
+A meniscus without thickness makes a saddle of the minimum. Down either side of it all but the new
 thicknesses vary; then these grow, a part of their least values at a time, and the lens follows; at last everything
 varies under the whole merit function.
 

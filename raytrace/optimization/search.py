@@ -83,7 +83,7 @@ def search(
     merit to conventions: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
     which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
-    more (`insertion.py`). seconds: after which it ends; seed: of all that is drawn. folder: keeps the minima as lens
+    more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. folder: keeps the minima as lens
     files, a table and figures, and how far the search has come: called again it goes on, and ends as if it had never
     ended before. Ctrl-C ends with what was found.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
@@ -138,7 +138,7 @@ def _places(free: Freedom, insert: bool | Sequence[int], starts: int | None) -> 
 
 
 def _stopped(run: "_Run | Insertion", progress: Callable | None) -> str:
-    """Why a search ended: a key of `searched.STOPPED`."""
+    """Why a search ended: a key of `search_result.STOPPED`."""
     try:
         run.through(progress)
     except Stopped:

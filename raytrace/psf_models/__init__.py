@@ -2,7 +2,7 @@
 
     psf(lens, model="gaussian", fields=…, object_distances=…, pixel=0.005, size=21, tol=1e-3) -> Psf
 
-`models.py` is the table of the models, `ladder.py` drives them to a tolerance, `compute.py` is the call.
+`models.py` is the table of the models and drives them to a tolerance, `compute.py` is the call.
 
 | model    | what it knows of the lens                                                       | module         |
 |----------|---------------------------------------------------------------------------------|----------------|

@@ -1,6 +1,6 @@
 """Clear pupil: where along arms of the pupil light passes every aperture, and how those edges move with the lens.
 
-An edge ρ of the clear part of an arm is a zero of a clearance c of `aperture.clearance`. Traced rays find it without
+An edge ρ of the clear part of an arm is a zero of a clearance c of `apertures.clearance`. Traced rays find it without
 derivatives. Two Newton steps with a constant slope s, ρ - c(ρ)/s, then carry its derivatives.
 """
 

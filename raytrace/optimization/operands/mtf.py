@@ -1,6 +1,6 @@
 """Operands of modulation and of the Strehl ratio.
 
-The MTF of diffraction follows from a few rings of rays (`sheared.py`), that of rays is a sum over a beam; both are
+The MTF of diffraction follows from a few rings of rays, that of rays is a sum over a beam; both are
 traced with all the rows' rays. What remains, a beam that apertures clip and the Strehl ratio, are the functions of
 `analysis.mtf` and `psf_models.wave`, with their derivatives by torch.
 
@@ -252,7 +252,7 @@ def diffraction_mtf(
 class Wave:
     """The wave of one field at one sampling, of one wavelength or all, and what rows of any operand ask of it.
 
-    From the rays of a few rings (`shear.py`). Where these do not tell it, as where apertures stop some of them, from
+    From the rays of a few rings (`pupil_autocorrelation.py`). Where apertures stop some of them, from
     those of a grid by torch, with a pass backward for each number.
     """
 
