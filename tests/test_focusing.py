@@ -1,13 +1,17 @@
 """A flat plate that learns to be a lens from pictures alone; its ideal, its bound, and what it refuses."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from scripts import script
 
+from raytrace.cli.door import CommandError
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.wave_optics.compute import psf
+from raytrace.wave_optics.element_files import read_label
 
 focusing = script("focusing")
 Setting, _behind, best_kernel, draw = focusing.Setting, focusing._behind, focusing.best_kernel, focusing.draw
@@ -91,3 +95,25 @@ def test_the_script_writes_heights_and_a_figure(capsys, tmp_path):
     assert '"steps": 2' in capsys.readouterr().out
     assert (tmp_path / "lens.npy").exists()
     assert (tmp_path / "lens.png").stat().st_size > 10_000
+
+
+def test_a_focusing_lens_of_other_measures(tmp_path):
+    """Half as wide, at another distance and wavelength, its features given."""
+    words = ["--aperture", "0.5", "--sensor", "12", "--wavelength", "0.64", "--feature", "0.01", "--size", "33"]
+    focusing.main(["--steps", "2", "--json", "-o", str(tmp_path / "lens.npy"), *words])
+    assert np.load(tmp_path / "lens.npy").shape == (50, 50)
+    label = read_label(tmp_path / "lens.npy")
+    assert (label.design_wavelength, label.pitch, label.aperture) == (0.64, 0.01, 0.5)
+    with pytest.raises(CommandError, match="a lens is learned at one wavelength"):
+        focusing.main(["--wavelength", "0.5", "0.6"])
+
+
+def test_the_script_prints_the_peak_of_the_plate(capsys, tmp_path):
+    focusing.main(["--steps", "4", "--json", "-o", str(tmp_path / "lens.npy")])
+    document = json.loads(capsys.readouterr().out)
+    assert document["initial_peak_ratio"] < 0.01 < document["peak_ratio"] < 0.5
+    assert document["steps"] == 4
+    assert document["seconds"] > 0
+    assert 0.85 < document["flat_pixels_best"] < 0.9
+    assert np.load(tmp_path / "lens.npy").shape == (128, 128)
+    assert json.loads((tmp_path / "lens.npy.json").read_text())["material"] == "F_SILICA"

@@ -210,19 +210,6 @@ def test_what_is_dear_is_said_or_refused(run):
     assert chosen.memory < 3e9
 
 
-def test_a_focusing_lens_of_other_measures(run, tmp_path):
-    """Half as wide, at another distance and wavelength, its features given."""
-    words = ("--aperture", "0.5", "--sensor", "12", "--wavelength", "0.64", "--feature", "0.01", "--size", "33")
-    code, _, err = run("focus", "--steps", "2", "--json", "-o", "lens.npy", *words)
-    assert code == 0, err
-    assert np.load(tmp_path / "lens.npy").shape == (50, 50)
-    label = read_label(tmp_path / "lens.npy")
-    assert (label.design_wavelength, label.pitch, label.aperture) == (0.64, 0.01, 0.5)
-    code, _, err = run("focus", "--wavelength", "0.5", "0.6")
-    assert code == 1
-    assert "a lens is learned at one wavelength" in err
-
-
 def test_heights_of_all_parts_are_drawn():
     """The round lens and the cubic plate over it: two maps, the second odd in x and y."""
     elements = baseline("cubic-refractive", aim(radius=0.5))
@@ -291,19 +278,6 @@ def test_a_small_file_names_its_aperture(run, tmp_path):
     code, _, err = run("psf", "--element", "small.npy")
     assert code == 1
     assert "less than the aperture of 5 mm; give --aperture 1" in err
-
-
-def test_focus_prints_what_became_of_the_plate(run, tmp_path):
-    code, out, err = run("focus", "--steps", "4", "--json", "-o", "lens.npy", "--plot", "focus.png")
-    assert code == 0, err
-    document = json.loads(out)
-    assert document["initial_peak_ratio"] < 0.01 < document["peak_ratio"] < 0.5
-    assert document["steps"] == 4
-    assert document["seconds"] > 0
-    assert 0.85 < document["flat_pixels_best"] < 0.9
-    assert np.load(tmp_path / "lens.npy").shape == (128, 128)
-    assert json.loads((tmp_path / "lens.npy.json").read_text())["material"] == "F_SILICA"
-    assert (tmp_path / "focus.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.parametrize("name", [command.name.removeprefix("wave-") for command in wave.SUBCOMMANDS])
