@@ -85,6 +85,7 @@ class CodesignSettings(Settings):
     drt_rays: int | None = None
     sampling: str = "sobol"
     vignetting: str = "none"
+    ray_aiming: str | None = None
     decay: str = "none"
 
 

@@ -386,3 +386,20 @@ def test_focus_of_a_sensor_is_its_paraxial_conjugate():
         image = paraxial_image_distance(begun, torch.tensor(1e3 * distance, dtype=torch.float64))
         assert focus(float(image)) == pytest.approx(distance, rel=1e-4)
     assert codesign_setup.focus_of(lens, CodesignSettings(vary="sensor thickness:5")) is None
+
+
+@pytest.mark.slow
+def test_ray_aiming_is_a_setting_of_a_run(run, pictures):
+    """The learned lens and the record of the settings have the aiming that the option specifies."""
+    options = ("retrofocus", "--ray-aiming", "real", "--data", pictures, *SMALL, "-o", "run")
+    assert run(*options)[0] == 0
+    assert read("run/joint/settings.json")["ray_aiming"] == "real"
+    assert read_lens("run/lens.zmx").ray_aiming == "real"
+
+
+def test_a_lens_is_aimed_before_training():
+    """As the option specifies, by default as its file does."""
+    lens = read_lens("retrofocus").at(ray_aiming="paraxial")
+    settings = {aiming: CodesignSettings(ray_aiming=aiming) for aiming in (None, "off", "real")}
+    aimed = {aiming: lens_at_start(lens, setting).ray_aiming for aiming, setting in settings.items()}
+    assert aimed == {None: "paraxial", "off": "off", "real": "real"}

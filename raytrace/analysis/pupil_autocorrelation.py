@@ -12,9 +12,7 @@ equations from these to the rays, whose derivatives by the variables come from t
 
 Source: Hopkins, Proc. Phys. Soc. B 70, 1957 (the sheared pupil); Golub & Pereyra 1973 (derivative of a fit).
 
-A pupil and its wave as polynomials of directions, where a few hundred rays determine them.
-
-The exit pupil as a regular grid of directions, whose autocorrelation is the optical transfer function.
+Where polynomials do not describe pupil and wave, the OTF is the autocorrelation of a regular grid of directions.
 """
 
 import math

@@ -3,6 +3,7 @@
 import argparse
 
 from raytrace.cli.options import (
+    RAY_AIMING,
     catalog,
     count,
     field_point,
@@ -97,6 +98,7 @@ ROWS = {
         "rays beyond the semi-diameters of the file: traced (none, default), or vignetted (semi-diameters)",
         choices=("none", "semi-diameters"),
     ),
+    "ray_aiming": option(**RAY_AIMING),
     "depth": option("layers, an even number, instead of the preset's (default 10 or 30)"),
     "width": option("maps of a layer, instead of the preset's (default 32 or 64)"),
     "epochs": option("of each step"),

@@ -184,6 +184,7 @@ def _experiment(report: Report) -> str:
     counts = {"Gaussian DRT in step 1" if s.drt_rays else "step 1": s.rays, "DRT in both steps": s.drt_rays}
     traced = [f"{count} rays ({s.sampling}) for {where}" for where, count in counts.items() if count is not None]
     rays = f", traced with {' and '.join(traced)}" if traced else ""
+    rays += "" if s.ray_aiming is None else f"; ray aiming {s.ray_aiming}"
     rays += "; rays beyond the semi-diameters are vignetted" if s.vignetting == "semi-diameters" else ""
     spread = "" if s.spread == "uniform" else " in 1/z"
     falling = "" if s.decay == "none" else ", falling to 0 along half a cosine"

@@ -302,13 +302,16 @@ def reference(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--reference", choices=("primary", "own"), help=what)
 
 
+#: Choices and help of --ray-aiming.
+RAY_AIMING = {
+    "choices": ("auto", "off", "paraxial", "real"),
+    "help": "aim rays at the stop: not at all, over a stop as wide as the paraxial or the real marginal ray makes it, "
+    "or auto: real where the axis bends in front of the stop, else off (default: as the file specifies, else auto)",
+}
+
+
 def ray_aiming(parser) -> None:
-    parser.add_argument(
-        "--ray-aiming",
-        choices=("auto", "off", "paraxial", "real"),
-        help="aim rays at the stop: not at all, over a stop as wide as the paraxial or the real marginal ray makes it, "
-        "or auto: real where the axis bends in front of the stop, else off (default: as the file specifies, else auto)",
-    )
+    parser.add_argument("--ray-aiming", **RAY_AIMING)
 
 
 def plot(parser: argparse.ArgumentParser, what: str) -> None:

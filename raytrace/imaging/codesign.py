@@ -91,14 +91,15 @@ class Outcome:
 
 
 def lens_at_start(lens: Lens, settings: CodesignSettings) -> Lens:
-    """The lens at the wavelengths and aperture of the experiment, focused as it begins.
+    """The lens at the wavelengths, aperture and ray aiming of the experiment, focused for the start of training.
 
     Raises NoImage where an object at the focus distance, or between near and far, has no real image.
     """
     wavelengths, weights = (lens.wavelengths.new_tensor(n) for n in (settings.wavelengths, settings.wavelength_weights))
     if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
         raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
-    lens = with_wavelengths(lens, wavelengths, weights).at(f_number=settings.f_number)
+    lens = with_wavelengths(lens, wavelengths, weights)
+    lens = lens.at(f_number=settings.f_number, ray_aiming=settings.ray_aiming)
     if settings.vignetting == "semi-diameters":
         lens = _clipped(lens)
     real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none

@@ -1,24 +1,18 @@
-"""Limits: how thin and how thick glass and air may be, and how far a lens is from keeping to it.
+"""Variables: numbers of a lens as parameters of a module, with the scale of one step, and limits on thickness.
 
-limits = limits_of(lens, glass=(2, 15), edge=1)
-violation(lens, limits)          # Σ (what a thickness lacks, or has too much of)², mm²; 0 is buildable
+    variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
+    changed = variables()                               # the lens with its variables, differentiable
+    limits = limits_of(changed, glass=(2, 15), edge=1)  # least and greatest thickness of glass, least edge, mm
+    violation(changed, limits)                          # Σ (excess over a limit)², mm²; 0 is buildable
 
+The parameters are offsets from the lens. A state carries the identity of its lens, and loading compares it (`Owned`).
 
-Variables: which numbers of a lens are learned, how far one step moves them, and what keeps the lens buildable.
+A number that is solved for holds the focal length. The power φ of a lens is linear in the curvature and the thickness
+of each of its surfaces (Gauss's brackets), so that a number v follows from φ(0) + v [φ(1) - φ(0)] = |n′|/f, with its
+derivatives. A power is finite where the lens is afocal.
 
-variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
-changed = variables()          # the lens with its variables, differentiable
-
-Owned: parameters that are offsets from what they belong to, which a state carries and a load compares.
-
-Held: one number of a lens solved for, so that the focal length stays whatever else of the lens varies.
-
-The power φ of a lens is linear in the curvature and the thickness of each of its surfaces (Gauss's brackets), and so in
-any one such number v: φ(0) + v [φ(1) - φ(0)] = |n′|/f. The one that holds f is found at once, with its derivatives. A
-power is finite where the lens is afocal, as a singlet is without its one bent surface.
-
-
-Phase variables: the heights of a thin element as parameters of a module."""
+`PhaseVariables` are the heights of a thin element as parameters.
+"""
 
 import dataclasses
 import json

@@ -15,7 +15,7 @@ from raytrace.maths.numerics import broadcast_shape
 def lent(place: str):
     """A method that a higher room lends to a value: `place` is "room.file.function", imported when it is called.
 
-    The only way up in the house. Called on an instance it gets the instance first, as any method.
+    Called on an instance it gets the instance first, as any method.
     """
 
     def method(self, *arguments, **options):

@@ -4,14 +4,13 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
-import house
 import pytest
+import structure
 
 
-@pytest.mark.parametrize(("what", "most"), [("refraction", 5), ('psf(lens, "drt")', 35), ("training step", 35)])
-def test_work_walks_downhill_through_few_files(what, most):
-    """Five files of a PSF measure, once a call, how far the beam misses the stop; a training step does not."""
-    files, upward = house.walked(house.walks()[what])
+@pytest.mark.parametrize(("computation", "most"), [("refraction", 5), ('psf(lens, "drt")', 29), ("training step", 34)])
+def test_a_computation_runs_through_few_files_and_calls_no_higher_layer(computation, most):
+    files, upward = structure.walked(structure.walks()[computation])
     assert len(files) <= most, sorted(files)
     assert not upward
 

@@ -1,10 +1,9 @@
-"""The measures of the house, counted: lines of the package and of each room, and how long its functions are.
+"""Measures of the package: lines by package and by kind, lengths of functions, files that a computation runs through.
 
-    python tests/house.py
-    python tests/house.py walks    # files that a refraction, a PSF and a training step run through; calls that go up
+    python tests/structure.py
+    python tests/structure.py walks    # files of a refraction, a PSF and a training step; calls to a higher layer
 
-Lines are all those of the .py files. The body of a function is what stands behind its docstring, from the first line of
-its first statement to the last of its last; functions inside functions count by themselves, too.
+Lines are those of the .py files. A body of a function is its lines after the docstring.
 """
 
 import ast
@@ -32,6 +31,27 @@ def lines_of_rooms() -> Counter[str]:
         room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         found[room] += len(path.read_text(encoding="utf-8").splitlines())
     return found
+
+
+def lines_by_kind() -> Counter[str]:
+    """Lines of the package by kind: docstrings, imports, signatures, comments, blank, and the rest, code."""
+    counts = Counter()
+    for path in PACKAGE.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        lines, kinds = text.splitlines(), {}
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                kinds |= dict.fromkeys(range(node.lineno, node.end_lineno + 1), "imports")
+            elif isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                if not isinstance(node, ast.Module):
+                    kinds |= dict.fromkeys(range(node.lineno, node.body[0].lineno), "signatures")
+                if ast.get_docstring(node) is not None:
+                    docstring = node.body[0]
+                    kinds |= dict.fromkeys(range(docstring.lineno, docstring.end_lineno + 1), "docstrings")
+        for number, line in enumerate(lines, 1):
+            plain = "blank" if not line.strip() else "comments" if line.lstrip().startswith("#") else "code"
+            counts[kinds.get(number, plain)] += 1
+    return counts
 
 
 def lines_of_library() -> int:
@@ -117,6 +137,7 @@ def main() -> None:
     for room, lines in sorted(rooms.items(), key=lambda one: -one[1]):
         print(f"{lines:7,} {room}")
     print(f"{sum(rooms.values()):7,} lines, {lines_of_library():,} of them the library (all but {' and '.join(APART)})")
+    print("        " + ", ".join(f"{lines:,} {kind}" for kind, lines in lines_by_kind().most_common()))
     median, long = statistics.median(lengths.values()), sum(length > 25 for length in lengths.values())
     print(f"{len(lengths):7,} functions, median body {median:g} lines, {long} of more than 25")
     for place, length in sorted(lengths.items(), key=lambda one: -one[1])[:5]:
