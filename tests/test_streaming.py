@@ -16,8 +16,8 @@ from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.psf_models import psf
-from raytrace.psf_models import rays as plain
 from raytrace.psf_models.compute import stream_kernels
+from raytrace.psf_models.drt import kernels_of_rays
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing import streaming
@@ -278,7 +278,7 @@ def test_psf_is_that_of_all_rays_at_once(width):
     for distance in batch["object_distances"].split(1):
         one = scene(system, batch["fields"], distance, COLOURS)
         found, half = stream_kernels(one, pixels, 1501, max_bytes=FEW, width=width)
-        whole, first = (plain.kernels(one, pixels, rays=n, width=width) for n in (1501, 750))
+        whole, first = (kernels_of_rays(one, pixels, rays=n, width=width) for n in (1501, 750))
         assert float((found.kernel - whole.kernel).abs().max()) < 1e-9
         assert float((half.kernel - first.kernel).abs().max()) < 1e-9
 
