@@ -104,7 +104,7 @@ def test_a_beam_that_misses_the_stop_is_told_once_with_figures_and_a_remedy(caps
 
 
 #: Commands that trace no rays of a lens whose aiming may be chosen.
-WITHOUT = {"check", "convert", "glass", "bench", "wave", "codesign", "edof", "superres", "quantise"}
+WITHOUT = {"check", "convert", "glass", "bench", "wave"}
 
 
 @pytest.mark.parametrize("command", [command.name for command in COMMANDS])
