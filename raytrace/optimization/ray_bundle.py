@@ -33,7 +33,7 @@ from raytrace.tracing.aiming import aiming_of, is_bent
 from raytrace.tracing.compiled.run import Pushed, Task
 from raytrace.tracing.compiled.structure import is_expressible, rows_of
 from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
-from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 
@@ -43,25 +43,21 @@ def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
     kind, distance = state.lens.fields.kind, state.thickness[0]
     index = np.abs(state.view.indices[:, :1])
     radius, depth = 0.5 * state.entrance_pupil_diameter, data.entrance_pupil_position
-    at_infinity = np.isinf(value_of(distance))
     x, y = (state.field_scale * part for part in (np.tan(np.deg2rad(field)) if kind == "angle" else field))
-    aim = radius * pupil[0], radius * pupil[1], depth
-    if at_infinity:
+    aim = Vector((radius * pupil[0], radius * pupil[1], depth))
+    if state.is_at_infinity:
         length = np.sqrt(x * x + y * y + 1.0)
         direction = x / length, y / length, 1.0 / length
         return aim, direction, index * dot(aim, direction)
-    source = x, y, -distance
-    chord = tuple(a - o for a, o in zip(aim, source, strict=True))
+    source = Vector((x, y, -distance))
+    chord = aim - source
     length, far = np.sqrt(dot(chord, chord)), np.sqrt(dot(source, source))
-    # Towards +z: a virtual object lies behind surface 1, and a pupil may lie before the object.
-    is_backward, is_virtual = value_of(depth) < -value_of(distance), value_of(distance) < 0
-    direction = tuple((-part if is_backward else part) / length for part in chord)
-    if abs(value_of(distance)) < abs(value_of(depth)):
-        return source, direction, index * (far if is_virtual else -far)
-    path = (dot(aim, aim) - 2 * dot(aim, source)) / (length + far)
-    if is_backward:
-        path = -path if is_virtual else -path - 2 * far
-    return aim, direction, index * path
+    distance, depth = value_of(distance), value_of(depth)
+    backward, nearer = depth < -distance, abs(distance) < abs(depth)
+    path = path_from_point(aim, source, length, far)
+    path = path_towards_lens(path, far, backward=backward, virtual=distance < 0, nearer=nearer)
+    direction = chord * ((-1.0 if backward else 1.0) / length)
+    return source if nearer else aim, direction, index * path
 
 
 _STEPS = 12

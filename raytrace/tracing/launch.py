@@ -34,6 +34,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.maths.dual import select
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import detached, value
@@ -153,8 +154,22 @@ def rays_from_point(point: Tensor, aim: Tensor, *, index: Tensor) -> Rays:
     point, aim: (3, ...) mm in the frame of surface 1; index: (...) of the object space. Any object distance.
     """
     chord = aim - point
-    length = dot(chord, unit(chord)) + dot(point, unit(point))
-    return start(aim, chord, index * (dot(aim, aim) - 2 * dot(aim, point)) / length)
+    return start(aim, chord, index * path_from_point(aim, point, dot(chord, unit(chord)), dot(point, unit(point))))
+
+
+def path_from_point(aim, point, chord, distance):
+    """Path in mm (n = 1) at aim points A less the distance |O| of the point; chord: |A - O|. Any number type."""
+    return (dot(aim, aim) - 2 * dot(aim, point)) / (chord + distance)
+
+
+def path_towards_lens(path, distance, *, backward, virtual, nearer):
+    """Path of a ray that travels towards +z, started at the nearer of object point and aim point. Any number type.
+
+    path: as of `path_from_point`; distance: |O|; backward: whether A lies before O; virtual: O behind surface 1;
+    nearer: O nearer to surface 1 than A. Paths count from the object, or to it if it is virtual.
+    """
+    from_aim = select(backward, select(virtual, -path, -path - 2 * distance), path)
+    return select(nearer, select(virtual, distance, -distance), from_aim)
 
 
 def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays:
@@ -325,20 +340,17 @@ def _towards_the_lens(point: Tensor, aim: Tensor, index: Tensor) -> Rays:
     """Rays of an object point O through pupil points A that travel towards +z, started at the nearer of O and A.
 
     A virtual object lies behind surface 1, and an entrance pupil may lie before the object (a stop behind the focus
-    of what is before it): then light runs from A to O on the same line. Paths count from the object, O_z < 0, or, if
-    it is virtual, to it.
+    of what is before it): then light runs from A to O on the same line.
     """
     rays = rays_from_point(point, aim, index=index)
-    backward = aim[2] < point[2]
-    virtual = point[2] > 0
-    length = index * dot(point, unit(point))
-    from_aim = torch.where(backward, torch.where(virtual, -rays.opl, -rays.opl - 2 * length), rays.opl)
-    nearer = point[2].abs() < aim[2].abs()
+    backward, nearer = aim[2] < point[2], point[2].abs() < aim[2].abs()
+    far = index * dot(point, unit(point))
+    path = path_towards_lens(rays.opl, far, backward=backward, virtual=point[2] > 0, nearer=nearer)
     return Rays(
         position=torch.where(rays.valid & nearer, point, rays.position),
         direction=torch.where(rays.valid & backward, -rays.direction, rays.direction),
         valid=rays.valid,
-        opl=torch.where(rays.valid, torch.where(nearer, torch.where(virtual, length, -length), from_aim), 0.0),
+        opl=torch.where(rays.valid, path, 0.0),
     )
 
 
