@@ -18,7 +18,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths, with_number
 from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, gap_behind, vertex_curvature
+from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled.structure import structure_of
 from raytrace.tracing.paraxial import signed
@@ -201,11 +201,8 @@ class View:
 
     @cached_property
     def media(self) -> list[int]:
-        """Which surface the medium behind each one is told by: its own, but for mirrors and coordinate breaks."""
-        found: list[int] = []
-        for k, surface in enumerate(self.lens.surfaces):
-            found.append(found[-1] if k and (surface.is_mirror or surface.is_break) else k)
-        return found
+        """The surface whose glass fills the space behind each surface."""
+        return medium_surfaces(self.lens.surfaces)
 
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:

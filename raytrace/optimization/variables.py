@@ -41,6 +41,7 @@ from raytrace.system.parameter_paths import (
     parse_bounds,
     sensor,
 )
+from raytrace.system.surface import medium_surfaces
 from raytrace.words import calling_level, did_you_mean
 
 #: Words for several numbers at once.
@@ -243,14 +244,8 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
 
 def bends_light(lens: Lens, k: int) -> bool:
     """Whether a surface is a mirror, or has other media before and behind it."""
-    return lens.surfaces[k].is_mirror or not same(_medium(lens, k - 1), _medium(lens, k))
-
-
-def _medium(lens: Lens, k: int) -> Glass:
-    """The medium behind a surface; mirrors and coordinate breaks have that before them."""
-    while k > 0 and (lens.surfaces[k].is_mirror or lens.surfaces[k].is_break):
-        k -= 1
-    return lens.surfaces[k].glass
+    surfaces, media = lens.surfaces, medium_surfaces(lens.surfaces[: k + 1])
+    return surfaces[k].is_mirror or not same(surfaces[media[k - 1]].glass, surfaces[media[k]].glass)
 
 
 def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:

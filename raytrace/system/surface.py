@@ -7,6 +7,8 @@ Functions work in the frame of the vertex, components first, for any batch shape
 intersection with rays.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -77,6 +79,14 @@ SHAPE = ("curvature", "conic", "coefficients", "kind", "sag_terms")
 def gap_behind(surface: Surface) -> Tensor | Gap:
     """The gap to the next surface: the thickness, with the pose behind the surface if it has one."""
     return surface.thickness if surface.after is None else Gap(surface.after, surface.thickness)
+
+
+def medium_surfaces(surfaces: Sequence[Surface]) -> list[int]:
+    """The surface whose glass fills the space behind each surface: mirrors and coordinate breaks keep the medium."""
+    media: list[int] = []
+    for k, surface in enumerate(surfaces):
+        media.append(media[-1] if k and (surface.is_mirror or surface.is_break) else k)
+    return media
 
 
 def is_posed(surface: Surface) -> bool:

@@ -22,7 +22,7 @@ from raytrace.system.lens import Lens, index_behind
 from raytrace.system.phases import IdealLens, power_of
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind, vertex_curvature
+from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import trace_compiled
 from raytrace.tracing.compiled.structure import is_expressible
@@ -266,10 +266,7 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     dtype = lens.surfaces[-2].thickness.dtype
     if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
         return _media_in_environment(lens, wavelength, dtype)
-    glasses: list[glass.Glass] = []
-    for surface in lens.surfaces:
-        keeps = glasses and (surface.is_mirror or surface.is_break or _same(surface.glass, glasses[-1]))
-        glasses.append(glasses[-1] if keeps else surface.glass)
+    glasses = [lens.surfaces[k].glass for k in medium_surfaces(lens.surfaces)]
     # Air lies between all elements: each medium is evaluated once.
     distinct = {(medium.formula, id(medium.coefficients)): medium for medium in glasses}
     indices = _refractive_indices(list(distinct.values()), wavelength)
@@ -277,18 +274,12 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     return [by_medium[medium.formula, id(medium.coefficients)] for medium in glasses]
 
 
-def _same(a: glass.Glass, b: glass.Glass) -> bool:
-    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
-
-
 def _media_in_environment(lens: Lens, wavelength: Tensor, dtype: torch.dtype) -> list[Tensor]:
     """`media` of a lens at a temperature and a pressure."""
     indices: list[Tensor] = []
     by_medium: dict[tuple, Tensor] = {}
-    for number, surface in enumerate(lens.surfaces):
-        if indices and (surface.is_mirror or surface.is_break):
-            indices.append(indices[-1])
-            continue
+    for number in medium_surfaces(lens.surfaces):
+        surface = lens.surfaces[number]
         key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
         if key not in by_medium:
             by_medium[key] = index_behind(lens, number, wavelength).to(dtype)

@@ -28,9 +28,8 @@ from raytrace.maths.dual import Dual, value_of
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import ENDS, LensState
 from raytrace.optimization.ray_bundle import Bundle, Marks
-from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import Surface, sag_at
+from raytrace.system.surface import Surface, medium_surfaces, sag_at
 from raytrace.tracing.trace import media
 
 
@@ -122,7 +121,7 @@ class Gaps:
     def __init__(self, planner: Planner):
         view, surfaces = planner.view, planner.lens.surfaces
         self.semi_diameters = planner.shared(SemiDiameters)
-        self.is_air = _in_air_of_gaps(planner.lens)
+        self.is_air = np.array([is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)])
         #: -1 behind an odd number of mirrors, where light goes towards -z.
         self.side = np.where(view.indices[0] < 0, -1.0, 1.0)
         #: The surface behind each that ends its gap.
@@ -244,15 +243,6 @@ def _next(surfaces: tuple[Surface, ...], start: int) -> int:
     """The next surface that is no coordinate break, or the image."""
     last = len(surfaces) - 1
     return next((k for k in range(start + 1, last) if not surfaces[k].is_break), last)
-
-
-def _in_air_of_gaps(lens: Lens) -> np.ndarray:
-    """Whether the medium behind every surface is air; mirrors and breaks keep the one before."""
-    found: list[bool] = []
-    for surface in lens.surfaces:
-        keeps = found and (surface.is_mirror or surface.is_break)
-        found.append(found[-1] if keeps else is_air(surface.glass))
-    return np.array(found)
 
 
 def _sag_by_torch(state: LensState, surface: int, height, side: tuple[float, float]):
