@@ -1,7 +1,7 @@
 """Ray bundles: all rays of a merit function's rows, launched and traced in one pass, with derivatives.
 
 Rays start as in `tracing.launch`. Rays that depend on the lens only through its first-order data are launched and aimed
-in numpy: for 126 rays and 21 variables an evaluation with derivatives takes 1.3 ms, against 490 ms with `tracing.launch`
+in numpy: 126 rays and 21 variables take 1.3 ms with derivatives, against 490 ms with `tracing.launch`
 and a forward derivative for every variable; 2.8 ms against 9.7 s with real ray aiming. All others (real image heights,
 telecentric objects, curved objects, bent axes) take that second way.
 
