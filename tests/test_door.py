@@ -15,8 +15,8 @@ import torch
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.cli import run as runner
 from raytrace.cli.commands import COMMANDS
+from raytrace.cli.run import RUNNER_OPTIONS
 from raytrace.maths.result import Result
 from raytrace.system.lens import field_points
 from raytrace.tracing.launch import launch
@@ -282,8 +282,9 @@ def test_a_lens_shows_itself():
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
 #: Commands that are a verb, each in a file of its own; those of bench, codesign and wave are none.
-VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and runner._verb(one.run) in rt.PUBLIC]
-OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
+VERBS = [command for command in COMMANDS if command.verb in rt.PUBLIC]
+#: Those that need no merit function.
+OF_A_LENS = [c for c in VERBS if c.run is None and c.name not in ("evaluate", "optimize", "search")]
 
 
 def options_of(command) -> set[str]:
@@ -294,10 +295,11 @@ def options_of(command) -> set[str]:
 
 @pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
 def test_a_command_has_the_options_of_its_verb(command):
-    keywords = inspect.signature(runner.verb_of(command.run)).parameters
-    own = {name for name in options_of(command) if not name.startswith("plot_")} - {*runner._RUNNERS}
+    verb = getattr(rt, command.verb)
+    keywords = inspect.signature(verb).parameters
+    own = {name for name in options_of(command) if not name.startswith("plot_")} - {*RUNNER_OPTIONS}
     assert own <= {*keywords}
-    assert runner.verb_of(command.run).__doc__
+    assert verb.__doc__
 
 
 def assert_alike(one, other) -> None:
@@ -318,7 +320,7 @@ def assert_alike(one, other) -> None:
 def test_a_command_prints_what_its_verb_gives(command, capsys):
     assert main([command.name, "cooke_triplet", "--json"]) == 0
     printed = capsys.readouterr().out
-    found = runner.verb_of(command.run)(rt.read_lens("cooke_triplet"))
+    found = getattr(rt, command.verb)(rt.read_lens("cooke_triplet"))
     assert_alike(json.loads(printed), found.document())
     assert main([command.name, "cooke_triplet"]) == 0
     assert capsys.readouterr().out == f"{found}\n"

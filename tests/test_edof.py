@@ -8,7 +8,7 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.cli.door import CommandError
+from raytrace.cli.run import CommandError
 from raytrace.cli.wave_design_run import learn
 from raytrace.imaging.pictures import dead_leaves, digest
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener

@@ -9,8 +9,8 @@ from PIL import Image
 from scripts import script
 
 from raytrace.cli import main, wave_design_run
-from raytrace.cli.door import CommandError
-from raytrace.cli.wave import SUBCOMMANDS
+from raytrace.cli.commands import WAVE_COMMANDS as SUBCOMMANDS
+from raytrace.cli.run import CommandError
 from raytrace.imaging.pictures import dead_leaves
 
 table = script("wave_edof")

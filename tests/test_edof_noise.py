@@ -11,7 +11,7 @@ import torch
 from scripts import script
 
 from raytrace.cli import wave_design_run
-from raytrace.cli.door import CommandError
+from raytrace.cli.run import CommandError
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, dead_leaves
 from raytrace.imaging.restoration import depth_invariant_density, depth_invariant_error, depth_invariant_wiener, psnr

@@ -15,8 +15,8 @@ import torch
 
 from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
-from raytrace.cli.door import find_lens
-from raytrace.cli.paths import PICTURES, picture_file
+from raytrace.cli.options import PICTURES, picture_file
+from raytrace.cli.run import find_lens
 from raytrace.io import read_lens
 from raytrace.maths.pupil import hexapolar
 from raytrace.plotting.analysis import distortion_curves

@@ -15,7 +15,8 @@ import torch
 from problems import number
 
 import raytrace as rt
-from raytrace.cli import wave, wave_options, wave_psf
+from raytrace.cli import wave_options
+from raytrace.cli.commands import WAVE_COMMANDS
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
 from raytrace.plotting.wave import height_figure
@@ -67,7 +68,7 @@ def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):
 def test_the_command_is_the_verb(run):
     """One name, the same options, the same defaults, the same result."""
     parser = argparse.ArgumentParser(add_help=False)
-    wave_psf.options(parser)
+    WAVE_COMMANDS[0].add_arguments(parser)
     keywords = inspect.signature(rt.wave_psf).parameters
     for action in parser._actions:
         if action.dest not in ("json", "output", "catalog") and not action.dest.startswith("plot"):
@@ -280,7 +281,7 @@ def test_a_small_file_names_its_aperture(run, tmp_path):
     assert "less than the aperture of 5 mm; give --aperture 1" in err
 
 
-@pytest.mark.parametrize("name", [command.name.removeprefix("wave-") for command in wave.SUBCOMMANDS])
+@pytest.mark.parametrize("name", [command.name.removeprefix("wave-") for command in WAVE_COMMANDS])
 def test_help_teaches_by_example(run, name):
     from raytrace.cli import build_parser
 

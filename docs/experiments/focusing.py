@@ -23,10 +23,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, refuse_suffix
 from raytrace.cli.options import count, json, output_file, plot
 from raytrace.cli.progress import progress
-from raytrace.cli.run import present
+from raytrace.cli.run import CommandError, present, refuse_suffix
 from raytrace.cli.settings import SEED, add_options
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.imaging.image import blur, visible

@@ -23,10 +23,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.cli import wave_design
-from raytrace.cli.door import CommandError, say
 from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
-from raytrace.cli.run import present
+from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import add_options, defaults_of, documents, picture_options, picture_words, words
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_design_run import LEAVES, WIDE, learn, training_pictures

@@ -28,10 +28,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from wave_edof import ROWS, STRENGTHS, contents_of, heights_of, look, title_of
 
-from raytrace.cli.door import CommandError
 from raytrace.cli.options import file_name, json, output_folder
 from raytrace.cli.progress import progress
-from raytrace.cli.run import present
+from raytrace.cli.run import CommandError, present
 from raytrace.cli.settings import (
     SEED,
     add_options,

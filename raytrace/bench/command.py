@@ -9,8 +9,7 @@ from types import ModuleType
 import torch
 
 from raytrace.bench.report import Asked, Measured
-from raytrace.cli.door import CommandError, open_lens, say
-from raytrace.cli.run import printed_anyway
+from raytrace.cli.run import CommandError, open_lens, printed_on_failure, say
 from raytrace.pages import machine
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
@@ -44,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Measured:
             return machine() | (peers.versions() if peers else {})
 
         found = subject.bench(Asked(arguments, _open, peers, about, threads))
-    with printed_anyway(found, arguments):
+    with printed_on_failure(found, arguments):
         if arguments.csv:
             found.save_table(arguments.csv)
         if arguments.docs:

@@ -34,8 +34,8 @@ from raytrace.bench.measure import (
 )
 from raytrace.bench.processes import bytes_per_ray, spot_process_ratio, two_process_gain
 from raytrace.bench.report import Asked, Measured
-from raytrace.cli.door import say
 from raytrace.cli.progress import progress
+from raytrace.cli.run import say
 from raytrace.io import read_lens
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to

@@ -24,8 +24,8 @@ from raytrace.bench.measure import (
     surfaces_of,
 )
 from raytrace.bench.report import Asked, Measured, clock_of, digits, in_words, table
-from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
+from raytrace.cli.run import CommandError
 from raytrace.maths.value import to
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays

@@ -5,7 +5,6 @@ only when the command runs, so that `raytrace --help` answers at once.
 """
 
 import argparse
-import importlib
 import os
 import re
 import sys
@@ -13,7 +12,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 
 from raytrace.budget import keep_freed_memory
-from raytrace.cli.command import as_options
 from raytrace.files import NotWritten
 from raytrace.words import did_you_mean
 
@@ -73,13 +71,15 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The whole command line, without importing any command."""
+    """The parser of the whole command line; imports no torch."""
+    from raytrace.cli.commands import COMMANDS
+
     parser = _Parser(
         prog="raytrace", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in importlib.import_module("raytrace.cli.commands").COMMANDS:  # they import from this room
+    for command in COMMANDS:
         command.add_to(commands)
     return parser
 
@@ -101,11 +101,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         of_result: list[str] = []
         warnings.showwarning = _shower(spelled, shown, of_result)
         try:
-            with (
-                importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
-                importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
-            ):
-                code = importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+            from raytrace.budget import within
+            from raytrace.cli.progress import heartbeat
+            from raytrace.cli.run import carry_out
+
+            with heartbeat(arguments.command), within(getattr(arguments, "max_bytes", None)):
+                code = carry_out(arguments)
             for words in of_result:
                 print(words, file=sys.stderr)
             return 1 if any(issubclass(category, NotWritten) for category in shown) else code
@@ -135,6 +136,17 @@ def script() -> None:
             stream.reconfigure(errors="replace")  # a terminal without µ shows ?
     keep_freed_memory()
     sys.exit(main())
+
+
+def as_options(message: str, spelled: Mapping[str, str]) -> str:
+    """A message with keywords in backticks, `fields` or `model=drt`, spelled as options: --field, --model drt."""
+
+    def option(match: re.Match) -> str:
+        if match[1] not in spelled:
+            return match[0]
+        return spelled[match[1]] + (f" {match[2]}" if match[2] else "")
+
+    return re.sub(r"`(\w+)(?:=([^`]*))?`", option, message)
 
 
 def _fail(message: str, code: int) -> int:

@@ -180,6 +180,3 @@ def options(parser: argparse.ArgumentParser) -> None:
         "--page", metavar="NAME", type=file_name, help="write NAME.md and NAME/ there (default codesign)"
     )
     group.add_argument("--report-only", action="store_true", help="train nothing, write the page of the stored runs")
-
-
-run = "cli.codesign_compare.run"

@@ -22,8 +22,7 @@ from raytrace.cli.codesign_runs import (
     spectral,
     train_run,
 )
-from raytrace.cli.door import CommandError, say
-from raytrace.cli.run import present
+from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import words
 from raytrace.experiments import publish
 from raytrace.files import table

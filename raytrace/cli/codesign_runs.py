@@ -14,10 +14,9 @@ import torch
 from torch import Tensor, distributed
 from tqdm import tqdm
 
-from raytrace.cli.door import CommandError, catalogs, find_lens, open_lens, say
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
-from raytrace.cli.run import present
+from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.files import write_json
 from raytrace.imaging.closed_form import power_spectrum
 from raytrace.imaging.codesign import (

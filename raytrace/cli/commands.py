@@ -1,19 +1,991 @@
-"""The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
+"""The commands of `raytrace`: a row each, with summary, description, examples and options. Imports no torch.
 
-from raytrace.cli.command import Command
+A command calls the function of the public API that has its name. An option's destination is the name of that function's
+parameter. A new command is a new row. Commands that do more than call the function once have a function `run`.
+"""
 
-#: The analyses, each a file of this folder.
-ANALYSES = (
-    *("mtf", "ray_fan", "opd_fan", "wavefront", "distortion", "field_curvature", "lateral_colour"),
-    *("relative_illumination", "seidel", "longitudinal_aberration", "chromatic_focal_shift", "distortion_grid"),
-    *("incidence", "rms_over_field", "encircled_energy"),
+import argparse
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+from raytrace.cli import codesign, wave_design, wave_restore
+from raytrace.cli.options import (
+    LENS_SUFFIXES,
+    MODELS,
+    Adder,
+    analysis,
+    aperture,
+    catalog,
+    conditions,
+    configuration,
+    count,
+    data_file,
+    environment,
+    fields,
+    file_name,
+    file_of,
+    folder_name,
+    freedom,
+    geometric,
+    group,
+    json,
+    lens,
+    log,
+    many,
+    max_bytes,
+    memory,
+    merit,
+    object_distance,
+    option,
+    output,
+    output_file,
+    output_folder,
+    output_lens,
+    picture_file,
+    plot,
+    points,
+    positive,
+    positive_finite,
+    ray_aiming,
+    reference,
+    samples,
+    sampling,
+    seed_number,
+    size,
+    substitute,
+    wavelength,
+    window,
 )
+from raytrace.cli.wave_options import camera, element, engine, light, pixels
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    examples: the last part of its help page; options: functions that add options to a parser; run: returns the result,
+    where it is more than a call of the public function `verb` with a lens.
+    """
+
+    name: str
+    summary: str
+    description: str
+    examples: str
+    options: tuple[Adder, ...]
+    run: Callable[[argparse.Namespace], object] | None = None
+
+    @property
+    def verb(self) -> str:
+        """Name of the public function."""
+        return self.name.replace("-", "_")
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        for add in self.options:
+            add(parser)
+
+    def add_to(self, commands, name: str = "") -> None:
+        """Add the parser of this command to a group of parsers, under its own name or another."""
+        parser = commands.add_parser(
+            name or self.name,
+            help=self.summary,
+            description=self.description,
+            epilog=self.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        self.add_arguments(parser)
+        max_bytes(parser)
+        spelled = {action.dest: action.option_strings[-1] for action in parser._actions if action.option_strings}
+        parser.set_defaults(run=self, spelled=spelled)
+
+
+def _command(name: str, summary: str, description: str, examples: str, *options: Adder, run=None) -> Command:
+    """A row; examples: one a line, without `raytrace NAME`."""
+    start = f"  raytrace {name.replace('wave-', 'wave ')} "
+    text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
+    return Command(name, summary, description, text, options, run)
+
+
+def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
+    return Command(name, module.SUMMARY, module.DESCRIPTION, module.EXAMPLES, (module.options,), run)
+
+
+# -- commands that do more than call their function once
+
+
+def _check(arguments: argparse.Namespace):
+    import raytrace
+    from raytrace.cli.run import catalogs, find_lens
+
+    return raytrace.check(
+        find_lens(arguments.lens),
+        catalogs=catalogs(arguments),
+        strict=arguments.strict,
+        configuration=arguments.configuration,
+        substitute=arguments.substitute,
+    )
+
+
+def _convert(arguments: argparse.Namespace):
+    import raytrace
+    from raytrace.cli.run import catalogs, find_lens
+
+    return raytrace.convert(
+        find_lens(arguments.source),
+        arguments.target,
+        catalogs=catalogs(arguments),
+        strict=arguments.strict,
+        configuration=arguments.configuration,
+        substitute=arguments.substitute,
+    )
+
+
+def _glass(arguments: argparse.Namespace):
+    import raytrace
+    from raytrace.cli.run import catalogs
+
+    return raytrace.glass(
+        arguments.name,
+        catalogs=catalogs(arguments),
+        wavelengths=arguments.wavelengths,
+        temperature=arguments.temperature,
+        pressure=arguments.pressure,
+    )
+
+
+def _bench(arguments: argparse.Namespace):
+    # Benchmarks are a layer above the commands, so the import is dynamic.
+    return importlib.import_module("raytrace.bench.command").run(arguments)
+
+
+def _layout(arguments: argparse.Namespace):
+    from raytrace.cli.run import result_of_lens
+
+    arguments.plot = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"
+    return result_of_lens(arguments)
+
+
+def _spot(arguments: argparse.Namespace):
+    from raytrace.cli.run import CommandError, result_of_lens
+
+    for flag, path in (("--plot", arguments.plot), ("-o", arguments.output)):
+        if path and arguments.rays:
+            raise CommandError(f"{flag} needs the rays, and --rays keeps none: leave one out")
+    return result_of_lens(arguments)
+
+
+def _focus(arguments: argparse.Namespace):
+    """The focus; -o writes the lens of the file with the new sensor distance, without the conditions of the options."""
+    from raytrace.cli.run import catalogs, find_lens, printed_on_failure, result_of_lens, say
+    from raytrace.io import read_lens, write_lens
+    from raytrace.system.lens import with_sensor_distance
+
+    focus = result_of_lens(arguments)
+    if arguments.output:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # shown when the file was first read
+            original = read_lens(
+                find_lens(arguments.lens),
+                catalogs=catalogs(arguments),
+                substitute=arguments.substitute,
+                configuration=arguments.configuration,
+            )
+        with printed_on_failure(focus, arguments):
+            write_lens(with_sensor_distance(original, focus.sensor_distance), arguments.output)
+        say(f"written: {arguments.output}")
+        arguments.output = None
+    return focus
+
+
+def _trace(arguments: argparse.Namespace) -> None:
+    """The table of rays, written as it is computed and not kept in memory."""
+    import sys
+
+    from raytrace.cli.progress import Lines, progress
+    from raytrace.cli.run import print_json, result_of_lens, say
+
+    listing = result_of_lens(arguments)
+    if arguments.output:
+        with progress(listing.count, "ray", what="trace") as bar:
+            listing.save(arguments.output, bar.update)
+        if arguments.json:
+            print_json({"rays": listing.count, "output": arguments.output, "lost": listing.lost()})
+        else:
+            say(f"{listing.count} rays written to {arguments.output}")
+    elif arguments.json:
+        listing.write_json(sys.stdout.write)
+    else:
+        with Lines(listing.count, "ray", what="trace") as lines:  # no bar: the terminal may show the rays
+            listing.write(sys.stdout.write, lines.update)
+    for line in listing.failures():
+        say(line)
+
+
+_WAVE_FIGURES = {
+    "heights": "the height of the element, as a disc and as a profile,",
+    "caustic": "the light behind the element, over distance and radius,",
+    "encircled": "the fraction of the light within a radius",
+}
+
+
+def _wave_psf(arguments: argparse.Namespace):
+    import raytrace
+    from raytrace.cli.run import catalogs, options_of, printed_on_failure, say
+
+    options = options_of(arguments) | {"catalog": catalogs(arguments)}
+    psf = raytrace.wave_psf(**options)
+    for name in _WAVE_FIGURES:
+        if path := vars(arguments).pop(f"plot_{name}"):
+            with printed_on_failure(psf, arguments):
+                psf.plot(path, what=name, progress=options["progress"])
+            say(f"written: {path}")
+    return psf
+
+
+def _codesign(arguments: argparse.Namespace):
+    from raytrace.cli.codesign_compare import run
+
+    return run(arguments)
+
+
+def _wave_design(arguments: argparse.Namespace):
+    from raytrace.cli.wave_design_run import design
+
+    return design(arguments)
+
+
+def _wave_restore(arguments: argparse.Namespace):
+    from raytrace.cli.wave_restore_run import restore_files
+
+    return restore_files(arguments)
+
+
+# -- options of one command
+
+_SEVERAL_WEIGHTS = [
+    option(f"--{name}-weights", metavar="W", type=positive_finite, nargs="+", help=f"one for each {name}")
+    for name in ("distance", "field", "wavelength")
+]
+_STRICT = option("--strict", action="store_true", help="fail on anything unknown or assumed")
+_POINTS_OF_FAN = partial(points, what="rays across the pupil (default 41)")
+_CURVES = partial(analysis, figure="the curves")
+
+
+def _tolerance_or_rays(parser: argparse.ArgumentParser) -> None:
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("--tol", metavar="T", type=positive_finite, help="bound on the estimated error (default 0.01)")
+    choice.add_argument(
+        "--rays",
+        metavar="N",
+        type=many,
+        help="rays per kernel instead of a tolerance; with --model drt and --max-bytes any number of them",
+    )
+
+
+_FREQUENCY = option(
+    "--frequency",
+    dest="frequencies",
+    metavar="F",
+    type=positive_finite,
+    nargs="+",
+    help="spatial frequencies, cycles/mm (default: 41 from 0 to the resolution of the sharpest field, at most half of "
+    "the diffraction cutoff)",
+)
+_SECONDS = option("--seconds", metavar="S", type=positive_finite, help="time limit")
+
+# -- the table
+
+#: Subcommands of `raytrace wave`.
+WAVE_COMMANDS = (
+    _command(
+        "wave-psf",
+        "point spread functions over depth and colour",
+        """\
+Kernels of a phase element for points on the axis, over depth and wavelength, integrated over pixels. All light through
+the aperture is 1: `energy` is the fraction inside the window, `peak` that in the brightest pixel, or in a pixel centred
+on the axis if the window has an even number of pixels. Named elements are listed under --element: smooth ones (ideal,
+singlet, …-refractive) of PMMA, wrapped ones of fused silica, all for one focus.
+
+The engine depends on the scene, its sampling on --tol; a sampling that would alias into the window is refused.
+--samples sets the sampling.""",
+        """
+        --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
+        --element fresnel --levels 16 --depth 1000 --wavelength 0.46 0.55 0.64 --json
+        --element cubic --focus 1000 --pixel 0.00369 --size 128 --exact -o cubic.npz
+        --element heights.npy --glass F_SILICA --design-wavelength 0.55 --levels 16 --plot made.png
+        --element ideal --depth 500 --engine fresnel --samples 2500 --json""",
+        element,
+        camera,
+        light,
+        pixels,
+        engine,
+        json,
+        partial(
+            output,
+            what="arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, "
+            "engine, error",
+            suffixes=(".npz",),
+        ),
+        partial(plot, what="the kernels"),
+        group(
+            "more figures",
+            *(
+                option(
+                    f"--{name}",
+                    dest=f"plot_{name}",
+                    metavar="FILE",
+                    type=picture_file,
+                    help=f"save {what} as .png, .pdf or .svg",
+                )
+                for name, what in _WAVE_FIGURES.items()
+            ),
+        ),
+        run=_wave_psf,
+    ),
+    _of_module("wave-design", wave_design, _wave_design),
+    _of_module("wave-restore", wave_restore, _wave_restore),
+)
+
+
+def _subcommands(parser: argparse.ArgumentParser) -> None:
+    children = parser.add_subparsers(dest="subcommand", metavar="SUB", required=True)
+    for command in WAVE_COMMANDS:
+        command.add_to(children, command.name.removeprefix("wave-"))
+
 
 #: All commands, in the order of the help page.
 COMMANDS = (
-    *(Command.of(f"cli.{name}") for name in ("info", "check", "convert", "layout", "spot", "focus", "optimize")),
-    *(Command.of(f"cli.{name}") for name in ("search", "evaluate", "trace", "psf")),
-    *(Command.of(f"cli.{name}") for name in ("compare", "glass", "bench", *ANALYSES)),
-    Command.of("cli.codesign"),
-    Command.of("cli.wave"),
+    _command(
+        "info",
+        "first-order data and the surfaces of a lens",
+        "Print focal lengths, pupils, magnification and the prescription of a lens.",
+        """
+        double_gauss
+        lenses/double_gauss.zmx --object-distance 25000 --f-number 4
+        lens.zmx --json | python3 -m json.tool""",
+        lens,
+        conditions,
+    ),
+    _command(
+        "check",
+        "import report of a lens file",
+        "Print the import report: every keyword read, ignored (with the reason) or unknown, and the catalog of each "
+        "glass. Fails if the file cannot be read; with --strict also if anything was assumed.",
+        """
+        lens.zmx
+        lens.zmx --strict --json""",
+        lens,
+        _STRICT,
+        run=_check,
+    ),
+    _command(
+        "convert",
+        "write a lens in another format",
+        "Read a lens file and write it in the format of the suffix of OUT. Numbers are kept bit for bit.",
+        """
+        lenses/double_gauss.zmx double_gauss.csv
+        table.txt lens.zmx
+        lens.zmx lens.seq""",
+        option("source", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens"),
+        option(
+            "target",
+            metavar="OUT",
+            type=file_of(LENS_SUFFIXES),
+            help="lens file to write: .zmx, .seq, .csv, .tsv, .txt",
+        ),
+        configuration,
+        catalog,
+        substitute,
+        json,
+        option("--strict", action="store_true", help="fail on anything unknown or assumed in IN"),
+        run=_convert,
+    ),
+    _command(
+        "layout",
+        "draw the lens with rays",
+        "Draw the cross section of a lens with the rays of its fields; folded systems are drawn in space.",
+        """
+        double_gauss --plot layout.png
+        lens.zmx --field 0 14 -14,0 --plot layout.pdf
+        folded_relay --view 3d --plot relay.png
+        spectrometer --wavelength 0.45 0.55 0.65
+        scanner.zmx --configuration all --plot scan.png""",
+        partial(lens, all_configurations="in one figure, superimposed"),
+        conditions,
+        fields,
+        option(
+            "--view", default="yz", choices=("yz", "xz", "3d"), help="from the side (default), from above, or in space"
+        ),
+        option("--rays", metavar="N", type=count, default=7, help="rays of each fan (default 7)"),
+        partial(plot, what="the cross section (default LENS_layout.png in this folder)"),
+        run=_layout,
+    ),
+    _command(
+        "spot",
+        "spot sizes and the spot diagram",
+        "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it. -o writes the "
+        "rays: field_x,field_y,wavelength,pupil_x,pupil_y,x,y,weight,status; x and y are empty for a ray that "
+        "does not reach the sensor. status: ok, vignetted, miss, tir, unaimed.",
+        """
+        double_gauss --plot spot.png
+        lens.zmx --object-distance 25000 --field 0 10 14 --json
+        double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
+        double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
+        lens,
+        conditions,
+        fields,
+        partial(sampling, rings=12),
+        option(
+            "--rays",
+            metavar="N",
+            type=many,
+            help="instead of --points, any number of sobol or random rays for each field and wavelength, as 1e9: "
+            "traced in chunks, none kept",
+        ),
+        option(
+            "--max-bytes",
+            metavar="BYTES",
+            type=memory,
+            help="memory limit, as 200MB (default with --rays 256MB, else half of the free memory)",
+        ),
+        option(
+            "--reference",
+            choices=("centroid", "chief"),
+            default="centroid",
+            help="radii about the centroid (default), or about the chief ray of the primary wavelength",
+        ),
+        option(
+            "--weights",
+            choices=("area", "equal"),
+            default="area",
+            help="rays are weighted by pupil area (default) or equally; OpticStudio's spots are "
+            "--sampling hexapolar --rings 6 --weights equal --reference chief",
+        ),
+        partial(
+            output,
+            what="table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status",
+            suffixes=(".csv", ""),
+        ),
+        partial(plot, what="the spot diagram"),
+        run=_spot,
+    ),
+    _command(
+        "focus",
+        "find the best sensor distance",
+        "Find the sensor distance of minimum RMS spot radius in closed form, without retracing; by default on the axis "
+        "at the primary wavelength.",
+        """
+        lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
+        lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
+        lens,
+        partial(conditions, several="several are focused together"),
+        fields,
+        option(
+            "--criterion",
+            choices=("rms", "paraxial", "mean"),
+            default="rms",
+            help="minimum RMS spot radius (default), paraxial image, or minimum mean distance from the centroid",
+        ),
+        *_SEVERAL_WEIGHTS,
+        partial(sampling, rings=12),
+        partial(plot, what="the through-focus curve, the spots before and after, and the layout"),
+        option(
+            "--by",
+            dest="plot_by",
+            choices=("field", "wavelength"),
+            help="draw only the through-focus curves, one for each field, or for each wavelength of the first field",
+        ),
+        partial(output_lens, what="lens file to write with the new sensor distance"),
+        run=_focus,
+    ),
+    _command(
+        "optimize",
+        "minimise the merit function of a lens",
+        "Optimise a lens by damped least squares on exact derivatives of its merit function: the file's, or the one of "
+        "--merit. Solves and pickups hold at every step. -o writes the lens with its variables and merit function. "
+        "Ctrl-C stops and writes the best lens so far.",
+        """
+        lens.zmx -o better.zmx --plot better.png
+        double_gauss --merit spot --vary curvature thickness --seconds 10 -o better.zmx
+        tessar --merit spot --vary curvature sensor thickness:2,4 --bounds thickness:1.. --hold efl=100
+        tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
+        lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
+        lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
+        lens,
+        ray_aiming,
+        merit,
+        freedom,
+        group(
+            "stopping",
+            option("--cycles", metavar="N", type=count, help="maximum, including those before --resume (default 500)"),
+            _SECONDS,
+            option("--paths", metavar="N", type=count, help="damping strategies to try (default 1)"),
+        ),
+        group(
+            "files",
+            option("--log", metavar="FILE", type=data_file, help="write a line for every cycle (.csv)"),
+            option("--checkpoint", metavar="FILE", type=data_file, help="store the state of the search there (.json)"),
+            option(
+                "--resume",
+                metavar="FILE",
+                type=file_name,
+                help="resume from a checkpoint of the same lens, variables and merit function",
+            ),
+        ),
+        partial(plot, what="the lens, its spots and its merit function, before and after"),
+        partial(output_lens, what="lens file to write"),
+    ),
+    _command(
+        "search",
+        "find the minima of a merit function globally, within bounds",
+        "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
+        "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
+        "optimised; the best are converged, and the search hops on from the best minima. --insert instead adds an "
+        "element: a thin meniscus at a surface is a saddle point that leads to new minima. -o stores every minimum as "
+        "a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
+        "Ctrl-C stops and keeps the minima found. Processes share the work: "
+        "torchrun --nproc-per-node 2 -m raytrace search …",
+        """
+        lens.zmx --starts 200 --seconds 60 -o minima
+        cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
+        triplet.zmx --insert 2 4 -o four_elements
+        singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
+        lens,
+        ray_aiming,
+        merit,
+        freedom,
+        group(
+            "extent",
+            option("--starts", metavar="N", type=count, help="initial designs (default 64)"),
+            option(
+                "--insert",
+                metavar="SURFACE",
+                type=count,
+                nargs="*",
+                help="instead of starts: insert a thin meniscus at every surface, or at these",
+            ),
+            _SECONDS,
+            option("--seed", metavar="N", type=seed_number, default=0, help="of starts and hops (default 0)"),
+        ),
+        partial(plot, what="the best lenses side by side"),
+        partial(output_folder, what="folder for lens files and their table; a search stored there resumes"),
+    ),
+    _command(
+        "evaluate",
+        "merit function of a lens, row by row",
+        "Evaluate a merit function: the file's, or a default one by --merit. Each row has its operand, arguments, "
+        "target, weight, value and contribution to the square of the merit. In long tables the rays of a field share a "
+        "line; --each lists them all. Rows of unknown operands are an error if they have a weight.",
+        """
+        lens.zmx
+        double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
+        tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
+        zoom.zmx --configuration 2 --skip-unknown""",
+        lens,
+        conditions,
+        merit,
+        option("--each", action="store_true", help="list every row, also the rays of one field"),
+        partial(plot, what="the contributions to the merit, by operand and field"),
+    ),
+    _command(
+        "trace",
+        "trace rays of a table, surface by surface",
+        "Trace rays and write one row per ray and surface: ray,surface,x,y,z,l,m,n,opl,status in each surface's own "
+        "frame, direction after the surface, opl the optical path from the given start. At a coordinate break the row "
+        "is the previous point and path in the new axes. status: ok, miss, tir, vignetted. A vignetted ray keeps its "
+        "coordinates; a missed or totally reflected one ends with an empty row. "
+        "Chief and marginal rays, at the primary wavelength or those of --wavelength, have further columns: "
+        "object_distance,field_x,field_y,wavelength,pupil_x,pupil_y.",
+        """
+        double_gauss --field 0 14 0,-7
+        lens.zmx --rays rays.csv -o traced.csv""",
+        lens,
+        option(
+            "--rays",
+            metavar="CSV",
+            type=file_name,
+            help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
+            "by default the chief and marginal rays of every field",
+        ),
+        partial(output, what="table to write (.csv); default: standard output", suffixes=(".csv", ".txt", "")),
+        partial(conditions, several="rays from each"),
+        fields,
+        run=_trace,
+    ),
+    _command(
+        "psf",
+        "point spread functions by five models",
+        "Compute point spread functions over object distance and field, integrated over pixels, to a tolerance. "
+        "Models: paraxial, fourier, gaussian, drt (ray-traced), wave (diffraction of the traced wavefront). Several "
+        "processes, or machines, share the kernels, or with --model drt --rays the rays; the result equals that of one "
+        "process to rounding and is written once: torchrun --nproc-per-node 2 -m raytrace psf …",
+        """
+        double_gauss --model gaussian --object-distance 10000 30000 --plot psf.png
+        double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
+        double_gauss --model drt --rays 256 --json
+        double_gauss --model drt --rays 1e8 --max-bytes 200MB -o psf.npz""",
+        lens,
+        option(
+            "--model",
+            metavar="MODEL",
+            choices=MODELS,
+            help="paraxial, fourier, gaussian, drt or wave, in order of fidelity; auto (default) takes the first that "
+            "agrees with the next",
+        ),
+        partial(conditions, several="one row of kernels each"),
+        fields,
+        partial(window, normalise="energy"),
+        option(
+            "--center",
+            choices=("axis", "chief", "centroid"),
+            help="centre of the window: the optical axis (default with --field), the chief ray (default of the "
+            "lens's fields) or the centroid of the rays",
+        ),
+        option(
+            "--per-wavelength", action="store_true", help="a kernel for each wavelength instead of their weighted sum"
+        ),
+        _tolerance_or_rays,
+        partial(
+            output,
+            what="arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], "
+            "pixel_pitch, energy, error, wavelengths, model",
+            suffixes=(".npz",),
+        ),
+        partial(plot, what="the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"),
+        log,
+    ),
+    _command(
+        "compare",
+        "compare the PSF models",
+        "Compare DRT (256 rays), Gaussian DRT, paraxial, Fourier and wave PSFs on the axis over object distance, with "
+        "one sensor, in windows of 21 pixels of 5 µm, by default at 0.53 µm. The table lists for each model: change of "
+        "the kernel when the conic of the most curved surface grows by 0.2; longer over shorter σ (of waves: of their "
+        "rays) and asymmetry of the kernel of the largest field; radius of the first dark ring at F/16 over that of "
+        "the Airy disc; number of lens parameters that change the kernel; rays traced. "
+        "These numbers use DRT to a tolerance, since the noise of 256 rays would pass for aberrations.",
+        """
+        lenses/double_gauss.zmx --plot compare.png
+        double_gauss --start rms --json""",
+        lens,
+        group(
+            "conditions other than the file's",
+            partial(object_distance, several="the columns (default 10000 20000 30000 40000 50000)"),
+            aperture,
+            wavelength,
+            ray_aiming,
+        ),
+        option(
+            "--start",
+            choices=("paraxial", "rms"),
+            help="sensor position: the paraxial image (default) or the minimum RMS spot radius on the axis",
+        ),
+        option("--focus-distance", metavar="MM", type=positive, help="object in focus (default 25000)"),
+        option("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)"),
+        partial(size, what="the windows (default 21)"),
+        partial(plot, what="the grid of kernels"),
+        log,
+    ),
+    _command(
+        "glass",
+        "look up a glass",
+        "Print index, nd, Vd, formula, range and catalog of a glass; similar names are suggested for an unknown one. "
+        "With a temperature or a pressure also its indices there, relative to air at that temperature and pressure, "
+        "and their change with temperature.",
+        """
+        N-BK7
+        SK16 --wavelength 0.53 --json
+        N-BK7 --temperature 40 --pressure 0
+        MYGLASS --catalog my_glasses.agf""",
+        option("name", metavar="NAME", help="name of a glass, as in a lens file, or a six-digit MIL code"),
+        catalog,
+        json,
+        option(
+            "--wavelength",
+            dest="wavelengths",
+            metavar="UM",
+            type=positive_finite,
+            nargs="+",
+            help="wavelengths in µm (default: F d C)",
+        ),
+        environment,
+        run=_glass,
+    ),
+    _command(
+        "bench",
+        "measure speed against error",
+        "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
+        "PSF model at every sampling against converged ones (minutes); every engine of wave PSFs compared with the "
+        "transfer function it replaces (a minute); the speed targets: the trace compared with limits of the machine "
+        "(C++, built here if there is a compiler), its memory and whole processes (minutes); or optimisation of lens "
+        "files by their own merit functions. With the extra [bench] Optiland is measured too in trace, psf, speed and "
+        "optimise.",
+        """
+        trace
+        psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
+        trace --rays 1000 100000 -o bench.md --plot bench.png
+        wave --docs docs
+        optimise designs/*.zmx --docs docs
+        speed --quick --repeats 1""",
+        option("what", choices=("trace", "psf", "wave", "speed", "optimise"), help="subject of the measurement"),
+        option(
+            "lenses",
+            metavar="LENS",
+            type=file_name,
+            nargs="*",
+            help="psf: lenses to measure, on the axis and at the largest field "
+            "(default double_gauss phone hubble, in predefined conditions); optimise: files with a merit function",
+        ),
+        json,
+        option("--lens", metavar="LENS", help="trace: lens to trace (default double_gauss)"),
+        option(
+            "--rays",
+            metavar="N",
+            type=count,
+            nargs="+",
+            help="trace: numbers of rays (default 1000 10000 100000 1000000)",
+        ),
+        option("--repeats", metavar="N", type=count, default=5, help="runs, whose median is reported"),
+        option("--threads", metavar="N", type=count, help="threads of torch"),
+        option("--no-peers", action="store_true", help="leave out Optiland even if it is installed"),
+        partial(output, what="report to write (.md)", suffixes=(".md",)),
+        option("--csv", metavar="FILE", type=output_file, help="psf: table to write, one line for each measurement"),
+        option(
+            "--docs",
+            metavar="DOCS",
+            type=folder_name,
+            help="wave, speed, optimise: folder for wave_bench.md and wave/, or speed.md or optimise.md, .csv and .png",
+        ),
+        option("--quick", action="store_true", help="speed: few rays, as a trial; the ratios are not meaningful"),
+        partial(plot, what="speed over number of rays, or time over error,"),
+        run=_bench,
+    ),
+    _command(
+        "mtf",
+        "modulation transfer function",
+        "Tangential (of patterns that vary along y) and sagittal (along x) MTF of each field, all wavelengths by their "
+        "weights, through frequency or focus.",
+        """
+        double_gauss --object-distance 25000 --plot mtf.png
+        tessar --frequency 10 20 40 --geometric --json
+        tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
+        _CURVES,
+        option(
+            "--geometric",
+            action=argparse.BooleanOptionalAction,
+            help="geometric MTF, or always the diffraction MTF (default: diffraction, but geometric for fields whose "
+            "blur is so large that diffraction takes long and changes the modulation by less than 0.001)",
+        ),
+        _FREQUENCY,
+        option(
+            "--through-focus",
+            metavar="MM",
+            type=positive_finite,
+            help="move the sensor by ±MM, at the one frequency of --frequency",
+        ),
+    ),
+    _command(
+        "ray-fan",
+        "ray fans",
+        "Transverse ray aberration over the pupil, relative to the chief ray of the primary wavelength.",
+        """
+        tessar --plot fan.png
+        double_gauss --field 0 14 -10,5 --points 21 --json""",
+        partial(analysis, figure="the fans"),
+        _POINTS_OF_FAN,
+    ),
+    _command(
+        "opd-fan",
+        "OPD fans",
+        "Optical path difference in waves over the pupil relative to each wavelength's chief ray, on the reference "
+        "sphere of the primary wavelength.",
+        """
+        tessar --plot opd.png
+        double_gauss --object-distance 25000 --reference own --json""",
+        partial(analysis, figure="the fans"),
+        _POINTS_OF_FAN,
+        partial(
+            reference,
+            what="centre of the reference sphere: the image point of the primary wavelength's chief ray (default), or "
+            "of each wavelength's own",
+        ),
+    ),
+    _command(
+        "wavefront",
+        "wavefront maps, Zernike coefficients, Strehl ratio",
+        "RMS and peak-to-valley OPD in waves (peak to valley over 127 points across the pupil) and the Strehl ratio; "
+        "with --numbering, --terms or --json also the Zernike coefficients, Noll's in waves RMS or fringe in waves at "
+        "the rim.",
+        """
+        tessar --plot wavefront.png
+        double_gauss --field 0 14 --numbering fringe --terms 16
+        double_gauss --field 0 --json""",
+        partial(analysis, figure="the maps"),
+        partial(size, what="a map (default 127)"),
+        option("--numbering", choices=("noll", "fringe"), help="print the coefficients in Noll's or fringe numbering"),
+        option("--terms", metavar="N", type=count, help="number of Zernike terms (default 37)"),
+    ),
+    _command(
+        "distortion",
+        "distortion over the field",
+        "Height of the chief ray on the sensor relative to f tan θ and f θ (1 = 100 % in JSON, % in text).",
+        """
+        phone --plot distortion.png
+        double_gauss --field 5 10 14 --json""",
+        _CURVES,
+        samples,
+    ),
+    _command(
+        "field-curvature",
+        "field curvature",
+        "Tangential and sagittal foci of close rays about the chief ray, mm from the sensor.",
+        """
+        tessar --plot curvature.png
+        double_gauss --field 0 10 14 --json""",
+        _CURVES,
+        samples,
+    ),
+    _command(
+        "lateral-colour",
+        "lateral colour",
+        "Height of each wavelength's chief ray on the sensor minus the primary wavelength's.",
+        """
+        tessar --plot lateral.png
+        double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
+        _CURVES,
+        samples,
+    ),
+    _command(
+        "relative-illumination",
+        "relative illumination",
+        "Illuminance of the sensor relative to the axis, from the solid angle filled by the rays of a uniform object.",
+        """
+        phone --plot illumination.png
+        double_gauss --field 0 10 14 --json""",
+        _CURVES,
+        samples,
+    ),
+    _command(
+        "seidel",
+        "Seidel aberrations by surface",
+        "Third-order aberrations S1 to S5 (spherical, coma, astigmatism, Petzval, distortion), C1, C2 (axial, lateral "
+        "colour) of every surface and their sums, with y n i of the marginal and chief ray, at the largest field or "
+        "those of --field.",
+        """
+        tessar --plot seidel.png
+        double_gauss --kind waves --field 10 14 --json""",
+        partial(analysis, figure="a bar for each surface"),
+        option(
+            "--kind",
+            choices=("coefficients", "waves", "transverse", "longitudinal"),
+            help="S1 to C2 in mm (default), wavefront coefficients in waves, or ray aberrations in mm",
+        ),
+    ),
+    _command(
+        "longitudinal-aberration",
+        "longitudinal aberration",
+        "Axial crossing of rays from the axial object point, mm from the sensor, over their height in the pupil.",
+        """
+        tessar --plot longitudinal.png
+        cooke_triplet --wavelength 0.55 --json""",
+        lens,
+        conditions,
+        partial(plot, what="the curves"),
+        partial(points, what="rays from the axis to the rim of the pupil (default 41)"),
+    ),
+    _command(
+        "chromatic-focal-shift",
+        "chromatic focal shift",
+        "Paraxial focus of each wavelength, mm from that of the primary wavelength.",
+        """
+        cemented_achromat --plot shift.png
+        singlet --wavelength 0.45 0.65 --json""",
+        lens,
+        conditions,
+        partial(plot, what="the curve"),
+        option("--samples", metavar="N", type=count, default=101, help="wavelengths of the curve (default 101)"),
+    ),
+    _command(
+        "distortion-grid",
+        "grid distortion",
+        "Image of a square grid of object points up to the largest field, compared with its ideal image.",
+        """
+        phone --plot grid.png --exaggerate 10
+        retrofocus --points 5 --json""",
+        lens,
+        conditions,
+        partial(plot, what="the ideal and the real grid"),
+        partial(points, what="points across the grid (default 11)"),
+        option(
+            "--exaggerate",
+            dest="plot_exaggerate",
+            metavar="N",
+            type=positive_finite,
+            default=1.0,
+            help="draw the distortion N times as large",
+        ),
+    ),
+    _command(
+        "incidence",
+        "angles of incidence",
+        "Angles of incidence of the chief and marginal rays of each field on the sensor, or on every surface, degrees.",
+        """
+        phone --plot incidence.png
+        double_gauss --field 0 14 --surfaces --json""",
+        _CURVES,
+        samples,
+        option("--surfaces", action="store_true", help="list every surface, not only the sensor"),
+    ),
+    _command(
+        "rms-over-field",
+        "RMS wavefront or spot over the field",
+        "RMS wavefront error in waves over the field, of each wavelength and of all together by their weights, with "
+        "the Strehl ratio exp(-(2π σ)²); or the RMS spot radius.",
+        """
+        tessar --plot rms.png
+        double_gauss --spot --field 0 10 14 --json""",
+        _CURVES,
+        samples,
+        option("--spot", action="store_true", help="RMS spot radius about the centroid instead"),
+        partial(
+            reference,
+            what="centres of the reference spheres of the wavelengths together: the primary wavelength's chief ray "
+            "(default: lateral colour counts), or each one's own",
+        ),
+    ),
+    _command(
+        "encircled-energy",
+        "encircled energy",
+        "Fraction of the light within a radius about the centroid of the rays, by diffraction or geometrically.",
+        """
+        tessar --plot encircled.png
+        double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
+        _CURVES,
+        geometric,
+        option(
+            "--radius",
+            dest="radii",
+            metavar="MM",
+            type=positive_finite,
+            nargs="+",
+            help="radii about the centroid, mm (default: from 0 to almost all of the light)",
+        ),
+    ),
+    _of_module("codesign", codesign, _codesign),
+    Command(
+        "wave",
+        "phase elements: PSFs, design, restoration",
+        "Wave optics of a thin phase element in front of a sensor: point spread functions (PSFs) over depth and\n"
+        "wavelength, design of the element together with a restoration filter, and restored images.\n"
+        "`raytrace wave SUB --help` shows examples.",
+        """examples:
+  raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
+  raytrace wave psf --element fresnel --wavelength 0.46 0.55 0.64 --json
+  raytrace wave design --element smooth --starts 2 -o run --plot element.png
+  raytrace wave restore scene.png --element run/heights.npy --simulate 500 -o simulated""",
+        (_subcommands,),
+    ),
 )

@@ -1,29 +1,143 @@
-"""Arguments that commands share: one name means the same everywhere. No torch: the help must not wait for it."""
+"""Options that commands share: one name means the same everywhere. Imports no torch, so that --help answers at once.
+
+A function of this module adds options to a parser; `option(...)` and `group(...)` return such a function.
+"""
 
 import argparse
-import importlib
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import PurePath
 
-from raytrace.cli.paths import data_file as data_file
-from raytrace.cli.paths import file_name, file_of, folder_name, picture_file
-from raytrace.cli.paths import folder_or_lens as folder_or_lens
-from raytrace.cli.paths import output_file as output_file
-
+PICTURES = (".png", ".pdf", ".svg")
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
+
+Adder = Callable[[argparse.ArgumentParser], object]
+
+
+def option(*flags: str, **settings) -> Adder:
+    """One option, as `add_argument` takes it."""
+    return lambda parser: parser.add_argument(*flags, **settings)
+
+
+def group(title: str, *options: Adder) -> Adder:
+    """Options under a title of their own."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        section = parser.add_argument_group(title)
+        for add_option in options:
+            add_option(section)
+
+    return add
 
 
 class Names:
-    """The names of a table of the library, as `choices` of an option; it is imported when one is given."""
+    """`choices` of an option from a table of the library, which is imported when the option is used."""
 
-    def __init__(self, module: str, table: str, *others: str):
-        self._place, self._others = (module, table), others
+    def __init__(self, table: Callable[[], Iterable[str]]):
+        self._table = table
 
     def __iter__(self) -> Iterator[str]:
-        module, table = self._place
-        return iter((*self._others, *getattr(importlib.import_module(f"raytrace.{module}"), table)))
+        return iter(self._table())
 
     def __contains__(self, name: str) -> bool:
         return name in tuple(self)
+
+
+def _models() -> Iterable[str]:
+    from raytrace.psf_models.models import MODELS
+
+    return ("auto", *MODELS)
+
+
+def _default_merits() -> Iterable[str]:
+    from raytrace.optimization.default_merit import KINDS
+
+    return KINDS
+
+
+def _written_formats() -> Iterable[str]:
+    from raytrace.io import WRITTEN
+
+    return WRITTEN
+
+
+MODELS = Names(_models)
+DEFAULT_MERITS = Names(_default_merits)
+LENS_SUFFIXES = Names(_written_formats)
+
+# -- files
+
+
+class InputFile(str):
+    """Name of a file that is read, or of a library item that a file may replace."""
+
+    __slots__ = ()
+
+
+class OutputFile(str):
+    """Name of a file that is written; suffixes: those allowed, any if empty."""
+
+    suffixes: Iterable[str] = ()
+
+
+class OutputFolder(str):
+    """Name of a folder that is written; may_be_file: or of a file, next to a folder of that name without suffix."""
+
+    may_be_file: bool = False
+
+
+def file_name(text: str) -> InputFile:
+    """A file to read."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name of the file is empty")
+    return InputFile(text)
+
+
+def output_file(text: str) -> OutputFile:
+    """A file to write."""
+    return OutputFile(file_name(text))
+
+
+def data_file(text: str) -> OutputFile:
+    """A data file to write; the suffix of a picture is refused."""
+    if PurePath(file_name(text)).suffix.lower() in PICTURES:
+        raise argparse.ArgumentTypeError(f"{text!r} is a picture: figures are saved by --plot, data by -o")
+    return OutputFile(text)
+
+
+def file_of(suffixes: Iterable[str]) -> Callable[[str], OutputFile]:
+    """The type of a data file to write with one of these suffixes."""
+
+    def reader(text: str) -> OutputFile:
+        file = data_file(text)
+        file.suffixes = suffixes
+        return file
+
+    return reader
+
+
+def picture_file(text: str) -> OutputFile:
+    """A figure to write: .png, .pdf or .svg."""
+    if PurePath(file_name(text)).suffix.lower() not in PICTURES:
+        listed = ", ".join(PICTURES)
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no picture ({listed}); data are written by -o, where there is one"
+        )
+    return OutputFile(text)
+
+
+def folder_name(text: str) -> OutputFolder:
+    """A folder to write in."""
+    return OutputFolder(data_file(text))
+
+
+def folder_or_lens(text: str) -> OutputFolder:
+    """A folder to write in, or a lens file next to it."""
+    folder = folder_name(text)
+    folder.may_be_file = bool(PurePath(text).suffix)
+    return folder
+
+
+# -- numbers
 
 
 def positive(text: str) -> float:
@@ -122,6 +236,9 @@ def _number(text: str) -> float:
     if number != number:
         raise argparse.ArgumentTypeError("nan is not a number to work with")
     return number
+
+
+# -- lens and conditions
 
 
 def lens(parser: argparse.ArgumentParser, *, all_configurations: str = "") -> None:
@@ -332,7 +449,7 @@ def output(parser: argparse.ArgumentParser, what: str, suffixes: Iterable[str]) 
 
 def output_lens(parser: argparse.ArgumentParser, what: str) -> None:
     """-o FILE, a lens file."""
-    output(parser, what, Names("io", "WRITTEN"))
+    output(parser, what, LENS_SUFFIXES)
 
 
 def output_folder(
@@ -359,4 +476,71 @@ def window(group, *, normalise: str) -> None:
         metavar="R",
         type=positive_finite,
         help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform disc)",
+    )
+
+
+# -- merit functions, variables, constraints
+
+
+def merit(parser: argparse.ArgumentParser) -> None:
+    """--merit and what goes with it: `optimization.merit.merit_for`."""
+    parser.add_argument(
+        "--merit",
+        metavar="KIND",
+        choices=DEFAULT_MERITS,
+        help="a default merit function instead of the file's: spot (where rays land), wavefront (path differences), "
+        "angular (directions behind an afocal lens) or mtf",
+    )
+    parser.add_argument(
+        "--skip-unknown", action="store_true", default=None, help="leave rows of operands that are not known out"
+    )
+    parser.add_argument(
+        "--reading",
+        dest="conventions",
+        metavar="NAME=CHOICE",
+        nargs="+",
+        help="where the meaning of an operand is open, another convention than the default: opd_tilt=common, "
+        "opd_chief=primary, opd_sign=shorter, boundary=largest, behind_mirrors=signed, focal_length=in-air, "
+        "total_track=sum, colour=second, seidel=wavefront, f_theta=axis-included",
+    )
+    own = parser.add_argument_group("of a default merit function")
+    own.add_argument("--rings", metavar="N", type=count, help="rings of rays in the pupil (default 3)")
+    own.add_argument("--arms", metavar="N", type=count, help="arms of rays in the pupil, even (default 6)")
+    own.add_argument("--reference", choices=("centroid", "chief"), help="what rays are told from (default centroid)")
+    own.add_argument(
+        "--frequency", dest="frequencies", metavar="F", type=positive_finite, nargs="+", help="of mtf, cycles/mm"
+    )
+    for name in ("field", "wavelength"):
+        option = f"--{name}-weights"
+        own.add_argument(option, metavar="W", type=positive_finite, nargs="+", help=f"one a {name}, not the lens's own")
+    bounds = parser.add_argument_group("boundaries, beside any merit function")
+    for name in ("glass", "air"):
+        option = f"--{name}-thickness"
+        bounds.add_argument(option, metavar="MIN[:MAX]", help=f"of {name} on the axis, mm, as 2:15, or 2")
+    bounds.add_argument("--edge", metavar="MIN", type=positive_finite, help="least thickness of glass at its edge, mm")
+
+
+def freedom(parser: argparse.ArgumentParser) -> None:
+    """--vary, --bounds and --hold: `optimization.variables.freedom`, `optimization.variables.bounds_of`,
+    `optimization.constraints.conditions_of`."""
+    group = parser.add_argument_group(
+        "what varies, where it is not the file's, and what holds",
+        "Words in quotes: 'curvature thickness' (all surfaces that bend light, all gaps), curvature:1-4,7 conic:3 a4:3 "
+        "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); what follows: "
+        "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "
+        "'thickness:8=marginal_height(0)' 'curvature:7=marginal_angle(-0.1)'.",
+    )
+    group.add_argument("--vary", metavar="WHAT", nargs="+", help="what varies, and what follows")
+    group.add_argument(
+        "--bounds",
+        metavar="NAME:LOW,HIGH",
+        nargs="+",
+        help="of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1,0), open on one side (sensor:30..)",
+    )
+    group.add_argument(
+        "--hold",
+        metavar="NAME=VALUE",
+        nargs="+",
+        help="what is kept to exactly: efl=50 f_number=4 'total_track<=80' 'distortion<=2%%' 'bfd>=30' "
+        "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' efl@2=100, or an operand as REAY(8,0,0,1,0,0)=2",
     )

@@ -1,169 +1,274 @@
-"""What every command does: open the lens, call the verb once, print or save what it gives."""
+"""The runner of every command: open the lens, call the public function once, print or save the result."""
 
 import argparse
 import inspect
+import json
 import math
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 
 import raytrace
-from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
-from raytrace.cli.outputs import check_outputs
+from raytrace.cli.options import InputFile, OutputFile, OutputFolder
 from raytrace.cli.progress import progress
-from raytrace.io import LensFileError
-from raytrace.maths.result import Result, called
+from raytrace.files import check_output, check_output_folder, shipped
+from raytrace.io import FORMATS, LensFileError, read_lens, shipped_lens
+from raytrace.materials.catalogs import shipped_file
+from raytrace.maths.result import Result
 from raytrace.shards import processes, share
+from raytrace.system.lens import Lens, check_media
+from raytrace.words import did_you_mean
 
-#: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
-_RUNNERS = (
+#: Options that set the lens, by the keywords of `Lens.at`.
+CONDITIONS = (
+    *("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming", "temperature", "pressure"),
+)
+#: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.
+RUNNER_OPTIONS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "spelled"),
     *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
-_DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log"
+_FIGURE = "plot_"  # prefix of options of the figure: --log, dest="plot_log"
+#: Outputs that may be an input: a checkpoint replaces the one that is resumed.
+_REPLACES = {("checkpoint", "resume")}
 
 
-def carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
-    """Run a command; its verb gets every option as the keyword of the same name. Returns the exit code: 1 for a result
-    that falls short of what was asked for.
+class CommandError(ValueError):
+    """Well-formed arguments that cannot be carried out together."""
 
-    Several object distances go to the verb where it takes `object_distances`, else one result follows the other. Under
-    torchrun processes share the work of a verb that takes a `share`, and the first one tells what was found.
+
+def carry_out(arguments: argparse.Namespace) -> int:
+    """Run the command of `arguments.run`. Returns the exit code: 1 for a result that falls short of what was asked for.
+
+    Several object distances are passed on if the function takes `object_distances`, else it is called once for each.
+    Under torchrun processes share the work of a function that takes a `share`, and the first one prints.
     """
-    with processes() if takes(command, "share") else nullcontext():
-        return _carry_out(command, arguments)
+    with processes() if _takes(arguments, "share") else nullcontext():
+        check_outputs(arguments)
+        run = arguments.run.run or result_of_lens
+        distances = getattr(arguments, "object_distances", None)
+        if distances and not _takes(arguments, "object_distances"):
+            return _run_each(run, arguments, distances)
+        result = run(arguments)
+        present(result, arguments)
+        return int(result is not None and result.falls_short)
 
 
-def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
-    check_outputs(arguments)
-    run = getattr(command, "run", None) or partial(verb_of_lens, command)
-    run = called(run) if isinstance(run, str) else run
-    distances = getattr(arguments, "object_distances", None)
-    if not distances or takes(command, "object_distances"):
-        found = run(arguments)
-        present(found, arguments)
-        return int(found is not None and found.falls_short)
-    documents, short, failed = [], False, None
-    for distance, one in _each(arguments, distances):
-        if len(distances) > 1 and not arguments.json:
-            print(f"object at {_words(distance)}", flush=True)
-        found = run(one)
-        short |= found.falls_short
+def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[float]) -> int:
+    """One result for each object distance; with several, files are named by the distance."""
+    documents, falls_short, failure = [], False, None
+    several = len(distances) > 1
+    for distance in distances:
+        text = f"{repr(distance).removesuffix('.0')} mm" if math.isfinite(distance) else "infinity"
+        suffix = "_" + text.replace(" ", "") if several else ""
+        values = {**vars(arguments), "object_distances": distance, "suffix": suffix}
+        for name in ("plot", "output"):
+            if suffix and values.get(name):
+                path = Path(values[name])
+                values[name] = str(path.with_name(path.stem + suffix + path.suffix))
+        single = argparse.Namespace(**values)
+        if several and not arguments.json:
+            print(f"object at {text}", flush=True)
+        result = run(single)
+        falls_short |= result.falls_short
         try:
-            save(found, one)
-        except (OSError, LensFileError) as error:  # said when all results are printed
-            failed = failed or error
+            save(result, single)
+        except (OSError, LensFileError) as error:  # raised when all results are printed
+            failure = failure or error
         if arguments.json:
-            place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
-            documents.append({**place, **found.document()})
+            place = {"object_distance": distance if math.isfinite(distance) else None} if several else {}
+            documents.append({**place, **result.document()})
         else:
-            print(found)
+            print(result)
     if arguments.json:
-        print_json(documents[0] if len(distances) == 1 else {"results_by_object_distance": documents})
-    if failed:
-        raise failed
-    return int(short)
+        print_json({"results_by_object_distance": documents} if several else documents[0])
+    if failure:
+        raise failure
+    return int(falls_short)
 
 
-def takes(command: ModuleType, keyword: str) -> bool:
-    """Whether the verb of a command has a keyword; those of codesign, wave and bench are no verbs."""
-    return _verb(command) in raytrace.PUBLIC and keyword in inspect.signature(verb_of(command)).parameters
+def _takes(arguments: argparse.Namespace, keyword: str) -> bool:
+    """Whether the command calls a public function with this parameter; codesign and bench call none."""
+    verb = arguments.run.verb
+    return verb in raytrace.PUBLIC and keyword in inspect.signature(getattr(raytrace, verb)).parameters
 
 
-def verb_of(command: ModuleType) -> Callable:
-    """The public function that a command calls."""
-    return getattr(raytrace, _verb(command))
-
-
-def _verb(command: ModuleType) -> str:
-    return getattr(command, "VERB", command.__name__.rpartition(".")[2])
-
-
-def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:
-    """The options of a command line as keywords of its verb; what was not given is left to the verb."""
-    given = {name: value for name, value in vars(arguments).items() if value is not None and name != "lens"}
-    wanted = {
+def options_of(arguments: argparse.Namespace) -> dict:
+    """The options of a command line as keywords of its public function, without those that are missing."""
+    options = {
         name: value
-        for name, value in given.items()
-        if not name.startswith(_DRAWING) and (name not in _RUNNERS or takes(command, name))
+        for name, value in vars(arguments).items()
+        if value is not None
+        and name != "lens"
+        and not name.startswith(_FIGURE)
+        and (name not in RUNNER_OPTIONS or _takes(arguments, name))
     }
-    if takes(command, "progress"):
-        wanted["progress"] = partial(progress, what=arguments.command)
-    if takes(command, "share"):
-        wanted["share"] = share()
-    return wanted
+    if _takes(arguments, "progress"):
+        options["progress"] = partial(progress, what=arguments.command)
+    if _takes(arguments, "share"):
+        options["share"] = share()
+    return options
 
 
-def verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
-    """What the verb says of the lens; its errors begin with the name of the lens, as every error does."""
+def result_of_lens(arguments: argparse.Namespace) -> Result:
+    """Call the public function with the lens and the options. Its errors begin with the name of the lens."""
     lens = open_lens(arguments)
     try:
-        return verb_of(command)(lens, **options_of(command, arguments))
+        return getattr(raytrace, arguments.run.verb)(lens, **options_of(arguments))
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
 
 
-def present(found: Result | None, arguments: argparse.Namespace) -> None:
-    """Save a result where --plot and -o ask for it, then print it, as text or as JSON: also what cannot be saved."""
-    if found is None or share().rank:
+# -- the lens
+
+
+def find_lens(name: str) -> Path:
+    """The file of that name, else the shipped lens of that name (with or without lenses/ and .zmx)."""
+    path = Path(name)
+    if path.is_dir():
+        raise CommandError(f"{name}: is a directory; expected a lens file")
+    if path.exists():
+        return path
+    if shipped_path := shipped_lens(path):
+        return shipped_path
+    names = sorted({lens.stem for lens in shipped("lenses").rglob("*.zmx")})
+    neighbours = [str(file) for file in path.parent.glob("*") if file.suffix.lower() in FORMATS]
+    meant = did_you_mean(name, [*names, *neighbours])
+    raise CommandError(f"{name}: no such lens file{meant or ';'} the shipped lenses are {', '.join(names)}")
+
+
+def open_lens(arguments: argparse.Namespace) -> Lens:
+    """Read the lens and set the conditions of the options; the object distance if it is a single one."""
+    path = find_lens(arguments.lens)
+    number = getattr(arguments, "configuration", None)
+    lens = read_lens(
+        path,
+        catalogs=catalogs(arguments),
+        substitute=getattr(arguments, "substitute", None),
+        configuration=number if isinstance(number, int) else None,
+    )
+    conditions = {name: getattr(arguments, name, None) for name in CONDITIONS}
+    distance = getattr(arguments, "object_distances", None)
+    try:
+        lens = lens.at(**conditions, object_distance=distance if isinstance(distance, float) else None)
+        check_media(lens, lens.wavelengths)
+    except ValueError as error:
+        raise CommandError(f"{path}: {error}") from error
+    return lens
+
+
+def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
+    """The glass catalogs of --catalog, files or names of shipped ones. Raises CommandError for a missing one."""
+    paths = []
+    for name in arguments.catalog:
+        path = Path(name)
+        if not (path.suffix or path.exists()):
+            path = shipped_file(name) or path
+        if not path.is_file():
+            raise CommandError(f"{path}: no such glass catalog; expected an .agf file after --catalog")
+        paths.append(path)
+    return tuple(paths)
+
+
+# -- outputs
+
+
+def check_outputs(arguments: argparse.Namespace) -> None:
+    """Check every output of a command line before the work. Raises CommandError and OSError.
+
+    The folder exists and can be written in, the suffix is known, and no two options name one file.
+    """
+    seen = {_real(path): name for name, path in _paths(arguments, InputFile)}
+    for name, path in _paths(arguments, OutputFile):
+        other = seen.get(_real(path))
+        flag = _flag(arguments, name)
+        if other is not None and (name, other) not in _REPLACES:
+            raise CommandError(f"{flag} {path}: is the file of {_flag(arguments, other)} too; give another name")
+        seen[_real(path)] = name
+        try:
+            check_output(path, tuple(path.suffixes))
+        except ValueError as error:
+            raise CommandError(f"{flag} {error}") from error
+    for name, path in _paths(arguments, OutputFolder):
+        if path.may_be_file and _real(path) in seen:
+            other = _flag(arguments, seen[_real(path)])
+            raise CommandError(f"{_flag(arguments, name)} {path}: is the file of {other} too; give another name")
+        check_output_folder(Path(path).parent if path.may_be_file else path)
+
+
+def _paths(arguments: argparse.Namespace, kind: type[str]) -> Iterator[tuple[str, str]]:
+    """Names and values of the arguments that are paths of a kind, single or in lists."""
+    for name, value in vars(arguments).items():
+        for entry in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(entry, kind):
+                yield name, entry
+
+
+def _real(path: str) -> str:
+    """The file of a name: the shipped lens of that name if there is none in the folder."""
+    return os.path.realpath(path if Path(path).exists() else shipped_lens(Path(path)) or path)
+
+
+def _flag(arguments: argparse.Namespace, name: str) -> str:
+    return getattr(arguments, "spelled", {}).get(name, name.upper())
+
+
+def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None:
+    """Raise CommandError for a file name with another suffix than the known ones; None passes."""
+    if path and Path(path).suffix.lower() not in known:
+        raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(filter(None, known))}")
+
+
+# -- the result
+
+
+def present(result: Result | None, arguments: argparse.Namespace) -> None:
+    """Save a result by --plot and -o, then print it as text or JSON, even if it cannot be saved."""
+    if result is None or share().rank:
         return
-    with printed_anyway(found, arguments):
-        save(found, arguments)
-    print_result(found, arguments)
+    with printed_on_failure(result, arguments):
+        save(result, arguments)
+    print_result(result, arguments)
 
 
 @contextmanager
-def printed_anyway(found: Result, arguments: argparse.Namespace) -> Iterator[None]:
-    """A result whose files cannot be written is printed before the error."""
+def printed_on_failure(result: Result, arguments: argparse.Namespace) -> Iterator[None]:
+    """Print a result whose files cannot be written before the error is raised."""
     try:
         yield
     except (OSError, LensFileError):
-        print_result(found, arguments)
+        print_result(result, arguments)
         raise
 
 
-def print_result(found: Result, arguments: argparse.Namespace) -> None:
-    """A result as text or as JSON."""
+def print_result(result: Result, arguments: argparse.Namespace) -> None:
+    """Print a result as text or JSON."""
     if getattr(arguments, "json", False):
-        print_json(found.document())
+        print_json(result.document())
     else:
-        print(found, flush=True)
+        print(result, flush=True)
 
 
-def save(found: Result, arguments: argparse.Namespace) -> None:
-    """The figure of --plot and the data of -o."""
-    drawing = {
-        name.removeprefix(_DRAWING): value for name, value in vars(arguments).items() if name.startswith(_DRAWING)
-    }
-    for option, write in (("plot", partial(found.plot, **drawing)), ("output", found.save)):
+def save(result: Result, arguments: argparse.Namespace) -> None:
+    """Write the figure of --plot and the data of -o."""
+    drawing = {name.removeprefix(_FIGURE): value for name, value in vars(arguments).items() if name.startswith(_FIGURE)}
+    for option, write in (("plot", partial(result.plot, **drawing)), ("output", result.save)):
         if path := getattr(arguments, option, None):
-            with _named(arguments):
+            try:
                 write(path)
+            except raytrace.NothingToShow as error:
+                raise CommandError(f"{arguments.lens}: {error}") from error
             say(f"written: {path}")
 
 
-@contextmanager
-def _named(arguments: argparse.Namespace) -> Iterator[None]:
-    """What there is nothing to draw of is told with the name of the lens; other errors have names of their own."""
-    try:
-        yield
-    except raytrace.NothingToShow as error:
-        raise CommandError(f"{arguments.lens}: {error}") from error
+def print_json(document: dict) -> None:
+    """Write one JSON document to standard output."""
+    print(json.dumps(document, indent=2, allow_nan=False))
 
 
-def _each(arguments: argparse.Namespace, distances: list[float]) -> Iterator[tuple[float, argparse.Namespace]]:
-    """The arguments for each object distance, with files named by it where there are several."""
-    for distance in distances:
-        suffix = "" if len(distances) == 1 else "_" + _words(distance).replace(" ", "")
-        one = {**vars(arguments), "object_distances": distance, "suffix": suffix}
-        for name in ("plot", "output"):
-            if suffix and one.get(name):
-                path = Path(one[name])
-                one[name] = str(path.with_name(path.stem + suffix + path.suffix))
-        yield distance, argparse.Namespace(**one)
-
-
-def _words(distance: float) -> str:
-    return f"{repr(distance).removesuffix('.0')} mm" if math.isfinite(distance) else "infinity"
+def say(message: str) -> None:
+    """Write one line to standard error."""
+    print(f"raytrace: {message}", file=sys.stderr)

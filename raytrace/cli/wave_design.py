@@ -88,6 +88,3 @@ def options(parser: argparse.ArgumentParser) -> None:
     output_folder(parser, "folder of the run", required=True)
     json(parser)
     plot(parser, "height map, PSFs over depth and wavelength, PSNR over depth")
-
-
-run = "cli.wave_design_run.design"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from raytrace.cli.door import CommandError, say
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
+from raytrace.cli.run import CommandError, say
 from raytrace.files import write_json
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import NotFinite, OtherSettings

@@ -37,6 +37,3 @@ def options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of the simulated noise (default 0)")
     output_folder(parser, "folder of the restored images, as .png", required=True)
     json(parser)
-
-
-run = "cli.wave_restore_run.restore_files"

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, catalogs, say
+from raytrace.cli.run import CommandError, catalogs, say
 from raytrace.imaging.image import blur
 from raytrace.imaging.restoration import depth_invariant_wiener, power_law, psnr, restore
 from raytrace.imaging.wave_camera import WaveCameraConfig, kernels, transfer
