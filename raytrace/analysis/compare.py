@@ -12,8 +12,7 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
-from raytrace.psf_models.compute import PIXEL, SIZE, psf
-from raytrace.psf_models.models import MODELS, Model, NotConverged
+from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 from raytrace.tracing.aiming import need_axis

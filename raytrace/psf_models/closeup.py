@@ -10,8 +10,7 @@ from torch import Tensor
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.psf_models.compute import psf
-from raytrace.psf_models.models import MODELS, NotConverged
+from raytrace.psf_models.models import MODELS, NotConverged, psf
 from raytrace.psf_models.result import EmptyPsf, Psf, mixture
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing.f_number import axial_f_number
