@@ -93,7 +93,13 @@ PUBLIC = {
     "search": "optimization.search",
     # images and analyses
     "Memo": "tracing.scene",
+    "DRT": "psf_models",
+    "Execution": "psf_models",
+    "Fourier": "psf_models",
+    "Gaussian": "psf_models",
+    "Paraxial": "psf_models",
     "Psf": "psf_models",
+    "Wave": "psf_models",
     "Incomplete": "analysis.setting",
     "NothingToShow": "analysis.setting",
     "compare": "analysis",

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -25,7 +25,21 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import gaussian
 from raytrace.psf_models.drt import deposit
-from raytrace.psf_models.models import MODELS, RUNGS, Model, between, by_order, by_rays, by_tolerance, climb
+from raytrace.psf_models.models import (
+    DRT,
+    MODELS,
+    RUNGS,
+    Fourier,
+    Gaussian,
+    Model,
+    Paraxial,
+    Wave,
+    between,
+    by_order,
+    by_rays,
+    by_tolerance,
+    climb,
+)
 from raytrace.psf_models.paraxial import has_one_focus
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
@@ -59,12 +73,12 @@ def shared_model(model: Model, share: Share) -> Model:
     return dataclasses.replace(model, kernels=deal(model.kernels), lean=model.lean and deal(model.lean), plain=plain)
 
 
-def check_shares(lens: Lens, options: Sequence) -> None:
+def check_shares(lens: Lens, parameters) -> None:
     """Raise ValueError for derivatives and for options that differ between kernels: processes cannot share them."""
-    leaves = [leaf for leaf in pytree.tree_leaves((lens, options)) if isinstance(leaf, Tensor)]
+    leaves = [leaf for leaf in pytree.tree_leaves((lens, parameters)) if isinstance(leaf, Tensor)]
     if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
         raise ValueError("kernels that processes share have no gradient: leave share out, or use torch.no_grad()")
-    if any(isinstance(option, Tensor) and option.dim() > 1 for option in options):
+    if any(isinstance(leaf, Tensor) and leaf.dim() > 1 for leaf in pytree.tree_leaves(parameters)):
         raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
 
 
@@ -199,12 +213,30 @@ def stream_kernels(
     return Kernels(whole, grid, *about, rays, arrived=arrived), Kernels(first, grid, *about, half, arrived=arrived)
 
 
+@dataclasses.dataclass(frozen=True)
+class Execution:
+    """How `psf` computes, without effect on the numbers.
+
+    memo: rays of earlier calls, reused where nothing before them has changed.
+    share: of this process (`shards.share()`), if all processes call alike; each gets all kernels, without gradient.
+    max_bytes: memory limit; independent rays are traced in chunks, in any number, without gradient; progress: (count,
+        unit) -> a progress bar, see `cli.progress`.
+    empty: value of a PSF that no ray reaches: "nan", kernel 0 and moments nan, all with gradient 0, or "error".
+    """
+
+    memo: Memo | None = None
+    share: Share | None = None
+    max_bytes: float | None = None
+    progress: Callable | None = None
+    empty: str = "nan"
+
+
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 
 
 def psf(
     lens: Lens,
-    model: str = "auto",
+    model: str | Paraxial | Fourier | Gaussian | DRT | Wave = "auto",
     *,
     fields: Tensor | Sequence | None = None,
     object_distances: Tensor | Sequence[float] | None = None,
@@ -216,25 +248,19 @@ def psf(
     center: str | None = None,
     window: str = "follows",
     tol: float | None = None,
-    rays: int | None = None,
-    order: int | None = None,
     normalise: str = "energy",
     per_wavelength: bool = False,
-    rho: Tensor | float = 0.5,
-    zernike: Tensor | None = None,
-    memo: Memo | None = None,
-    share: Share | None = None,
-    max_bytes: float | None = None,
-    progress: Callable | None = None,
-    empty: str = "nan",
+    execution: Execution | None = None,
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
     Derivatives include the motion of the window. Two edges have no derivative: the rim of a beam where rays miss a
-    surface or are totally reflected, in all models; and every aperture for independent rays (`rays` of `drt`), because
-    a vignetted ray drops out abruptly.
+    surface or are totally reflected, in all models; and every aperture for independent rays (`DRT(rays=…)`),
+    because a vignetted ray drops out abruptly.
 
-    model: a name of MODELS, or "auto".
+    model: "auto", "paraxial", "fourier", "gaussian", "drt" or "wave", or a model with its numbers, as `DRT(rays=2000)`:
+        rays: instead of a tolerance, about that many rays per kernel, the error estimated from half of them; order:
+        instead, an order of the model, as in `Psf.order` of an earlier call: for loops; nothing is estimated.
     fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm, inf allowed; wavelengths:
     (W,)
         µm with wavelength_weights: (W,); by default those of the lens. Kernels are summed over the wavelengths;
@@ -247,23 +273,21 @@ def psf(
     shift
         of the whole image changes no kernel. "fixed": the window has no derivative: the pixels of a sensor that does
         not move. The kernels are the same.
-    tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
-    about
-        that many rays per kernel (`drt`: independent Sobol rays), the error estimated from half of them. order:
-        instead, an order of the model, as in `Psf.order` of an earlier call: for loops; nothing is estimated.
+    tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
     normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
-    rho: of `paraxial`, σ over the blur radius. zernike: of `fourier`, Noll coefficients from 1 on, mm RMS of path.
-    memo: rays of earlier calls, reused where nothing before them has changed.
-    share: of this process (`shards.share()`), if all processes call psf alike; each gets all kernels, without gradient.
-    max_bytes: memory limit; independent rays are traced in chunks, in any number, without gradient; progress: (count,
-        unit) -> a progress bar, see `cli.progress`.
-    empty: value of a PSF that no ray reaches: "nan", kernel 0 and moments nan, all with gradient 0, or "error".
+    execution: memory, processes and progress, see `Execution`.
 
     Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
-    outside of loops (without `order` and `memo`), UnfilledStop.
+    outside of loops (without an order or a memo), UnfilledStop.
     """
+    name = model if isinstance(model, str) else next(k for k, m in MODELS.items() if isinstance(model, m.parameters))
+    _check_choices(name, center, window, normalise)
+    parameters = MODELS[name].parameters() if isinstance(model, str) and name != "auto" else model
+    order, rays = (getattr(parameters, number, None) for number in ("order", "rays"))
+    execution = execution or Execution()
+    memo, share = execution.memo, execution.share
     center = center or ("chief" if fields is None else "axis")
-    _check(model, center, window, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    _check(tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
     like = lens.wavelengths
     framed = (grid, pixel, size) != (None, None, None)
     base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
@@ -276,10 +300,9 @@ def psf(
     _check_batch(fields, distances, wavelengths, weights)
     if order is None and memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
-    options = {"rho": rho, "zernike": zernike}
-    drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
+    drive = _driver(lens, name, parameters, tol, execution)
     if share is not None and share.processes > 1:
-        check_shares(lens, (rho, zernike))
+        check_shares(lens, parameters)
     shares = weights / weights.sum()
     summed = None if per_wavelength else shares
 
@@ -293,7 +316,7 @@ def psf(
         return drive(batch, dataclasses.replace(base, centre=centre), summed)
 
     infinite = torch.isinf(distances)
-    with within(max_bytes) if max_bytes is not None else contextlib.nullcontext():
+    with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():
         if bool(infinite.any()) and not bool(infinite.all()):
             psfs = _merged(compute(~infinite), compute(infinite), infinite)
         else:
@@ -310,7 +333,7 @@ def psf(
         scaled = safe_divide(psfs.kernel, psfs.kernel.detach().amax((-2, -1), keepdim=True))
         kernel = safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
         psfs = dataclasses.replace(psfs, kernel=kernel, normalised="window")
-    psfs = without_dark(psfs, empty)
+    psfs = without_dark(psfs, execution.empty)
     _warn_of_dark(lens, fields, distances, wavelengths, psfs)
     return dataclasses.replace(
         psfs,
@@ -319,19 +342,22 @@ def psf(
         object_distances=distances,
         wavelengths=wavelengths,
         wavelength_weights=shares,
-        options=options,
+        parameters=MODELS[psfs.model].parameters() if name == "auto" else parameters,
         framed=framed,
     )
 
 
-def _driver(lens: Lens, model, options: Mapping, tol, rays, order, share: Share | None, max_bytes, progress):
+def _driver(lens: Lens, model: str, parameters, tol: float | None, execution: Execution):
     """The function (scene, grid, weights) -> Psf that the arguments of `psf` select."""
-    streams = rays is not None and max_bytes is not None and MODELS[model].plain is not None
+    share, max_bytes, progress = execution.share, execution.max_bytes, execution.progress
+    order, rays = (None if n is None else int(n) for n in (getattr(parameters, k, None) for k in ("order", "rays")))
 
     def configured(name: str) -> Model:
         row = MODELS[name]
-        if row.options:
-            keywords = {option: options[option] for option in row.options}
+        numbers = row.parameters() if model == "auto" else parameters
+        keywords = {f.name: getattr(numbers, f.name) for f in dataclasses.fields(numbers)}
+        keywords = {key: number for key, number in keywords.items() if key not in ("order", "rays")}
+        if keywords:
             row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **keywords))
         return shared_model(row, share) if share is not None and share.processes > 1 else row
 
@@ -343,7 +369,7 @@ def _driver(lens: Lens, model, options: Mapping, tol, rays, order, share: Share 
     if model == "auto":
         rungs = [configured(name) for name in RUNGS if MODELS[name].traces or has_one_focus(lens)]
         return functools.partial(climb, rungs=rungs, tol=tol or 0.01)
-    if streams:
+    if rays is not None and max_bytes is not None and MODELS[model].plain is not None:
         return stream
     if order is not None:
         return functools.partial(by_order, model=configured(model), order=order)
@@ -369,28 +395,26 @@ def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Te
         warn_of_failures(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
 
 
-def _check(model: str, center: str, window: str, normalise: str, *, tol, rays, order, grid, pixel, size) -> None:
-    known = {"model": (model, ("auto", *MODELS)), "center": (center, ("axis", "chief", "centroid"))}
+def _check_choices(model: str, center: str | None, window: str, normalise: str) -> None:
+    known = {"model": (model, ("auto", *MODELS)), "center": (center or "axis", ("axis", "chief", "centroid"))}
     known |= {"window": (window, ("follows", "fixed")), "normalise": (normalise, ("energy", "window"))}
     for name, (word, words) in known.items():
         if word not in words:
             raise ValueError(f"{name} {word!r} is not known; expected {', '.join(words)}")
+
+
+def _check(*, tol, rays, order, grid, pixel, size) -> None:
     for refused, message in (
         (
             tol is not None and rays is not None,
             "tol and rays exclude each other: a tolerance chooses the number of rays",
         ),
         (
-            order is not None and (tol is not None or rays is not None or model == "auto"),
-            "order belongs to one model and excludes tol and rays: an order says how much work is done",
+            order is not None and (tol is not None or rays is not None),
+            "an order fixes the amount of work: it excludes tol and rays",
         ),
         (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
-        (rays is not None and rays < 1, f"rays {rays}: expected a whole number above 0"),
-        (
-            rays is not None and model == "auto",
-            "auto chooses by a tolerance: give tol, or rays and a model that traces them",
-        ),
-        (rays is not None and model != "auto" and not MODELS[model].traces, f"{model} traces no rays: leave rays out"),
+        (rays is not None and (rays < 1 or rays % 1), f"rays {rays}: expected a whole number above 0"),
         (grid is not None and (pixel, size) != (None, None), "grid says pixel and size: leave them out, or the grid"),
         (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
     ):

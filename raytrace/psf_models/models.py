@@ -17,6 +17,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import OverBudget
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.value import value
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.psf_models.result import Kernels, Psf, polychromatic
@@ -24,6 +25,52 @@ from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, varies
 from raytrace.words import calling_level
+
+
+@value
+class Paraxial:
+    """First-order data: a Gaussian of the defocus blur. rho: its σ over the blur radius; order: 0, for loops."""
+
+    rho: Tensor | float = 0.5
+    order: int | None = None
+
+
+@value
+class Fourier:
+    """First-order data with diffraction: a circular pupil, defocused and aberrated.
+
+    zernike: Noll coefficients from 1 on, mm RMS of path, (J,) or (J, D, F, W); order: -2 … 5, for loops.
+    """
+
+    zernike: Tensor | None = None
+    order: int | None = None
+
+
+@value
+class Gaussian:
+    """A Gaussian of the centroid and covariance of traced rays.
+
+    rays: at most so many per kernel; order: instead, Gauss rings, 2, 3, 4, 5, 6, 8, 10, 12, 16 or 24, for loops.
+    """
+
+    rays: int | None = None
+    order: int | None = None
+
+
+@value
+class DRT:
+    """All traced rays: geometric optics. rays: independent Sobol rays per kernel; order: instead, 0 … 10, for loops."""
+
+    rays: int | None = None
+    order: int | None = None
+
+
+@value
+class Wave:
+    """Diffraction of the traced wavefront. rays: at most so many per kernel; order: instead, -2 … 5, for loops."""
+
+    rays: int | None = None
+    order: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,13 +81,14 @@ class Model:
     kernels: (scene, grid, order=…) -> Kernels; orders: from the coarsest to the finest.
     lean: the same without the residual, where that costs time; None if it does not.
     plain: (scene, grid, rays=…) -> Kernels of independent rays; None if the model has none.
-    options: further keywords of `kernels`, passed on by `psf`.
+    parameters: the class of its numbers, as `psf` takes them; those other than order and rays are keywords of
+        `kernels`.
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
     alone
         and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
     is_rung: whether `model="auto"` tries it.
-    row, compared: its row in `compare`, and the arguments used there.
+    row, compared: its row in `compare`, and the arguments of `psf` used there.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -56,9 +104,9 @@ class Model:
     title: str
     kernels: Callable[..., Kernels]
     orders: Sequence[int]
+    parameters: type
     lean: Callable[..., Kernels] | None = None
     plain: Callable[..., Kernels] | None = None
-    options: tuple[str, ...] = ()
     traces: bool = True
     waves: bool = False
     is_rung: bool = False
@@ -81,24 +129,24 @@ _OF_WAVES = {"waves": True, "first": 0.23, "least": 1e-3, "most": 0.5, "floor": 
 # fmt: off
 _ROWS = (
     # First-order data: a Gaussian of the defocus blur.
-    Model("paraxial", "paraxial", paraxial.kernels, (0,), options=("rho",), traces=False, is_rung=True, row=2),
+    Model("paraxial", "paraxial", paraxial.kernels, (0,), Paraxial, traces=False, is_rung=True, row=2),
     # The same with diffraction: a defocused (and aberrated) circular pupil.
-    Model("fourier", "Fourier", fourier.kernels, range(-2, 6), options=("zernike",), traces=False, row=3, **_OF_WAVES),
+    Model("fourier", "Fourier", fourier.kernels, range(-2, 6), Fourier, traces=False, row=3, **_OF_WAVES),
     # Centroid and covariance of traced rays. Gauss rings converge irregularly: the change of one order does not predict
     # that of the next, so the error is proven.
     Model(
-        "gaussian", "Gaussian DRT", gaussian.kernels, (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), lean=gaussian.kernels_alone,
-        is_rung=True, row=1, compared={"tol": 1e-3},
+        "gaussian", "Gaussian DRT", gaussian.kernels, (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), Gaussian,
+        lean=gaussian.kernels_alone, is_rung=True, row=1, compared={"tol": 1e-3},
         by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
     ),
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
-        "drt", "DRT", drt.kernels, range(11), plain=drt.kernels_of_rays, is_rung=True, row=0, compared={"rays": 256},
-        first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
+        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0,
+        compared={"model": DRT(rays=256)}, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
-    Model("wave", "wave", wave.kernels, range(-2, 6), is_rung=True, by_field=True, row=4, **_OF_WAVES),
+    Model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_rung=True, by_field=True, row=4, **_OF_WAVES),
 )
 # fmt: on
 
@@ -107,6 +155,20 @@ MODELS = {row.name: row for row in _ROWS}
 
 #: The models that `model="auto"` tries in turn.
 RUNGS = tuple(row.name for row in _ROWS if row.is_rung)
+
+
+def model_of(name: str, **numbers) -> Paraxial | Fourier | Gaussian | DRT | Wave:
+    """A model with its numbers, by its name. Raises ValueError for a name or a number that there is not."""
+    if name == "auto" and "rays" in numbers:
+        raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
+    if name not in MODELS:
+        raise ValueError(f"the model {name!r} has no numbers; expected {', '.join(MODELS)}")
+    if "rays" in numbers and not MODELS[name].traces:
+        raise ValueError(f"{name} traces no rays: leave rays out")
+    known = {field.name for field in dataclasses.fields(MODELS[name].parameters)}
+    if unknown := ", ".join(sorted(numbers.keys() - known)):
+        raise ValueError(f"{unknown}: no number of the model {name}; leave it out")
+    return MODELS[name].parameters(**numbers)
 
 
 class NotConverged(UserWarning):
