@@ -57,8 +57,8 @@ def test_a_search_refuses_them_too(triplet):
 
 
 def test_what_is_missed_is_in_text_document_and_figure(triplet):
+    merit = rt.DefaultMerit("spot", air_thickness="0.1:90", glass_thickness="0.5:1")
     with pytest.warns(NotReached, match="MXCG 1 7 <= 1 .row 7. is not reached"):
-        merit = rt.DefaultMerit("spot", air_thickness="0.1:90", glass_thickness="0.5:1")
         found = rt.optimize(triplet, merit=merit, vary="curvature", hold="efl=100", cycles=3)
     assert found.falls_short
     by_name = {one.name: one for one in found.conditions}

@@ -117,7 +117,9 @@ def options_of(arguments: argparse.Namespace) -> dict:
         options["share"] = share()
     if _takes(arguments, "execution"):
         options["execution"] = Execution(**{name: options.pop(name) for name in _EXECUTION if name in options})
-    if arguments.run.verb == "psf" and (numbers := {key: options.pop(key) for key in ("rays", "rho") if key in options}):
+    if arguments.run.verb == "psf" and (
+        numbers := {key: options.pop(key) for key in ("rays", "rho") if key in options}
+    ):
         options["model"] = model_of(options.get("model", "auto"), **numbers)
     return options
 

@@ -35,9 +35,10 @@ class BadMerit(ValueError):
 
 @dataclass(frozen=True)
 class Boundaries:
-    """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum of glass at its edge.
+    """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum at the edge.
 
-    None: no such row. The minimum of air also holds at its edge. The space before the image has no maximum.
+    None: no such row. `edge` is of glass; the minimum of air also holds at its edge. The space before the image has
+    no maximum.
     """
 
     glass: tuple[float, float] | None = None

@@ -8,7 +8,7 @@ merit.with_weights(EFFL=1)             of all rows of an operand; with_targets l
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 
 from raytrace.optimization.context import Line
 from raytrace.optimization.conventions import Conventions, conventions_of
@@ -34,7 +34,7 @@ class Merit:
     _: KW_ONLY
     conventions: Conventions | str | Sequence[str] | None = None
     skip_unknown: bool = False
-    boundaries: Boundaries = Boundaries()
+    boundaries: Boundaries = field(default_factory=Boundaries)
 
     def __post_init__(self):
         object.__setattr__(self, "conventions", conventions_of(self.conventions))
