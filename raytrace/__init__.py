@@ -79,6 +79,7 @@ PUBLIC = {
     "BadMerit": "optimization.default_merit",
     "Condition": "optimization.constraints",
     "Measure": "optimization.operands.custom",
+    "DefaultMerit": "optimization.default_merit",
     "Merit": "optimization.merit",
     "Conventions": "optimization.conventions",
     "NoProblem": "optimization.problem",

@@ -60,6 +60,7 @@ from raytrace.maths.value import to as to
 from raytrace.optimization.constraints import Condition as Condition
 from raytrace.optimization.conventions import Conventions as Conventions
 from raytrace.optimization.default_merit import BadMerit as BadMerit
+from raytrace.optimization.default_merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.journal import BadSearch as BadSearch

@@ -124,10 +124,19 @@ def options_of(arguments: argparse.Namespace) -> dict:
 
 
 def result_of_lens(arguments: argparse.Namespace) -> Result:
-    """Call the public function with the lens and the options. Its errors begin with the name of the lens."""
-    lens = open_lens(arguments)
+    """Call the public function with the lens and the options. Its errors begin with the name of the lens.
+
+    Options that a function of a merit function has no parameters for define the merit function.
+    """
+    lens, options = open_lens(arguments), options_of(arguments)
     try:
-        return getattr(raytrace, arguments.run.verb)(lens, **options_of(arguments))
+        if _takes(arguments, "merit"):
+            names = [name for name in options if name == "merit" or not _takes(arguments, name)]
+            if of_merit := {name: options.pop(name) for name in names}:
+                from raytrace.optimization.merit import merit_of_options  # loads the package of merit functions
+
+                options["merit"] = merit_of_options(lens, **of_merit)
+        return getattr(raytrace, arguments.run.verb)(lens, **options)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
 
