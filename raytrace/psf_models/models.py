@@ -16,13 +16,13 @@ from torch.utils import _pytree as pytree
 
 from raytrace.budget import OverBudget
 from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.psf_models.result import Kernels, Psf, polychromatic
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import Scene, varies
+from raytrace.tracing.scene import Scene
 from raytrace.words import calling_level
 
 
