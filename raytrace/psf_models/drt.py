@@ -28,14 +28,14 @@ from torch import Tensor
 from raytrace.budget import afford
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import safe_divide, varies
 from raytrace.maths.value import value
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf_models.result import Kernels, centroid_and_covariance
 from raytrace.system.apertures import Aperture, clearance
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
-from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, trace_scene, varies
+from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, trace_scene
 
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:

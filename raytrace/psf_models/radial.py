@@ -16,8 +16,8 @@ from torch import Tensor
 
 from raytrace.budget import afford, forewarn
 from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.tracing.scene import Scene, varies
+from raytrace.maths.numerics import safe_divide, varies
+from raytrace.tracing.scene import Scene
 
 _STEPS = 64  # of the table of g in a pixel
 
