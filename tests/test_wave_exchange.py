@@ -262,7 +262,7 @@ TEXTS = {
     "empty": (".csv", "", r"is empty"),
     "no array": (".npy", "heights", r"is no .npy file"),
     "no picture": (".png", "heights", r"cannot be read as a picture"),
-    "another suffix": (".obj", "x", r"the suffix '.obj' names no format of height maps; expected one of .npy"),
+    "another suffix": (".obj", "x", r"the suffix '.obj' is unknown; expected a height map, one of .npy"),
     "no suffix": ("", "x", r"has no suffix"),
 }
 

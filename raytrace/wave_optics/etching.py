@@ -1,10 +1,10 @@
-"""Etching: what a process of lithography can make of an element of any height.
+"""Etching: the heights that a process of lithography can make of an element of any height.
 
-A process etches rings or pixels to L equal depths below m waves of the design wavelength, each off by up to a
-tolerance. Modulo m waves nothing changes at the design wavelength, but at every other one: so of all depths that is
-taken whose phases agree best with those of the element in all colours,
+A process etches rings or pixels to L equal depths below m waves of the design wavelength, each with an error up to a
+tolerance. Modulo m waves nothing changes at the design wavelength, but at every other one: so the depth is taken whose
+phases agree best with those of the element at all wavelengths,
 
-    h = argmax_d Σ_λ cos(k_λ (n_λ - 1) (d - h₀) - φ_λ),     φ_λ the pistons, which no picture shows
+    h = argmax_d Σ_λ cos(k_λ (n_λ - 1) (d - h₀) - φ_λ),     φ_λ the pistons, which no image shows
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ class Process:
     wavelength: float = 0.55
 
     def period(self, element: Element) -> Tensor:
-        """The depth in mm that is as good as none at the design wavelength, and not reached."""
+        """The depth in mm of `waves` whole waves at the design wavelength, which is not reached."""
         return self.waves * period(element.glass, self.wavelength).to(element.radius)
 
 
@@ -44,9 +44,9 @@ def relief(element: Element, process: Process) -> Tensor:
 
 @torch.no_grad()
 def matched(element: Element, process: Process, wavelengths: Tensor) -> tuple[Element, float]:
-    """The element as the process makes it nearest in phase at wavelengths (W,) µm, and how near: 1 in all colours.
+    """The element that the process can make nearest in phase at wavelengths (W,) µm, and their agreement: 1 at best.
 
-    Rings count by their area. Raises ValueError for a smooth element, which has nothing to be etched in.
+    Rings count by their area. Raises ValueError for a smooth element, which has no features to etch.
     """
     if not is_flat(element):
         kind = type(element.profile).__name__
@@ -63,20 +63,20 @@ def matched(element: Element, process: Process, wavelengths: Tensor) -> tuple[El
         pistons = pistons if trial else torch.zeros_like(pistons)
         for _ in range(_ROUNDS):
             agreement = _agreement(rate, depths, wanted, pistons)
-            own = depths[agreement.argmax(0)]
+            nearest = depths[agreement.argmax(0)]
             pistons = torch.angle(
-                (area * torch.polar(torch.ones_like(rate)[:, None], rate[:, None] * (own - wanted))).sum(1)
+                (area * torch.polar(torch.ones_like(rate)[:, None], rate[:, None] * (nearest - wanted))).sum(1)
             )
         near = float((area * agreement.amax(0)).sum() / (area.sum() * len(rate)))
         if near > most:
-            best, most = own, near
-    made = element.with_numbers(best.reshape(element.numbers.shape))
-    return dataclasses.replace(made, period=process.period(element), levels=process.levels), most
+            best, most = nearest, near
+    etched = element.with_numbers(best.reshape(element.numbers.shape))
+    return dataclasses.replace(etched, period=process.period(element), levels=process.levels), most
 
 
 def _agreement(rate: Tensor, depths: Tensor, wanted: Tensor, pistons: Tensor) -> Tensor:
     """Σ_λ cos (C, R) of phases of depths (C,) with those wanted (R,)."""
     total = torch.zeros(len(depths), len(wanted)).to(wanted)
-    for own, piston in zip(rate, pistons, strict=True):
-        total += torch.cos(own * (depths[:, None] - wanted) - piston)
+    for slope, piston in zip(rate, pistons, strict=True):
+        total += torch.cos(slope * (depths[:, None] - wanted) - piston)
     return total
