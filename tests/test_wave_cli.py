@@ -22,8 +22,8 @@ from raytrace.maths.grid import grid
 from raytrace.plotting.wave import height_figure
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import BASELINES, aim, baseline
-from raytrace.wave_optics.element import as_rings
 from raytrace.wave_optics.element_files import read_element, read_label, write_element
+from raytrace.wave_optics.fabrication import as_rings
 from raytrace.wave_optics.height_maps import write_heights
 from raytrace.wave_optics.plan import ENGINES, plan
 from raytrace.wave_optics.scene import WaveScene

@@ -12,17 +12,8 @@ from PIL import Image
 from problems import number
 
 from raytrace.materials.catalogs import find_glass
-from raytrace.wave_optics.element import (
-    Element,
-    EvenPowers,
-    Pixels,
-    Rings,
-    as_pixels,
-    fabricated,
-    fabricated_height,
-    period,
-    wrapped,
-)
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, fabricated_height, period
+from raytrace.wave_optics.fabrication import as_pixels, fabricated, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 EXACT = (".npy", ".csv")

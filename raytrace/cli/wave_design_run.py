@@ -16,8 +16,8 @@ from raytrace.imaging.wave_camera import Judged, WaveCameraConfig, depth_text, k
 from raytrace.imaging.wave_design import WaveCamera, begin, learn_element
 from raytrace.maths.result import plain
 from raytrace.settings import DesignSettings
-from raytrace.wave_optics.element import as_pixels, fabricated
 from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.fabrication import as_pixels, fabricated
 
 WIDE = 512  # pixels of a period of the restored pictures
 LEAF_COUNT = 40  # dead-leaves images

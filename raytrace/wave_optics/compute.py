@@ -24,8 +24,9 @@ from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, height_range
+from raytrace.wave_optics.element import Element, EvenPowers
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
+from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture

@@ -19,19 +19,8 @@ from raytrace.materials.glass import Glass, constant, index
 from raytrace.maths.numerics import polynomial
 from raytrace.maths.value import value
 from raytrace.maths.zernike import noll, norm
-from raytrace.wave_optics.element import (
-    ETCHED,
-    TURNED,
-    Element,
-    EvenPowers,
-    Rings,
-    Zernike,
-    as_rings,
-    fabricated_height,
-    features,
-    period,
-    wrapped,
-)
+from raytrace.wave_optics.element import ETCHED, TURNED, Element, EvenPowers, Rings, Zernike, fabricated_height, period
+from raytrace.wave_optics.fabrication import as_rings, features, wrapped
 
 #: How steep a sphere may be, (R/z)², for its series to be worth summing.
 _STEEPEST = 0.8

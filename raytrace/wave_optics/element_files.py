@@ -17,7 +17,8 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.formulas import FORMULAS
 from raytrace.materials.glass import Glass
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat
+from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 #: Suffix of smooth elements, and their profiles by their name in the file.
