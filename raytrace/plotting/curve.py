@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
@@ -45,7 +43,7 @@ class FocusRays(NamedTuple):
 
 
 @style.styled
-def through_focus_curve(found: Focus, by: str = "field") -> Figure:
+def through_focus_curve(found: Focus, by: str = "field"):
     """RMS spot radius against the sensor distance; minima, the paraxial focus and the sensor before are marked.
 
     by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
@@ -53,14 +51,14 @@ def through_focus_curve(found: Focus, by: str = "field") -> Figure:
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
-    lens = with_object_distance(style.detached(found.before), found.object_distances[0].detach())
+    lens = with_object_distance(detached(found.before), found.object_distances[0].detach())
     fields, values = found.fields.detach(), style.array(found.wavelengths)
     if by == "field":
-        labels = [style.field_label(lens, field) for field in style.array(fields).T]
-        colours, title = style.field_colours(len(labels)), style.field_title(lens)
+        labels = [field_label(lens, field) for field in style.array(fields).T]
+        colours, title = style.field_colours(len(labels)), field_title(lens)
     else:
         fields, labels = fields[:, :1], [f"{wavelength:.4g} µm" for wavelength in values]
-        colours, title = style.wavelength_colours(values), f"Field {style.field_label(lens, style.array(fields)[:, 0])}"
+        colours, title = style.wavelength_colours(values), f"Field {field_label(lens, style.array(fields)[:, 0])}"
     bundle = focus_rays(
         lens, fields=fields, wavelengths=found.wavelengths.detach(), wavelength_weights=found.wavelength_weights,
         pupil=(found.points, found.weights), by=by,
@@ -75,7 +73,7 @@ def through_focus_curve(found: Focus, by: str = "field") -> Figure:
         style.fill(lens.name, 6.3, 11, bold=True) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
     )
     axes.annotate(
-        style.first_order_text(lens, first_order(lens)),
+        first_order_text(lens, first_order(lens)),
         (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
     )  # fmt: skip
     columns = 3 if max(map(len, labels)) < 6 else 2
@@ -124,7 +122,7 @@ def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[flo
 
 
 def draw_curves(
-    axes: Axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, labels, colours=None
+    axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, labels, colours=None
 ) -> None:
     """One line for each batch of rays, a dot at its minimum; labels carry the place and the radius of the minimum."""
     colours = style.field_colours(len(labels)) if colours is None else colours
@@ -148,7 +146,7 @@ def draw_curves(
     axes.set_axisbelow(True)
 
 
-def draw_marks(axes: Axes, marks: dict[str, float]) -> None:
+def draw_marks(axes, marks: dict[str, float]) -> None:
     """Vertical lines with their names along the top, turned so that neighbours do not meet."""
     low, high = axes.get_xlim()
     dashes = ((0, (1, 1.5)), (0, (5, 2)), "solid", (0, (5, 2, 1, 2)))

@@ -1,9 +1,8 @@
 """An image in a panel without axes."""
 
-from matplotlib.axes import Axes
 
 
-def show_image(panel: Axes, values, title: str = "", *, top: float = 1.0, **drawing) -> None:
+def show_image(panel, values, title: str = "", *, top: float = 1.0, **drawing) -> None:
     """A grey or coloured image from 0 to `top`."""
     panel.imshow(values, **{"cmap": "gray", "vmin": 0, "vmax": top, "interpolation": "nearest"} | drawing)
     panel.set(xticks=[], yticks=[])

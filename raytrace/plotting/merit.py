@@ -1,6 +1,5 @@
 """Figure of a merit function: what its square is made of."""
 
-from matplotlib.figure import Figure
 
 from raytrace.optimization.evaluate import MeritResult
 from raytrace.optimization.merit import arguments
@@ -11,7 +10,7 @@ _MOST = 16  # bars
 
 
 @styled
-def contributions(found: MeritResult) -> Figure:
+def contributions(found: MeritResult):
     """A bar for every operand and field, the largest part first; rays of a field share one, other rows have their own.
 
     Bars are coloured by operand; what the smallest have together is the last bar.

@@ -19,4 +19,4 @@ def page(lens: Lens) -> str:
     except (ValueError, RuntimeError):
         return f"<pre>{html.escape(text(lens))}</pre>"
     svg = drawing.getvalue()
-    return f"<b>{html.escape(lens.name or 'Lens')}</b><br>{html.escape(title)}{svg[svg.index('<svg') :]}{table}"
+    return f"<b>{html.escape(lens.name or 'Lens')}</b><br>{html.escape(title)}{svg[svg.index('<svg'):]}{table}"

@@ -2,9 +2,6 @@
 
 from os import PathLike
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
 from raytrace.optimization.search_result import Searched
 from raytrace.plotting import style
 from raytrace.plotting.layout import draw_layout, on_one_scale
@@ -15,7 +12,7 @@ _MOST, _COLUMNS = 9, 3
 
 
 @style.styled
-def best(found: Searched) -> Figure:
+def best(found: Searched):
     """The best lenses on one scale, each with its merit, its spots and how often it was found."""
     count = min(_MOST, len(found.lenses))
     columns = min(_COLUMNS, count)
@@ -34,7 +31,7 @@ def best(found: Searched) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, found: Searched, k: int) -> None:
+def _draw(axes, found: Searched, k: int) -> None:
     _draw_lens(axes, found.lenses[k])
     spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
     times = int(found.found[k])
@@ -44,8 +41,8 @@ def _draw(axes: Axes, found: Searched, k: int) -> None:
     )  # fmt: skip
 
 
-def _draw_lens(axes: Axes, lens: Lens) -> None:
-    lens = style.detached(lens)
+def _draw_lens(axes, lens: Lens) -> None:
+    lens = detached(lens)
     draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
 
 

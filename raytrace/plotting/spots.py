@@ -6,10 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
@@ -80,13 +76,13 @@ def shares_of(lens: Lens, wavelengths: Tensor | None, weights: Tensor | None) ->
 
 
 @style.styled
-def spot_diagram(found: Spots) -> Figure:
+def spot_diagram(found: Spots):
     """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
     All panels have the same scale, are centred on the centroid over all wavelengths or, as the reference says, on the
     chief ray of the primary one, and print the RMS and the geometric radius about it.
     """
-    lens, points, rays = style.detached(found.lens), found.fields.detach(), found.arrivals
+    lens, points, rays = detached(found.lens), found.fields.detach(), found.arrivals
     about = chief_reference(lens, points)[..., 0] if found.reference == "chief" else None
     whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
     whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
@@ -103,12 +99,12 @@ def spot_diagram(found: Spots) -> Figure:
             panel.axis("off")
             continue
         draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
-        panel.set_title(f"{style.field_title(lens)} {style.field_label(lens, fields[:, f])}")
+        panel.set_title(f"{field_title(lens)} {field_label(lens, fields[:, f])}")
     name = style.fill(lens.name, width, 11, bold=True) or "Lens"
     figure.suptitle(name, fontsize=11, fontweight="bold")
     legend = figure.legend(
         handles=wavelength_handles(wavelengths, airy),
-        title=f"{style.first_order_text(lens, first_order(lens))}\n"
+        title=f"{first_order_text(lens, first_order(lens))}\n"
         f"centred on the {'centroid' if about is None else 'chief ray'}; RMS and GEO (largest) radius about it, "
         "all wavelengths together",
         loc="outside lower center", ncols=min(6, int(width / 1.05)), handletextpad=0.3,
@@ -124,7 +120,7 @@ def panel_size(radii: Sequence[float], airy: float) -> float:
 
 
 def draw_spot(
-    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+    axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
 ) -> None:
     """Draw the spot of one field into square axes of ± half mm about its centroid, with its radii below."""
     draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
@@ -139,7 +135,7 @@ def draw_spot(
 
 
 def draw_spot_to_scale(
-    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+    axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
 ) -> None:
     """As `draw_spot`, on the scale of other panels; a spot much smaller than its panel is enlarged in a corner of it,
     with the factor below."""
@@ -154,7 +150,7 @@ def draw_spot_to_scale(
 
 
 def draw_dots(
-    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+    axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
 ) -> None:
     """The dots and the Airy circle, without words."""
     centre = style.array(whole.centroid[:, number])

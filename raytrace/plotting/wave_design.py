@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from raytrace.imaging.wave_camera import Judged, WaveCameraConfig, depth_text
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
@@ -16,7 +14,7 @@ _MARGIN = 1e-5  # of the brightest pixel, shown black
 
 
 @styled
-def element_figure(judged: Judged) -> Figure:
+def element_figure(judged: Judged):
     """Height over the radius, kernels over depth × colour, PSNR over depth, of one element."""
     own, world = judged.quality, judged.world
     figure = new_figure(9.2, 7.0)
@@ -34,7 +32,7 @@ def element_figure(judged: Judged) -> Figure:
     return figure
 
 
-def _draw_profile(axes: Axes, elements: Sequence[Element]) -> None:
+def _draw_profile(axes, elements: Sequence[Element]) -> None:
     radius = float(elements[0].radius)
     r = torch.linspace(0, radius * (1 - 1e-9), 4000, dtype=elements[0].radius.dtype)
     for number, element in enumerate(elements):
@@ -66,7 +64,7 @@ def _draw_kernels(figure, found: ElementPsf) -> None:
     )
 
 
-def mark_depths(axes: Axes, world: WaveCameraConfig) -> None:
+def mark_depths(axes, world: WaveCameraConfig) -> None:
     """Near objects on the left, even in dioptres."""
     axes.set_xticks([1e3 / depth for depth in world.depths], [depth_text(depth, "∞") for depth in world.depths])
     axes.invert_xaxis()

@@ -4,9 +4,6 @@ import math
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import proj3d
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from torch import Tensor
 
 from raytrace.maths.pupil import fan
@@ -22,7 +19,7 @@ _LEAD = 0.14  # of the size of the system: how far in front of it rays of a far 
 _MIRROR = "#b9c2ca"
 
 
-def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> Figure:
+def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
     """Surfaces as shaded meshes, glass with its edge, and the rays of both fans: z to the right, y upward."""
     figure = style.new_figure(7.5, 6.0)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)

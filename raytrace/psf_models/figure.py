@@ -4,15 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from raytrace.analysis import Comparison
+from raytrace.analysis.panels import field_labels
 from raytrace.maths.grid import Grid
-from raytrace.plotting.panels import field_labels
 from raytrace.plotting.style import GREY, INK, array, bar_on_dark, fill, new_figure, round_length, styled
 from raytrace.psf_models.closeup import CloseUp
 from raytrace.psf_models.closeup import close_up as light_of
@@ -23,7 +18,7 @@ _MOST_PIXELS = 16  # across a panel, whose edges are drawn
 
 
 @styled
-def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) -> Figure:
+def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
     Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
@@ -67,7 +62,7 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
 
 
 @styled
-def model_grid(found: Comparison, *, log: bool = False) -> Figure:
+def model_grid(found: Comparison, *, log: bool = False):
     """Kernels over object distance (columns) and model (rows, with the number of its rays).
 
     Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
@@ -95,7 +90,7 @@ def model_grid(found: Comparison, *, log: bool = False) -> Figure:
     )
 
 
-def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figure, np.ndarray]:
+def _panels(kernels, halves, distances, labels, notes, log: bool):
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
     Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
@@ -148,7 +143,7 @@ def _brightness(log: bool) -> str:
     )
 
 
-def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
+def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
     """Outline the window of a kernel about a centre (2,) mm; and its pixels, where a panel holds only a few."""
     (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
     corner = centre - 0.5 * pitch * np.array([columns, rows])
@@ -167,7 +162,7 @@ def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, ro
     panel.set(xlim=(low, high), ylim=(bottom, top))
 
 
-def _worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
+def _worded(figure, title: str, said: Sequence[str]):
     """The title above and one caption below, both in lines that fit."""
     width = figure.get_figwidth()
     figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)

@@ -6,10 +6,6 @@ And the error of the closed form over the sensor distance.
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from raytrace.plotting.images import show_image
 from raytrace.plotting.style import GREY, LOOKS, new_figure, styled
@@ -23,7 +19,7 @@ Curves = Mapping[str, Sequence[Sequence[float]]]
 
 
 @styled
-def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int) -> Figure:
+def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int):
     """Mean loss of every epoch, of step 1 and of step 2: means over seeds, and their range."""
     figure = new_figure(7.2, 3.3)
     axes = figure.subplots(1, 2, sharey=True)
@@ -41,7 +37,7 @@ def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int) -> Figure:
 
 
 @styled
-def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[float]], steps_per_epoch: int) -> Figure:
+def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[float]], steps_per_epoch: int):
     """The sensor over training, and on the right the object distance whose paraxial image it is.
 
     conjugates: sensor distances in mm, ascending, and object distances in m.
@@ -66,7 +62,7 @@ def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[fl
 
 
 @styled
-def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[float]], pixel: float) -> Figure:
+def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[float]], pixel: float):
     """RMS blur diameter (mm) of the optimised lenses over object distance (mm), beside a pixel."""
     figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
@@ -82,7 +78,7 @@ def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[flo
 
 
 @styled
-def distance_figure(distances: Sequence[float], losses: Curves) -> Figure:
+def distance_figure(distances: Sequence[float], losses: Curves):
     """Test loss on DRT PSFs after step 2 over object distance (mm): means over seeds, and their range."""
     figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
@@ -94,7 +90,7 @@ def distance_figure(distances: Sequence[float], losses: Curves) -> Figure:
 
 
 @styled
-def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Sequence[float]) -> Figure:
+def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Sequence[float]):
     """Blurred and noisy images and their restorations, a row for each model, a pair of columns for each distance."""
     models = list(rows)
     figure = new_figure(1.15 * (2 * len(distances) + 1) + 0.8, 1.3 * len(models) + 0.5)
@@ -117,7 +113,7 @@ def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Seq
 @styled
 def scan_figure(
     sensors: Sequence[float], errors: Mapping[str, Sequence[float]], trained: Mapping[str, float]
-) -> Figure:
+):
     """Closed-form error over the sensor's place (mm) for each model, its minimum, and where training ended."""
     figure = new_figure(5.6, 3.7)
     panel = figure.subplots()
@@ -148,7 +144,7 @@ def _apart(places: Mapping[float, float], low: float, high: float, parts: int) -
     return chosen
 
 
-def _legend(figure: Figure, panel: Axes, more: Sequence[Line2D] = ()) -> None:
+def _legend(figure, panel, more: Sequence[Line2D] = ()) -> None:
     """Above the axes, where no curve runs."""
     handles = [*panel.get_legend_handles_labels()[0], *more]
     columns = len(handles) if len(handles) <= 4 or figure.get_figwidth() > 9 else 3
@@ -165,7 +161,7 @@ def _means(losses: Sequence[float], steps_per_epoch: int) -> np.ndarray:
     return np.asarray(losses[: whole * steps_per_epoch]).reshape(whole, -1).mean(1)
 
 
-def _band(panel: Axes, x: np.ndarray, seeds: Sequence[Sequence[float]], model: str, marker: str = "") -> None:
+def _band(panel, x: np.ndarray, seeds: Sequence[Sequence[float]], model: str, marker: str = "") -> None:
     values = np.stack([np.asarray(seed, dtype=float) for seed in seeds])
     panel.plot(x, values.mean(0), **_look(model), marker=marker, markersize=3)
     if len(values) > 1:

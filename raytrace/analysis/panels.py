@@ -3,8 +3,6 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.result import masked
@@ -29,7 +27,7 @@ SAGITTAL = (0, (4, 2))
 _FEW = 5  # fields that are drawn as points, for a line of one would not be seen
 
 
-def by_wavelength(panel: Axes, found, x: np.ndarray, y: np.ndarray, *, suffix="", dashes=DASHES, **look) -> None:
+def by_wavelength(panel, found, x: np.ndarray, y: np.ndarray, *, suffix="", dashes=DASHES, **look) -> None:
     """A curve of every wavelength in its colour, x or y (N, W); dashes: one after another; look: of all lines."""
     for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
         places = (values[:, w] if values.ndim == 2 else values for values in (x, y))
@@ -37,7 +35,7 @@ def by_wavelength(panel: Axes, found, x: np.ndarray, y: np.ndarray, *, suffix=""
         panel.plot(*places, label=wavelength_label(found, w) + suffix, color=colour, linestyle=dash, **look)
 
 
-def by_field(panel: Axes, found, x: np.ndarray, **curves: np.ndarray) -> None:
+def by_field(panel, found, x: np.ndarray, **curves: np.ndarray) -> None:
     """Curves (F, N) of every field in its colour, the first solid, the second dashed; the legend names them if two."""
     drawn = [*zip(curves, ("solid", SAGITTAL), strict=False)]
     for f, (label, colour) in enumerate(zip(field_labels(found), field_colours(found.fields.shape[1]), strict=True)):
@@ -48,18 +46,18 @@ def by_field(panel: Axes, found, x: np.ndarray, **curves: np.ndarray) -> None:
         panel.plot([], [], color=INK, linewidth=1.2, linestyle=dash, label=name)
 
 
-def mark_fields(panel: Axes, x: np.ndarray, *curves: np.ndarray) -> None:
+def mark_fields(panel, x: np.ndarray, *curves: np.ndarray) -> None:
     """What was asked for on curves (F, N) of fields."""
     for f, colour in enumerate(field_colours(len(curves[0]))):
         for values in curves:
             marks(panel, x, values[f], colour)
 
 
-def marks(panel: Axes, x: np.ndarray, y: np.ndarray, colour) -> None:
+def marks(panel, x: np.ndarray, y: np.ndarray, colour) -> None:
     panel.plot(x, y, "o", color=colour, markersize=3.5, clip_on=False, zorder=4)
 
 
-def over_field(panel: Axes, found, values: Tensor, **options) -> None:
+def over_field(panel, found, values: Tensor, **options) -> None:
     """Curves (F, W) drawn upwards over the field, as lens designers do; options: as for `by_wavelength`."""
     ruled(panel)
     order = np.argsort(field_axis(found), kind="stable")
@@ -110,7 +108,7 @@ def wavelength_label(found, w: int) -> str:
     return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
 
 
-def chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
+def chart(width: float, height: float, x: str, y: str):
     """A figure of one ruled panel, its axes named."""
     figure = new_figure(width, height)
     panel = ruled(figure.add_subplot())
@@ -119,13 +117,13 @@ def chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
     return figure, panel
 
 
-def ruled(panel: Axes) -> Axes:
+def ruled(panel) -> Axes:
     panel.grid(color="#ececec", linewidth=0.6, zorder=0)
     panel.set_axisbelow(True)
     return panel
 
 
-def finished(panel: Axes, found, what: str, columns: int = 0) -> Figure:
+def finished(panel, found, what: str, columns: int = 0):
     """The figure of a panel with its title, and a legend of so many columns below it."""
     figure, name = panel.figure, found.lens.name
     if columns:

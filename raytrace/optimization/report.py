@@ -2,9 +2,6 @@
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from raytrace.optimization.result import STOPPED, Optimized
 from raytrace.plotting import style
@@ -20,7 +17,7 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 
 @style.styled
-def optimize_report(found: Optimized) -> Figure:
+def optimize_report(found: Optimized):
     """One page: the lens and its spots before and after in its configurations, on one scale, the merit by cycle, the
     operands that are left, and what conditions and boundaries asked for and reached."""
     each, conditions = _configurations(found), found.shown_conditions()
@@ -52,12 +49,12 @@ def _configurations(found: Optimized) -> list[tuple[str, Lens, Lens]]:
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_CONFIGURATIONS)).round().astype(int))
     several = len(pairs) > 1
     return [
-        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(style.detached(one) for one in pairs[k]))
+        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(detached(one) for one in pairs[k]))
         for k in chosen.tolist()
     ]
 
 
-def _draw_conditions(axes: Axes, found: Optimized) -> None:
+def _draw_conditions(axes, found: Optimized) -> None:
     """The table of what was asked for and what was reached, what is not met in red."""
     lines, shown = found.conditions_in_words(), found.shown_conditions()
     axes.axis("off")
@@ -70,11 +67,11 @@ def _draw_conditions(axes: Axes, found: Optimized) -> None:
         )  # fmt: skip
 
 
-def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
+def _draw_lens(axes, lens: Lens, title: str) -> None:
     draw_layout(axes, lens, fields=drawn_fields(lens), rays=5)
     axes.set_title(f"{title}\n", fontweight="bold", pad=4)
     axes.annotate(
-        style.first_order_text(lens, first_order(lens)), (0.5, 1.0), (0, 5), xycoords="axes fraction",
+        first_order_text(lens, first_order(lens)), (0.5, 1.0), (0, 5), xycoords="axes fraction",
         textcoords="offset points", ha="center", fontsize=7.5, color=style.GREY,
     )  # fmt: skip
 
@@ -108,12 +105,12 @@ def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
             draw_spot_to_scale(panel, whole, dots, f, **look)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
-                panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
+                panel.set_title(field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
         row[0].set_ylabel(f"Spots {when}" + (f"\n{label}" if label else ""), fontweight="bold")
     page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
 
 
-def _draw_history(axes: Axes, found: Optimized) -> None:
+def _draw_history(axes, found: Optimized) -> None:
     merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
     _scale_merit(axes, merit)
@@ -127,7 +124,7 @@ def _draw_history(axes: Axes, found: Optimized) -> None:
     axes.grid(alpha=0.25)
 
 
-def _scale_merit(axes: Axes, merit: np.ndarray) -> None:
+def _scale_merit(axes, merit: np.ndarray) -> None:
     """Logarithmic over more than a factor of three; else even, about a value that is told where the change is small."""
     least, most = float(np.min(merit)), float(np.max(merit))
     if least > 0 and most > 3 * least:
@@ -138,7 +135,7 @@ def _scale_merit(axes: Axes, merit: np.ndarray) -> None:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=True)
 
 
-def _draw_left(axes: Axes, found: Optimized) -> None:
+def _draw_left(axes, found: Optimized) -> None:
     """What the square of the merit is made of now, and was."""
     shares: dict[str, np.ndarray] = {}
     for i, name in _groups(found):

@@ -6,9 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from torch import Tensor
 
 from raytrace.maths.pupil import fan, hexapolar
@@ -28,14 +25,14 @@ _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
 
 
 @style.styled
-def layout(found: Layout) -> Figure:
+def layout(found: Layout):
     """The lens in cross section, or in space: glass filled by index, mirrors hatched, the stop marked, rays by field.
 
     Rays are those of the primary wavelength, or coloured by wavelength where several are asked for. Lost ones are drawn
     faint and dashed up to where they are lost, with a cross where a surface is missed or reflects totally. A folded
     system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
     """
-    lens, fields = style.detached(found.lens), found.fields.detach()
+    lens, fields = detached(found.lens), found.fields.detach()
     wavelengths = lens.primary[None] if found.wavelengths is None else found.wavelengths
     if found.configuration == ALL:
         return _superimposed(found, lens.configurations, fields, wavelengths.detach())
@@ -55,11 +52,11 @@ def layout(found: Layout) -> Figure:
         width, height = 1.2 * width, max(height, 3.6)
         _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
     figure.set_size_inches(width, height)
-    axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
+    axes.set_title(first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
     return _finished(figure, lens, fields, wavelengths, width)
 
 
-def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor) -> Figure:
+def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor):
     """The lens in all its configurations in one cross section, rays coloured by configuration."""
     figure, colours = style.new_figure(8.0, 4.0), style.field_colours(len(lenses))
     axes = figure.add_subplot()
@@ -80,7 +77,7 @@ def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelen
     return figure
 
 
-def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
+def _draw_spectrum(axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
     """Where rays of every wavelength land on the image."""
     points = hexapolar(4, dtype=wavelengths.dtype, device=wavelengths.device)[0]
     end = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelengths), wavelengths[:, None])
@@ -97,13 +94,13 @@ def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) 
     axes.set_title("on the image", fontsize=8.5, color=style.GREY, pad=4)
 
 
-def _finished(figure: Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float) -> Figure:
+def _finished(figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float):
     """The figure with its title and its legend: fields, or wavelengths where there are several."""
     figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     if len(wavelengths) > 1:
         title, labels = "Wavelength", [f"{float(wavelength):g} µm" for wavelength in wavelengths]
     else:
-        title, labels = style.field_title(lens), [style.field_label(lens, field) for field in style.array(fields).T]
+        title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T]
     colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
     colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
     handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
@@ -115,7 +112,7 @@ def _finished(figure: Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, w
 
 
 def draw_layout(
-    axes: Axes,
+    axes,
     lens: Lens,
     *,
     fields: Tensor,
@@ -147,7 +144,7 @@ class _Drawn(NamedTuple):
 
 
 def _drawn(
-    axes: Axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
+    axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
 ) -> _Drawn:
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
@@ -180,7 +177,7 @@ def _drawn(
     return _Drawn(places, outline.is_bent(lens), (min(first, start), last), heights)
 
 
-def _framed(axes: Axes, drawn: Sequence[_Drawn]) -> None:
+def _framed(axes, drawn: Sequence[_Drawn]) -> None:
     """The frame of one cross section, or of several in each other's place."""
     if any(one.is_bent for one in drawn):
         _frame_bent(axes, [one.places for one in drawn])
@@ -209,7 +206,7 @@ def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> flo
 
 
 def _draw_glass(
-    axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]
+    axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]
 ) -> None:
     for k in range(1, len(places) - 1):
         if indices[k] <= outline.GLASSY or lens.surfaces[k].is_break:
@@ -223,7 +220,7 @@ def _draw_glass(
             _draw_thin(axes, lens.surfaces[k], places[k], radii[k])
 
 
-def _draw_thin(axes: Axes, surface: Surface, place: outline.Section, radius: float) -> None:
+def _draw_thin(axes, surface: Surface, place: outline.Section, radius: float) -> None:
     """A thin structure: a line along the surface, with arrows at the ends of an ideal lens."""
     height = np.linspace(-radius, radius, 81)
     line = place.at(outline.depth(surface, height, place.direction), height)
@@ -238,7 +235,7 @@ def _draw_thin(axes: Axes, surface: Surface, place: outline.Section, radius: flo
             axes.plot(*corners, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
+def _draw_mirrors(axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
     bent = outline.is_bent(lens)
     for k, side in enumerate(outline.sides(lens)):
         surface = lens.surfaces[k]
@@ -261,7 +258,7 @@ def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: 
             axes.plot(*front, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
 
 
-def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_apertures(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
@@ -284,7 +281,7 @@ def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_stop(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
     surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
     radius = float(stop_radius(lens))
@@ -298,7 +295,7 @@ def _draw_stop(axes: Axes, lens: Lens, places: list[outline.Section], radii: lis
         axes.fill(*corners, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
 
 
-def _draw_rays(axes: Axes, paths, colours) -> None:
+def _draw_rays(axes, paths, colours) -> None:
     for field, colour in zip(paths, colours, strict=True):
         for path in field:
             if path.status == "ok":
@@ -311,7 +308,7 @@ def _draw_rays(axes: Axes, paths, colours) -> None:
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
 
-def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
+def _draw_sensor(axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
     """The image surface, as far as the rays need it; returns its half height in mm."""
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
@@ -325,7 +322,7 @@ def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[flo
     return half
 
 
-def _draw_object(axes: Axes, lens: Lens, place: outline.Section, paths) -> None:
+def _draw_object(axes, lens: Lens, place: outline.Section, paths) -> None:
     heights = [abs(path.y[0]) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
@@ -340,7 +337,7 @@ def _ray_heights(paths) -> tuple[float, float]:
     return (float(np.concatenate(y).min()), float(np.concatenate(y).max())) if y else (0.0, 0.0)
 
 
-def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
+def _frame(axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
     """Optical axis, limits and scale bar."""
     length = extent[1] - extent[0]
     margin = 0.025 * length
@@ -355,7 +352,7 @@ def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]
     axes.axis("off")
 
 
-def _frame_bent(axes: Axes, ways: Sequence[Sequence[outline.Section]]) -> None:
+def _frame_bent(axes, ways: Sequence[Sequence[outline.Section]]) -> None:
     """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
     axes.relim()
     for patch in axes.patches:

@@ -2,8 +2,6 @@
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.result import object_text
@@ -21,7 +19,7 @@ _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial fo
 
 
 @style.styled
-def focus_report(found: Focus, by: str | None = None) -> Figure:
+def focus_report(found: Focus, by: str | None = None):
     """One page: the lens, the RMS spot radius through focus, and the spots before and after on one scale.
 
     Every object distance and field is a curve and a pair of spots. by: instead the curves alone, as for
@@ -29,7 +27,7 @@ def focus_report(found: Focus, by: str | None = None) -> Figure:
     """
     if by is not None:
         return through_focus_curve(found, by)
-    lens_before, lens_after = style.detached(found.before), style.detached(found.lens)
+    lens_before, lens_after = detached(found.before), detached(found.lens)
     lens, fields, wavelengths = lens_before, found.fields.detach(), found.wavelengths.detach()
     distances = found.object_distances.tolist()
     labels = _labels(lens, distances, fields)
@@ -49,7 +47,7 @@ def focus_report(found: Focus, by: str | None = None) -> Figure:
     axes = top.add_subplot()
     drawn = with_object_distance(lens_after, distances[0])
     draw_layout(axes, drawn, fields=fields, wavelengths=wavelengths[:1], rays=11 if fields.shape[1] == 1 else 7)
-    top.suptitle(style.first_order_text(drawn, first_order(drawn)), fontsize=8.5, color=style.GREY)
+    top.suptitle(first_order_text(drawn, first_order(drawn)), fontsize=8.5, color=style.GREY)
 
     _draw_focus(left.add_subplot(), lens_before, lens_after, distances, labels, rule)
     left.legend(
@@ -62,14 +60,14 @@ def focus_report(found: Focus, by: str | None = None) -> Figure:
 
 def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
     """What tells the curves apart, object distance outermost."""
-    points = [style.field_label(lens, point) for point in style.array(fields).T]
+    points = [field_label(lens, point) for point in style.array(fields).T]
     if len(distances) == 1:
         return points
     objects = [object_text(distance) for distance in distances]
     return [place if len(points) == 1 else f"{place}, {point}" for place in objects for point in points]
 
 
-def _draw_focus(axes: Axes, before: Lens, after: Lens, distances: list[float], labels: list[str], rule: dict) -> None:
+def _draw_focus(axes, before: Lens, after: Lens, distances: list[float], labels: list[str], rule: dict) -> None:
     """The curves, and lines for the sensor before and after and for the paraxial focus, all with their numbers."""
     bundles = [focus_rays(with_object_distance(before, distance), **rule) for distance in distances]
     rays = Rays(

@@ -6,9 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, PowerNorm, to_rgb
-from matplotlib.figure import Figure
 
 from raytrace.maths.grid import centres
 from raytrace.plotting.style import (
@@ -31,7 +28,7 @@ _ACROSS = 700  # points across a disc of heights
 
 
 @styled
-def psf_figure(found: ElementPsf) -> Figure:
+def psf_figure(found: ElementPsf):
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
@@ -74,7 +71,7 @@ def psf_figure(found: ElementPsf) -> Figure:
 
 
 @styled
-def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
+def height_figure(elements: Sequence[Element], *, title: str = ""):
     """The heights of elements in contact as they are made, a row for each: the disc, the profile along x, and the rim
     of one that has steps."""
     figure = new_figure(7.6, 3.1 * len(elements))
@@ -99,7 +96,7 @@ def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
     return figure
 
 
-def _disc(axes: Axes, element: Element) -> None:
+def _disc(axes, element: Element) -> None:
     """Height over the aperture as a map."""
     R = float(element.radius)
     line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
@@ -119,7 +116,7 @@ def _kind(element: Element) -> str:
 
 
 @styled
-def caustic_figure(found: ElementPsf, *, progress: Progress | None = None) -> Figure:
+def caustic_figure(found: ElementPsf, *, progress: Progress | None = None):
     """Light per mm² over the distance behind the element, logarithmic (`wave_optics.compute.caustic`).
 
     A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
@@ -150,7 +147,7 @@ def caustic_figure(found: ElementPsf, *, progress: Progress | None = None) -> Fi
 
 
 @styled
-def encircled_figure(found: ElementPsf) -> Figure:
+def encircled_figure(found: ElementPsf):
     """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
     x, y = (array(line) for line in centres(found.grid))
     radius = np.hypot(x, y[:, None]).ravel()
@@ -186,14 +183,14 @@ FIGURES: dict[str, Callable[..., Figure]] = {
 }
 
 
-def element_figure(found: ElementPsf, *, what: str = "kernels", progress: Progress | None = None) -> Figure:
+def element_figure(found: ElementPsf, *, what: str = "kernels", progress: Progress | None = None):
     """One of FIGURES of what `wave_psf` gives; progress: of a caustic."""
     if what not in FIGURES:
         raise ValueError(f"no figure {what!r}; expected one of {', '.join(FIGURES)}")
     return FIGURES[what](found, **({"progress": progress} if progress and what == "caustic" else {}))
 
 
-def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
+def _profile(panel, element: Element, first: float, last: float) -> None:
     """h(x) at y = 0 as a line."""
     x = torch.linspace(first, last, 4001, dtype=element.radius.dtype)
     with torch.no_grad():
@@ -218,7 +215,7 @@ def _mixed(kernels: np.ndarray, wavelengths: Sequence[float]) -> np.ndarray:
     return np.moveaxis((np.clip(picture, 0, None) / (peak if peak > 0 else 1)) ** _GAMMA, 0, -1)
 
 
-def framed(panel: Axes) -> None:
+def framed(panel) -> None:
     panel.set_xticks([])
     panel.set_yticks([])
     for spine in panel.spines.values():
@@ -226,7 +223,7 @@ def framed(panel: Axes) -> None:
         spine.set_color(GREY)
 
 
-def _bar(panel: Axes, found: ElementPsf) -> None:
+def _bar(panel, found: ElementPsf) -> None:
     """A bar of a round length in the corner of a kernel."""
     pitch, columns = float(found.pitch), found.grid.columns
     length = round_length(0.35 * pitch * columns)
