@@ -66,10 +66,10 @@ class Distortion(OverField):
         """Distortion in percent over the field: against f tan θ, and against f θ where the object is at infinity."""
         curves = self.drawn()
         infinite = curves.f_theta is not None
-        curves = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta} if infinite else {"Height": curves.f_tan}
-        figure = new_figure(3.1 * len(curves) + 0.9, 4.2)
-        panels = figure.subplots(1, len(curves), squeeze=False)[0]
-        for panel, (name, values) in zip(panels, curves.items(), strict=True):
+        ideals = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta} if infinite else {"Height": curves.f_tan}
+        figure = new_figure(3.1 * len(ideals) + 0.9, 4.2)
+        panels = figure.subplots(1, len(ideals), squeeze=False)[0]
+        for panel, (name, values) in zip(panels, ideals.items(), strict=True):
             over_field(panel, curves, 100 * values)
             panel.set_xlabel(f"{name} distortion (%)")
             drawn_at_least([panel], 1e-6, "x")
@@ -133,7 +133,7 @@ class LateralColour(OverField):
 
     @styled
     def draw(self):
-        """Chief-ray heights less that of the primary wavelength over the field, and the Airy radius of that one in grey."""
+        """Chief-ray heights less that of the primary wavelength over the field; its Airy radius is grey."""
         curves = self.drawn()
         _, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
         if math.isfinite(airy := 1e3 * float(airy_radius(curves.lens))):

@@ -49,7 +49,7 @@ class RelativeIllumination(OverField):
 
     @styled
     def draw(self):
-        """Relative illumination over the field, and cos⁴θ where fields are angles; fields that were asked for are marked."""
+        """Relative illumination over the field, and cos⁴θ where fields are angles. Requested fields are marked."""
         curves = self.drawn()
         _, panel = chart(5.4, 3.6, field_name(curves.lens), "relative illumination")
         order = np.argsort(field_axis(curves), kind="stable")

@@ -1,5 +1,7 @@
 """Layout: the cross section of a lens, from the side or from above, with the rays of its fields."""
 
+import html
+import io
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,52 +10,127 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis import outline, space
+from raytrace.analysis.panels import first_order_text
 from raytrace.maths.pupil import fan, hexapolar
-from raytrace.plotting import outline, space, style
+from raytrace.maths.result import Result, numbers
+from raytrace.maths.value import detached, value
+from raytrace.plotting import style
 from raytrace.system.apertures import reach
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_label,
+    field_points,
+    field_title,
+    name_of_field,
+    wavelengths_of,
+)
 from raytrace.system.phases import IdealLens
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import edge_radius
-from raytrace.tracing.launch import launch, stop_radius
-from raytrace.tracing.lens_report import ALL, Layout
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.geometry import edge_radius, warn_of_defects
+from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
+from raytrace.tracing.lens_report import Info, text
 from raytrace.tracing.trace import media, trace_lens
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
 
 
-@style.styled
-def layout(found: Layout):
-    """The lens in cross section, or in space: glass filled by index, mirrors hatched, the stop marked, rays by field.
+#: From where a lens is looked at.
+VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
 
-    Rays are those of the primary wavelength, or coloured by wavelength where several are asked for. Lost ones are drawn
-    faint and dashed up to where they are lost, with a cross where a surface is missed or reflects totally. A folded
-    system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
+
+#: All configurations of a lens, drawn together.
+ALL = "all"
+
+
+@value
+class Layout(Result):
+    """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
+
+    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
+    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
     """
-    lens, fields = detached(found.lens), found.fields.detach()
-    wavelengths = lens.primary[None] if found.wavelengths is None else found.wavelengths
-    if found.configuration == ALL:
-        return _superimposed(found, lens.configurations, fields, wavelengths.detach())
-    if found.view == "3d":
-        return _finished(space.draw(lens, fields, wavelengths.detach(), found.rays), lens, fields, wavelengths, 7.5)
-    figure = style.new_figure(8.0, 4.0)
-    axes, spectrum = figure.add_subplot(), None
-    if len(wavelengths) > 1:
-        figure.delaxes(axes)
-        axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
-    draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=found.rays, view=found.view)
-    (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    shape = (y1 - y0) / (z1 - z0)
-    width = min(max(6.0 / shape, 5.5), 8.0)
-    height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
-    if spectrum is not None:
-        width, height = 1.2 * width, max(height, 3.6)
-        _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
-    figure.set_size_inches(width, height)
-    axes.set_title(first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
-    return _finished(figure, lens, fields, wavelengths, width)
+
+    lens: Lens
+    fields: Tensor
+    rays: int = 7
+    view: str = "yz"
+    wavelengths: Tensor | None = None
+    configuration: str | None = None
+    has_fields: bool = True
+
+    def document(self) -> dict:
+        return {"fields": [numbers(point) for point in self.fields.unbind(1)]}
+
+    def __str__(self) -> str:
+        points = ", ".join(map(name_of_field, self.fields.unbind(1)))
+        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
+
+    @style.styled
+    def draw(self):
+        """The lens in cross section or in space: glass filled by index, mirrors hatched, the stop marked.
+
+        Rays are those of the primary wavelength, coloured by field, or coloured by wavelength where several are
+        given. Failed and vignetted rays are faint and dashed and end at their last surface, with a cross where they
+        miss it or are totally reflected. A folded system is drawn in its real geometry.
+        Raises ValueError for a lens with an infinite thickness inside.
+        """
+        lens, fields = detached(self.lens), self.fields.detach()
+        wavelengths = lens.primary[None] if self.wavelengths is None else self.wavelengths
+        if self.configuration == ALL:
+            return _superimposed(self, lens.configurations, fields, wavelengths.detach())
+        if self.view == "3d":
+            return _finished(space.draw(lens, fields, wavelengths.detach(), self.rays), lens, fields, wavelengths, 7.5)
+        figure = style.new_figure(8.0, 4.0)
+        axes, spectrum = figure.add_subplot(), None
+        if len(wavelengths) > 1:
+            figure.delaxes(axes)
+            axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
+        draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=self.rays, view=self.view)
+        (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+        shape = (y1 - y0) / (z1 - z0)
+        width = min(max(6.0 / shape, 5.5), 8.0)
+        height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
+        if spectrum is not None:
+            width, height = 1.2 * width, max(height, 3.6)
+            _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
+        figure.set_size_inches(width, height)
+        axes.set_title(first_order_text(lens), fontsize=8.5, color=style.GREY, pad=4)
+        return _finished(figure, lens, fields, wavelengths, width)
+
+
+def layout(
+    lens: Lens,
+    *,
+    fields: Tensor | Sequence | None = None,
+    rays: int = 7,
+    view: str = "yz",
+    wavelengths: Tensor | Sequence[float] | None = None,
+    configuration: int | str | None = None,
+) -> Layout:
+    """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
+
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
+    in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
+    coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
+    configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made. Raises ValueError for a view or a
+    configuration that there is not.
+    """
+    if view not in VIEWS:
+        raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
+    if configuration == ALL and view == "3d":
+        raise ValueError("`view=3d`: shows one configuration; `configuration=all` is drawn from the side or from above")
+    if configuration not in (None, ALL):
+        lens = lens.configuration(configuration)
+    chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
+    for one in lens.configurations if configuration == ALL else (lens,):
+        warn_of_defects(one)
+    every = ALL if configuration == ALL else None
+    points = field_points(fields, like=lens)
+    warn_of_filling(lens, points)
+    return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
 
 def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor):
@@ -69,9 +146,9 @@ def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelen
     width = min(max(6.0 * shape[1] / shape[0], 5.5), 8.0)
     figure.set_size_inches(width, min(max(0.98 * width * shape[0] / shape[1], 1.2), 6.0) + 1.1)
     figure.suptitle(style.fill(lenses[0].name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
-    handles = [Line2D([], [], color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
+    handles = [style.legend_entry(color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
     figure.legend(
-        handles=[Line2D([], [], linestyle="", label="Configuration"), *handles],
+        handles=[style.legend_entry(linestyle="", label="Configuration"), *handles],
         loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
@@ -103,9 +180,9 @@ def _finished(figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: fl
         title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T]
     colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
     colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
-    handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
+    handles = [style.legend_entry(color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
     figure.legend(
-        handles=[Line2D([], [], linestyle="", label=title), *handles],
+        handles=[style.legend_entry(linestyle="", label=title), *handles],
         loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
@@ -125,7 +202,7 @@ def draw_layout(
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
 
 
-def on_one_scale(panels: Sequence[Axes]) -> None:
+def on_one_scale(panels: Sequence) -> None:
     """Give cross sections in axes of one size the same scale: each stays in the middle of what it shows."""
     limits = [(panel.get_xlim(), panel.get_ylim()) for panel in panels]
     width, height = (max(abs(one[k][1] - one[k][0]) for one in limits) for k in (0, 1))
@@ -205,9 +282,7 @@ def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> flo
     return float(min(0.0, *places[1].at(outline.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 
 
-def _draw_glass(
-    axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]
-) -> None:
+def _draw_glass(axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]) -> None:
     for k in range(1, len(places) - 1):
         if indices[k] <= outline.GLASSY or lens.surfaces[k].is_break:
             continue
@@ -369,3 +444,15 @@ def _frame_bent(axes, ways: Sequence[Sequence[outline.Section]]) -> None:
     axes.set_xlim(left - 0.025 * size, right + 0.025 * size)
     axes.set_ylim(bottom - 0.03 * size, high + 0.025 * size)
     axes.axis("off")
+
+
+def page(lens: Lens) -> str:
+    """A lens in a notebook: HTML of its cross section and its prescription, or plain text if it cannot be traced."""
+    try:
+        title, drawing = first_order_text(lens), io.StringIO()
+        layout(lens).plot().savefig(drawing, format="svg")
+        table = Info(lens).to_frame().to_html(index=False, float_format="{:.7g}".format, na_rep="")
+    except (ValueError, RuntimeError):
+        return f"<pre>{html.escape(text(lens))}</pre>"
+    svg = drawing.getvalue()
+    return f"<b>{html.escape(lens.name or 'Lens')}</b><br>{html.escape(title)}{svg[svg.index('<svg') :]}{table}"

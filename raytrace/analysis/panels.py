@@ -1,24 +1,25 @@
 """What figures of curves share: ruled panels, titles and legends, and the curves of every wavelength or field."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from torch import Tensor
 
-from raytrace.maths.result import masked
+from raytrace.maths.result import masked, object_text
 from raytrace.plotting.style import (
     GREY,
     INK,
     array,
     field_colours,
-    field_label,
-    field_title,
     fill,
+    length_text,
     new_figure,
     number_text,
     wavelength_colours,
 )
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_label, field_title
+from raytrace.tracing.paraxial import first_order
 
 #: Dashes of wavelengths, in order, for readers who do not tell their colours apart; and of sagittal curves.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
@@ -78,7 +79,7 @@ def seen(values: Tensor, valid: Tensor) -> np.ndarray:
     return array(masked(values, valid))
 
 
-def drawn_at_least(axes: Iterable[Axes], floor: float, along: str) -> None:
+def drawn_at_least(axes: Iterable, floor: float, along: str) -> None:
     """Keep axes of one scale from magnifying rounding: where no curve passes the floor, they end there and say so."""
     panels = list(axes)
     curves = [line for panel in panels for line in panel.lines if not line.get_label().startswith("_")]  # no rulers
@@ -108,6 +109,17 @@ def wavelength_label(found, w: int) -> str:
     return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
 
 
+def first_order_text(lens: Lens) -> str:
+    """`EFL 99.51 mm · F/2.99 · object at 25.00 m`, as a subtitle."""
+    data, distance, parts = first_order(lens), float(lens.surfaces[0].thickness), []
+    if math.isfinite(focal_length := float(data.effective_focal_length)):
+        parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(data.f_number), 3)}"]
+    parts.append(f"object at {object_text(distance)}")
+    if math.isfinite(distance) and math.isfinite(working := float(data.paraxial_working_f_number)):
+        parts.append(f"working F/{number_text(working, 3)}")
+    return "  ·  ".join(parts)
+
+
 def chart(width: float, height: float, x: str, y: str):
     """A figure of one ruled panel, its axes named."""
     figure = new_figure(width, height)
@@ -117,7 +129,7 @@ def chart(width: float, height: float, x: str, y: str):
     return figure, panel
 
 
-def ruled(panel) -> Axes:
+def ruled(panel):
     panel.grid(color="#ececec", linewidth=0.6, zorder=0)
     panel.set_axisbelow(True)
     return panel

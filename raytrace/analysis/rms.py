@@ -77,7 +77,7 @@ class RmsOverField(OverField):
 
     @styled
     def draw(self):
-        """RMS over the field: all wavelengths together dark, each in its colour; Maréchal's limit of wavefronts dotted."""
+        """RMS over the field: all wavelengths together in black, each in its colour; Maréchal's limit dotted."""
         curves = self.drawn()
         waves = curves.quantity == "wavefront"
         what = "RMS wavefront error" if waves else "RMS spot radius"

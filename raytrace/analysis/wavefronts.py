@@ -87,7 +87,7 @@ class WavefrontMap(Analysis):
     def draw(self):
         """A panel for each field (rows) and wavelength (columns), one scale for all; RMS, P-V, Strehl below.
 
-        Maps of a single wavelength follow each other in lines of four. 0 is white, and the scale ends where the maps end.
+        Maps of a single wavelength follow each other in lines of four. 0 is white; the scale ends with the maps.
         """
         labels, count = field_labels(self), len(self.wavelengths)
         flows = count == 1

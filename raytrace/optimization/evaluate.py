@@ -9,17 +9,20 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, cell, rows
 from raytrace.maths.value import value
-from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.plotting.style import FAINT, field_colours, new_figure, number_text, styled
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.launch import warn_of_filling
 
 _WHOLE = 40  # rows that are listed one by one
 _TOGETHER = 3  # rows of one field that share a line in longer tables
+
+_BARS = 16  # of the figure
 
 
 @value
@@ -46,8 +49,6 @@ class MeritResult(Result):
     unit: float
     skipped: tuple[int, ...]
     each: bool = False
-
-    FIGURE = "plotting.merit.contributions"
 
     def columns(self) -> dict[str, Tensor]:
         kinds, said = self.words()["operand"], self.words()["arguments"]
@@ -131,39 +132,47 @@ class MeritResult(Result):
         told = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{shown}{100 * part:>8.2f}%{lost}"
         return f"{name:>9}  {row.name:<8}{said:<{width}}{told}"
 
+    @styled
+    def draw(self):
+        """A bar for every operand and field, the largest part first; rays of a field share one.
+
+        Bars are coloured by operand; the smallest are summed in the last bar.
+        """
+        shares = _shares(self)
+        names = sorted(shares, key=lambda name: -shares[name][1])
+        shown, rest = names[:_BARS], names[_BARS:]
+        kinds = [*dict.fromkeys(shares[name][0] for name in shown)]
+        colours = dict(zip(kinds, field_colours(len(kinds)), strict=True))
+        figure = new_figure(6.4, 0.24 * (len(shown) + bool(rest)) + 1.2)
+        panel = figure.subplots()
+        bars = [(name, 100 * shares[name][1], colours[shares[name][0]]) for name in shown]
+        if rest:
+            bars.append((f"{len(rest)} more", 100 * sum(shares[name][1] for name in rest), FAINT))
+        labels, parts, fills = zip(*bars, strict=True)
+        panel.barh(range(len(bars)), parts, color=fills, height=0.72)
+        panel.set_yticks(range(len(bars)), labels)
+        panel.invert_yaxis()
+        panel.grid(axis="x", color=FAINT, linewidth=0.6, alpha=0.6)
+        panel.set_axisbelow(True)
+        panel.set_xlabel("part of the square of the merit (%)")
+        title = f"merit {number_text(float(self.merit))}"
+        panel.set_title(f"{self.lens.name}: {title}" if self.lens.name else title)
+        return figure
+
 
 def evaluate(
     lens: Lens,
     *,
-    merit: Merit | Sequence[Row] | str | None = None,
-    rings: int | None = None,
-    arms: int | None = None,
-    reference: str | None = None,
-    frequencies: Sequence[float] | None = None,
-    field_weights: Sequence[float] | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    glass_thickness: tuple[float, float] | str | None = None,
-    air_thickness: tuple[float, float] | str | None = None,
-    edge: float | None = None,
-    skip_unknown: bool = False,
-    conventions: Conventions | str | Sequence[str] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
     configuration: int | None = None,
     each: bool = False,
 ) -> MeritResult:
     """What the lens is worth by a merit function, row by row.
 
-    merit: `Merit`, rows, or the name of a default one ("spot", "wavefront", "angular", "mtf"); by default the file's.
-    rings, arms (even), reference ("centroid", "chief"), frequencies (cycles/mm, of "mtf"), field_weights,
-    wavelength_weights: of a default one. glass_thickness, air_thickness: least and greatest in mm, edge: least of glass
-    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. conventions: where
-    the meaning of an operand is open, as "opd_tilt=common" (`Conventions`). configuration: its rows alone. each: list
-    every row in the text. Raises BadMerit, UnknownOperand.
+    merit: `Merit`, `DefaultMerit`, rows, or a kind of default one ("spot", "wavefront", "angular", "mtf"); by default
+    the file's. configuration: its rows alone. each: list every row in the text. Raises BadMerit, UnknownOperand.
     """
-    function = merit_for(
-        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
-        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
-        configurations=configuration and [configuration],
-    )  # fmt: skip
+    function = merit_for(lens, merit, configuration and [configuration])
     warn_of_filling(lens, field_points(None, like=lens))
     where = configurations_of(function, lens.current_configuration)
     if configuration is not None:
@@ -173,8 +182,8 @@ def evaluate(
         Model(lens),
         function.rows,
         unit=function.unit,
-        skip_unknown=skip_unknown,
-        conventions=conventions_of(conventions),
+        skip_unknown=function.skip_unknown,
+        conventions=function.conventions,
     )
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and where[k] in (configuration or where[k],)
@@ -203,3 +212,21 @@ def _result(
         skipped=planned.skipped,
         each=each,
     )
+
+
+def _shares(found: MeritResult) -> dict[str, tuple[str, float]]:
+    """Operand and part of every bar by its name."""
+    several = len({*found.configurations.tolist()}) > 1
+    shares: dict[str, tuple[str, float]] = {}
+    numbers = (found.row, found.configurations, found.weights, found.contributions)
+    for row, number, at, weight, part in zip(found.valued(), *(n.tolist() for n in numbers), strict=True):
+        if weight:
+            name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
+            shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)
+    return shares or {"no row has a weight": ("", 0.0)}
+
+
+def _name(number: int, row: Row) -> str:
+    if any(row.numbers[2:]):
+        return f"{row.name} field {row.numbers[0]:.3g}, {row.numbers[1]:.3g}"
+    return f"{number} {row.name} {arguments(row)}".rstrip()

@@ -211,6 +211,30 @@ def bar_on_dark(axes, x: float, y: float, length: float, words: str = "", *, uni
     )  # fmt: skip
 
 
+def show_image(panel, values, title: str = "", *, top: float = 1.0, **drawing) -> None:
+    """A grey or coloured image from 0 to `top`."""
+    panel.imshow(values, **{"cmap": "gray", "vmin": 0, "vmax": top, "interpolation": "nearest"} | drawing)
+    panel.set(xticks=[], yticks=[])
+    panel.set_title(title, fontsize=7.5)
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+
+
+def framed(panel) -> None:
+    """A panel with a thin grey frame and no ticks."""
+    panel.set(xticks=[], yticks=[])
+    for spine in panel.spines.values():
+        spine.set_visible(True)
+        spine.set_color(GREY)
+
+
+def legend_entry(label: str, **look):
+    """A line or marker of a legend that no curve has."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **look)
+
+
 def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
     """A text of a size in points in lines no wider than a figure of a width in inches, by the widths of its letters.
 

@@ -1,5 +1,6 @@
 """Close-ups: the light of a model far finer than the pixels of a sensor, in windows that its kernels fill."""
 
+import dataclasses
 import math
 import warnings
 
@@ -9,8 +10,7 @@ from torch import Tensor
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.psf_models.compute import psf
-from raytrace.psf_models.models import MODELS, NotConverged
+from raytrace.psf_models.models import MODELS, NotConverged, psf
 from raytrace.psf_models.result import EmptyPsf, Psf, mixture
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing.f_number import axial_f_number
@@ -47,15 +47,17 @@ def close_up(found: Psf) -> CloseUp:
     """
     half, centre = _windows(found)
     half = _affordable(found, half)
-    work = {"rays": _RAYS} if MODELS[found.model].plain is not None else {"order": found.order}
-    work |= {"wavelengths": found.wavelengths, "wavelength_weights": found.wavelength_weights, **found.options}
+    plain = MODELS[found.model].plain is not None
+    numbers = {"rays": _RAYS, "order": None} if plain else {"order": found.order}
+    model = dataclasses.replace(found.parameters, **numbers)
+    work = {"wavelengths": found.wavelengths, "wavelength_weights": found.wavelength_weights}
     work |= {"per_wavelength": not found.wavelengths_summed, "center": "axis"}
 
     def light(distances: slice, chosen: slice) -> Tensor:
         grid = Grid(2 * half[distances, chosen].max() / _SAMPLES, _SAMPLES, _SAMPLES, centre[:, distances, chosen])
         where = {"fields": found.fields[:, chosen], "object_distances": found.object_distances[distances]}
         try:
-            return psf(found.lens, found.model, grid=grid, **where, **work).kernel
+            return psf(found.lens, model, grid=grid, **where, **work).kernel
         except EmptyPsf:  # no light: nothing to see
             return found.kernel.new_zeros(*found.energy[distances, chosen].shape, _SAMPLES, _SAMPLES)
 

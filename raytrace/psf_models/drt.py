@@ -33,6 +33,8 @@ from raytrace.maths.value import value
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf_models.result import Kernels, moments
 from raytrace.system.apertures import Aperture, clearance
+from raytrace.system.lens import with_object_distance
+from raytrace.tracing import streaming
 from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, trace_scene, varies
 
 
@@ -478,6 +480,56 @@ def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *
     centroid, covariance = moments(*torch.where(energy > 0, points - reference, 0.0), share)
     centroid = centroid + reference[..., 0]
     return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=arrived * light)
+
+
+@torch.no_grad()
+def stream_kernels(
+    scene: Scene,
+    grid: Grid,
+    rays: int,
+    *,
+    sampling: str = "sobol",
+    seed: int = 0,
+    width: float = 0.25,
+    max_bytes: float = streaming.MAX_BYTES,
+    progress: streaming.Progress | None = None,
+) -> tuple[Kernels, Kernels]:
+    """Kernels of `rays` independent rays for each distance, field and wavelength, as `kernels_of_rays`, and of the
+    first half of them; without derivatives.
+
+    sampling, seed: as for `stream_spots`; width: half width in pixels of the blur of each ray, 0 for none; max_bytes:
+    additional memory; progress: called with the number of rays traced since the last call. Sums are float64.
+    """
+    shape, lens = scene.shape, scene.lens
+    like = lens.surfaces[-2].thickness
+    at = (with_object_distance(lens, d) for d in lens.surfaces[0].thickness.flatten().unbind(0))
+    shots = [s for here in at for s in streaming.shots_of(here, rays, scene.fields, scene.wavelengths, None, None)[0]]
+    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))).expand(2, *shape)
+    grids = [dataclasses.replace(grid, centre=c) for c in centre.flatten(1).unbind(1)]
+    size = streaming.chunk_size(shots[0], max_bytes, kept=3 * 8 * len(shots) * grid.rows * grid.columns)
+    references: list[Tensor] = []
+    sums, images = [streaming.nothing(like)] * len(shots), like.new_zeros(len(shots), *grid.shape, dtype=torch.float64)
+    done, half = 0, max(1, rays // 2)
+    for points in streaming.pupil_chunks(rays, size, sampling=sampling, seed=seed, like=like, cut=half):
+        for k, s in enumerate(shots):
+            landing, valid = streaming.hits(s, points)
+            if not done:
+                references.append(streaming.moments(landing, valid, like.new_zeros(2)).mean.to(like.dtype))
+            sums[k] = streaming.merge(sums[k], streaming.moments(landing, valid, references[k]))
+            images[k] += deposit(grids[k], landing, valid.double(), width)
+            if progress is not None:
+                progress(points.shape[1])
+        done += points.shape[1]
+        if done == half:
+            before = images.clone()
+    pairs = zip(references, sums, strict=True)
+    m = streaming.stacked([streaming.Moments(m.count, r + m.mean, m.scatter) for r, m in pairs], shape)
+    light = beam_share(scene).double()
+    about, arrived = (m.mean, safe_divide(m.scatter, m.count)), light * m.count / rays
+    whole, first = (
+        k.unflatten(0, shape) * (light / count)[..., None, None] for k, count in ((images, rays), (before, half))
+    )
+    return Kernels(whole, grid, *about, rays, arrived=arrived), Kernels(first, grid, *about, half, arrived=arrived)
 
 
 def deposit(grid: Grid, points: Tensor, energy: Tensor, width: float) -> Tensor:

@@ -1,7 +1,7 @@
 """What a PSF model gives back, Kernels, and what the call that drives it does, a Psf; and how several become one."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 
 import numpy as np
@@ -86,15 +86,13 @@ class Psf(Result):
     residual: (D, F) how wrong the model itself is, where it can tell, or None.
     arrived: (D, F) of plain rays, the energy on the whole sensor plane: what `energy` lacks of it lies beside the
         window, what it lacks of 1 was lost in the lens; else None.
-    model: its name; waves: whether its light is diffracted; order: of its ladder, to repeat with `psf(order=…)`, None
-        for plain rays; rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
+    model: its name; waves: whether its light is diffracted; order: as for `DRT(order=…)`, None for plain rays;
+        rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
     normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
     wavelengths, wavelength_weights: (W,) µm and shares of 1, that the kernels are summed over or have an axis of.
-    lens, fields, object_distances: of what and where, (2, F) and (D,) mm; options: of the model.
+    lens, fields, object_distances: of what and where, (2, F) and (D,) mm; parameters: of the model.
     framed: whether the pixels were asked for; otherwise a figure shows the light itself, finely.
     """
-
-    FIGURE = "plotting.psf.psf_grid"
 
     kernel: Tensor
     grid: Grid
@@ -117,13 +115,19 @@ class Psf(Result):
     lens: Lens | None = None
     fields: Tensor | None = None
     object_distances: Tensor | None = None
-    options: Mapping = dataclasses.field(default_factory=dict)
+    parameters: object = None
     framed: bool = True
 
     @property
     def wavelengths_summed(self) -> bool:
         """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
         return self.kernel.dim() == 4
+
+    def draw(self, **options):
+        """The kernels over object distance and field; options: as for `psf_models.figure.psf_grid`."""
+        from raytrace.psf_models.figure import psf_grid
+
+        return psf_grid(self, **options)
 
     def columns(self) -> dict[str, Tensor]:
         """A row for every kernel: mm, widths of the light before pixels."""

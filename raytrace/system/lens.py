@@ -323,8 +323,10 @@ def field_label(lens: Lens, field: Sequence[float]) -> str:
 
 def field_title(lens: Lens) -> str:
     """The kind of field of this lens, in a figure."""
-    return "Image height" if lens.fields.kind == "real_image_height" else (
-        "Field angle" if lens.fields.kind == "angle" else lens.fields.kind.replace("_", " ").capitalize()
+    return (
+        "Image height"
+        if lens.fields.kind == "real_image_height"
+        else ("Field angle" if lens.fields.kind == "angle" else lens.fields.kind.replace("_", " ").capitalize())
     )
 
 
