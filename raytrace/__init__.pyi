@@ -60,6 +60,7 @@ from raytrace.maths.value import to as to
 from raytrace.optimization.constraints import Condition as Condition
 from raytrace.optimization.conventions import Conventions as Conventions
 from raytrace.optimization.default_merit import BadMerit as BadMerit
+from raytrace.optimization.default_merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.journal import BadSearch as BadSearch
@@ -70,7 +71,13 @@ from raytrace.optimization.problem import NoProblem as NoProblem
 from raytrace.optimization.result import Optimized as Optimized
 from raytrace.optimization.search import search as search
 from raytrace.optimization.search_result import Searched as Searched
+from raytrace.psf_models import DRT as DRT
+from raytrace.psf_models import Execution as Execution
+from raytrace.psf_models import Fourier as Fourier
+from raytrace.psf_models import Gaussian as Gaussian
+from raytrace.psf_models import Paraxial as Paraxial
 from raytrace.psf_models import Psf as Psf
+from raytrace.psf_models import Wave as Wave
 from raytrace.psf_models import psf as psf
 from raytrace.system.apertures import Aperture as Aperture
 from raytrace.system.lens import Fields as Fields

@@ -56,8 +56,8 @@ def images(lens: rt.Lens) -> dict[str, torch.Tensor]:
         "distortion": rt.distortion(lens, fields=FIELDS).f_tan,
         "colour": rt.lateral_colour(lens, fields=FIELDS).shift,
         "light": rt.relative_illumination(lens, fields=FIELDS).illumination,
-        "gaussian": rt.psf(lens, "gaussian", order=4, center="chief", size=9).kernel,
-        "drt": rt.psf(lens, "drt", rays=4096, center="chief", size=9).kernel,
+        "gaussian": rt.psf(lens, rt.Gaussian(order=4), center="chief", size=9).kernel,
+        "drt": rt.psf(lens, rt.DRT(rays=4096), center="chief", size=9).kernel,
         "encircled": rt.encircled_energy(lens, [0.005, 0.01]).share,
     }
 
@@ -90,7 +90,7 @@ def test_a_fold_changes_no_image(unfolded, fold):
 def test_a_fold_changes_no_wave_kernel(unfolded):
     lens = unfolded[0].at(wavelengths=[0.5876], fields=[7.0])
     fold = folds(lens)["90° about x"]
-    kernels = [rt.psf(one, "wave", order=4, center="chief", size=9).kernel for one in (lens, fold)]
+    kernels = [rt.psf(one, rt.Wave(order=4), center="chief", size=9).kernel for one in (lens, fold)]
     assert (kernels[0] - kernels[1]).abs().max() < 1e-7 * kernels[0].max()
 
 
@@ -233,7 +233,7 @@ def test_derivatives_by_tilts():
             scene_of(lens, torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)), points, weights
         )
         mtf = rt.mtf(lens, [5.0], geometric=True)
-        kernel = rt.psf(lens, "gaussian", order=3, center="axis", size=9, pixel=0.2).kernel
+        kernel = rt.psf(lens, rt.Gaussian(order=3), center="axis", size=9, pixel=0.2).kernel
         return rt.spot(lens, rings=4).mean_square_radius, 1e3 * rms(front), mtf.tangential, mtf.sagittal, kernel
 
     at = [real(number).requires_grad_() for number in (3.0, 0.5)]

@@ -8,7 +8,7 @@ import raytrace as rt
 from raytrace.budget import OverBudget
 from raytrace.cli import main
 from raytrace.io.ray_tables import RayTableError
-from raytrace.optimization.default_merit import BadMerit, rows_of
+from raytrace.optimization.default_merit import BadMerit, DefaultMerit
 from raytrace.system.parameter_paths import BadVariables, counted
 
 SINGLET = rt.read_lens("singlet")
@@ -40,7 +40,7 @@ def test_a_table_of_rays_is_no_larger_than_its_bound(tmp_path):
 )
 def test_a_default_merit_function_has_no_more_rows_than_its_bound(options, message):
     with pytest.raises(BadMerit, match=message):
-        rows_of(SINGLET, **options)
+        DefaultMerit(**options).rows(SINGLET)
 
 
 @pytest.mark.parametrize("numbers", ["1-1000000000000", "99999999999999999999", "1-9999,1-9999", "9" * 5000])

@@ -93,7 +93,7 @@ def test_a_beam_that_misses_the_stop_is_told_once_with_figures_and_a_remedy(caps
         rt.spot(lens, fields=[0, 40], ray_aiming="paraxial")
         rt.spot(lens, fields=[0, 1])
         rt.spot(lens.replace(1, curvature=curvature), fields=[0, 40])  # as in a loop of optimisation
-        rt.psf(lens, "gaussian", fields=[40], order=3)
+        rt.psf(lens, rt.Gaussian(order=3), fields=[40])
         torch.func.vmap(lambda y: (warn_of_filling(lens, torch.stack([0 * y, y])[:, None]), y)[1])(vector(30.0, 40.0))
     from raytrace.cli import main
 

@@ -195,7 +195,6 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
         ("wave psf --element cubc", 1, "did you mean cubic?"),
-        ("codesign compar double_gauss", 1, "did you mean compare?"),
         ("codesign double_gauss --field 5,5 --loss spectral", 1, "co-design takes field points along y"),
         ("psf double_gauss -o psf.png", 2, "'psf.png' is a picture: figures are saved by --plot"),
         ("mtf tessar --plot mtf.npz", 2, "'mtf.npz' is no picture (.png, .pdf, .svg)"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.optimization.default_merit import BadMerit, Boundaries, rows_of
+from raytrace.optimization.default_merit import BadMerit, DefaultMerit
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 PRINTED = 1e-6  # the files hold six to twelve digits
@@ -63,7 +63,7 @@ def test_a_stored_default_merit_function_is_made_again_row_by_row(name):
     kind, reference = KINDS[operand]
     lens = rt.read_lens(path)
     lens = lens.at(fields=options.pop("fields")) if "fields" in options else lens
-    rows = [row for row in rows_of(lens, kind, reference=reference, **options) if row.weight]
+    rows = [row for row in DefaultMerit(kind, reference=reference, **options).rows(lens) if row.weight]
     found = np.array([[row.integers[1], *row.numbers, row.target, row.weight] for row in rows])
     assert found.shape == expected.shape
     np.testing.assert_array_equal(found[:, 0], expected[:, 0])
@@ -76,7 +76,7 @@ def test_the_rows_of_a_triplet_have_the_weights_that_opticstudio_prints():
     triplet = rt.read_lens("cooke_triplet").at(
         fields=[0, 12.6, 17.8, 21.7], wavelengths=[0.4861327, 0.5875618, 0.6562725]
     )
-    rows = [row for row in rows_of(triplet) if row.weight]
+    rows = [row for row in DefaultMerit().rows(triplet) if row.weight]
     assert len(rows) == 3 * 3 + 3 * 3 * 3 * 3
     axis, first = rows[:3], rows[9:18]
     assert [row.weight for row in axis] == pytest.approx([7.27220522e-2, 1.16355283e-1, 7.27220522e-2], rel=1e-8)
@@ -92,7 +92,7 @@ def test_the_rows_of_a_triplet_have_the_weights_that_opticstudio_prints():
 def test_the_weighted_sum_over_rows_is_an_integral_over_the_pupil(fields, rings, arms):
     """Σ w f(P) of a field and wavelength is its share of ∬ f dP, exact for polynomials up to the order of the rule."""
     lens = rt.read_lens("double_gauss").at(fields=fields, wavelengths=[0.5, 0.6])
-    rows = [row for row in rows_of(lens, rings=rings, arms=arms, wavelength_weights=[1, 3]) if row.weight]
+    rows = [row for row in DefaultMerit(rings=rings, arms=arms, wavelength_weights=[1, 3]).rows(lens) if row.weight]
     outer = [row for row in rows if row.numbers[:2] != (0, 0) and row.numbers[1] > 0 and row.integers[1] == 2]
     w, (x, y) = np.array([row.weight for row in outer]), np.array([row.numbers[2:] for row in outer]).T
     share = 3 / (2 * 2)
@@ -105,9 +105,9 @@ def test_the_weighted_sum_over_rows_is_an_integral_over_the_pupil(fields, rings,
 
 def test_weights_of_fields_and_wavelengths_are_the_lens_s_own_or_those_given():
     lens = rt.read_lens("double_gauss").at(fields=[0, 7, 14], wavelengths=[0.5, 0.6])
-    one = sum(row.weight for row in rows_of(lens))
+    one = sum(row.weight for row in DefaultMerit().rows(lens))
     assert one == pytest.approx(np.pi, rel=1e-12)
-    rows = rows_of(lens, field_weights=[2, 0, 1], wavelength_weights=[0.5, 0])
+    rows = DefaultMerit(field_weights=[2, 0, 1], wavelength_weights=[0.5, 0]).rows(lens)
     assert {row.integers[1] for row in rows if row.weight} == {1}
     assert {row.numbers[1] for row in rows if row.weight} == {0, 1}
     assert sum(row.weight for row in rows) == pytest.approx(np.pi * 3 / 3 * 0.5 / 2, rel=1e-12)
@@ -115,17 +115,17 @@ def test_weights_of_fields_and_wavelengths_are_the_lens_s_own_or_those_given():
 
 def test_every_configuration_has_its_rows():
     zoom = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 16.0], 11: [57.9, 52.0]})
-    rows = rows_of(zoom, boundaries=Boundaries(glass=(2, 15)))
+    rows = DefaultMerit(glass_thickness=(2, 15)).rows(zoom)
     places = [number for number, row in enumerate(rows) if row.operand == "CONF"]
     assert [rows[place].integers[0] for place in places] == [1, 2]
     assert rows[places[0] + 1 : places[1]] == rows[places[1] + 1 :] or len(rows) == 2 + 2 * (places[1] - places[0])
-    assert [row.operand for row in rows_of(zoom, configurations=[2])][2] == "CONF"
-    assert "CONF" not in {row.operand for row in rows_of(rt.read_lens("double_gauss"))}
+    assert [row.operand for row in DefaultMerit().rows(zoom, [2])][2] == "CONF"
+    assert "CONF" not in {row.operand for row in DefaultMerit().rows(rt.read_lens("double_gauss"))}
 
 
 def test_boundaries_are_rows_over_all_surfaces():
     lens = rt.read_lens("double_gauss")
-    rows = rows_of(lens, boundaries=Boundaries(glass=(2, 15), air=(0.5, 50), edge=1))
+    rows = DefaultMerit(glass_thickness="2:15", air_thickness=(0.5, 50), edge=1).rows(lens)
     told = {row.operand: (*row.integers, row.target, row.weight) for row in rows if row.operand[:2] in ("MN", "MX")}
     assert told == {
         "MNCA": (1, 11, 0.5, 1),
@@ -135,15 +135,15 @@ def test_boundaries_are_rows_over_all_surfaces():
         "MXCG": (1, 11, 15, 1),
         "MNEG": (1, 11, 1, 1),
     }
-    assert {row.operand for row in rows_of(lens, boundaries=Boundaries(edge=1)) if row.weight} == {"MNEG", "TRAC"}
-    assert "MXCG" not in {row.operand for row in rows_of(lens, boundaries=Boundaries(glass=(2, float("inf"))))}
+    assert {row.operand for row in DefaultMerit(edge=1).rows(lens) if row.weight} == {"MNEG", "TRAC"}
+    assert "MXCG" not in {row.operand for row in DefaultMerit(glass_thickness=(2, float("inf"))).rows(lens)}
 
 
 def test_other_kinds_have_operands_of_their_own():
     lens = rt.read_lens("double_gauss")
-    assert {row.operand for row in rows_of(lens, "angular") if row.weight} == {"ANAC"}
-    assert {row.operand for row in rows_of(lens, "angular", reference="chief") if row.weight} == {"ANAR"}
-    rows = [row for row in rows_of(lens, "mtf", frequencies=[10, 40]) if row.weight]
+    assert {row.operand for row in DefaultMerit("angular").rows(lens) if row.weight} == {"ANAC"}
+    assert {row.operand for row in DefaultMerit("angular", reference="chief").rows(lens) if row.weight} == {"ANAR"}
+    rows = [row for row in DefaultMerit("mtf", frequencies=[10, 40]).rows(lens) if row.weight]
     assert [row.numbers[:2] for row in rows] == [(f, v) for f in (1, 2, 3) for v in (10, 40)]
     assert {(row.operand, row.target, row.integers) for row in rows} == {("MTFA", 1, (1, 0))}
     assert sum(row.weight for row in rows) == pytest.approx(1, rel=1e-12)
@@ -158,13 +158,14 @@ def test_other_kinds_have_operands_of_their_own():
         ("spot", {"reference": "axis"}, "expected one of centroid, chief"),
         ("spot", {"frequencies": [10]}, "goes with `frequencies`"),
         ("mtf", {}, "goes with `frequencies`"),
+        ("mtf", {"frequencies": float("nan")}, "expected finite numbers"),
         ("spot", {"field_weights": [1]}, "1 weights, and the lens has 3 fields"),
         ("spot", {"wavelength_weights": [-1]}, "0 or more"),
     ],
 )
 def test_what_cannot_be_made_is_refused(kind, options, said):
     with pytest.raises(BadMerit, match=re.escape(said)):
-        rows_of(rt.read_lens("double_gauss"), kind, **options)
+        DefaultMerit(kind, **options).rows(rt.read_lens("double_gauss"))
 
 
 def test_the_list_of_stored_merit_functions_is_that_of_the_oracle():

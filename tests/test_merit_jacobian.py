@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from raytrace.io import read_lens
-from raytrace.optimization.default_merit import rows_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model, with_numbers_of
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.variables import freedom
@@ -32,7 +32,7 @@ def residuals(lens, rows) -> torch.Tensor:
 
 def test_the_jacobian_is_that_of_autograd():
     lens = read_lens("double_gauss").at(wavelengths=[0.4861327, 0.5875618, 0.6562725])
-    rows = [row for row in rows_of(lens, "spot", rings=6, arms=6) if row.operand == "TRAC"]
+    rows = [row for row in DefaultMerit("spot", rings=6, arms=6).rows(lens) if row.operand == "TRAC"]
     free = freedom(lens, "curvature thickness")
     model = Model(free.lens, free.variables, free.solves)
     found = Evaluation(model, rows)(model.start, derivatives=True)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.optimization.merit import merit_for
 from raytrace.optimization.merit_rows import UnknownOperand
 from raytrace.system.optimization_data import OptimizationData, Row
 
@@ -79,7 +78,7 @@ def test_configurations_are_told_apart(lens):
     assert float(alone.merit) == pytest.approx(two, rel=1e-12)
     joined = rt.Merit.default(zoom) + OWN
     assert rt.evaluate(zoom, merit=joined).configurations.tolist()[-1] == 1
-    rows = rt.evaluate(zoom, merit="spot", edge=1.0, configuration=2)
+    rows = rt.evaluate(zoom, merit=rt.DefaultMerit("spot", edge=1.0), configuration=2)
     assert {*rows.configurations.tolist()} == {2}
 
 
@@ -88,18 +87,16 @@ def test_the_file_s_merit_function_is_meant_without_another(lens):
     found = rt.evaluate(own)
     assert (found.unit, len(found.row)) == (25.4, 1)
     assert rt.Merit.of(own).rows == (FOCAL,)
-    assert [row.operand for row in merit_for(own, edge=1.0)] == ["EFFL", "MNEG"]
+    assert [row.operand for row in rt.Merit.of(own, edge=1.0)] == ["EFFL", "MNEG"]
     with pytest.raises(rt.BadMerit, match="no merit function of its own"):
         rt.evaluate(lens)
-    with pytest.raises(rt.BadMerit, match="`rings` belongs to a default merit function"):
-        rt.evaluate(own, rings=3)
 
 
 def test_an_operand_that_is_not_known_is_an_error_unless_it_is_skipped(lens):
     rows = [FOCAL, Row("QXYZ", weight=1.0), Row("QABC")]
     with pytest.raises(UnknownOperand, match="row 2 of the merit function: operand QXYZ"):
         rt.evaluate(lens, merit=rows)
-    found = rt.evaluate(lens, merit=rows, skip_unknown=True)
+    found = rt.evaluate(lens, merit=rt.Merit(tuple(rows), skip_unknown=True))
     assert found.skipped == (2, 3)
     assert "left out, unknown: rows 2 (QXYZ), 3 (QABC)" in str(found)
     assert float(found.merit) == pytest.approx(abs(float(found.values[0]) - 100))
@@ -115,16 +112,18 @@ def test_a_function_of_a_lens_is_a_row_by_its_name(lens):
     assert "power" in str(found)
 
 
-def test_readings_are_chosen_by_words(lens):
-    rows = [Row("SPHA", (0, 1), weight=1.0)]
-    usual, other = (float(rt.evaluate(lens, merit=rows, conventions=r).values[0]) for r in (None, "seidel=wavefront"))
+def test_conventions_are_chosen_by_text(lens):
+    def merit(conventions):
+        return rt.Merit((Row("SPHA", (0, 1), weight=1.0),), conventions=conventions)
+
+    usual, other = (float(rt.evaluate(lens, merit=merit(words)).values[0]) for words in (None, "seidel=wavefront"))
     assert other == pytest.approx(usual / 8, rel=1e-12)
-    spelled = rt.evaluate(lens, merit=rows, conventions=["focal_length=in-air", "seidel=wavefront"])
+    spelled = rt.evaluate(lens, merit=merit(["focal_length=in-air", "seidel=wavefront"]))
     assert float(spelled.values[0]) == other
     with pytest.raises(ValueError, match=r"did you mean seidel\?"):
-        rt.evaluate(lens, merit=rows, conventions="seidl=wavefront")
+        merit("seidl=wavefront")
     with pytest.raises(ValueError, match="expected one of coefficients, wavefront"):
-        rt.evaluate(lens, merit=rows, conventions="seidel=waves")
+        merit("seidel=waves")
 
 
 def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
@@ -137,7 +136,7 @@ def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
     value = float(rt.first_order(lens).effective_focal_length)
     both = [float(rt.evaluate(lens, merit=one).values[0]) for one in (joined, OWN + inches)]
     assert both == pytest.approx([value / 25.4, value], rel=1e-12)
-    edged = merit_for(
+    edged = rt.Merit.of(
         dataclasses.replace(lens, optimization_data=OptimizationData(merit=inches.rows, unit=25.4)), edge=2.54
     )
     assert edged.rows[-1].target == pytest.approx(0.1)
@@ -154,8 +153,10 @@ def test_lost_rays_are_told(lens):
 
 
 def test_long_tables_share_lines_and_list_every_row_when_asked(lens):
-    together, every = (str(rt.evaluate(lens, merit="spot", rings=6, each=each)) for each in (False, True))
-    rows = len(rt.evaluate(lens, merit="spot", rings=6).row)
+    together, every = (
+        str(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6), each=each)) for each in (False, True)
+    )
+    rows = len(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6)).row)
     assert len(every.splitlines()) == 2 + rows
     assert len(together.splitlines()) == 2 + 3
     assert str(rt.Merit.default(lens)).count("TRAC") == 21

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 import raytrace as rt
 from raytrace.bench import optimise as bench
 from raytrace.optimization import checkpoint as paths
-from raytrace.optimization.default_merit import Boundaries, rows_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.least_squares import Linear, Manner, NoStep, Sides, State, least_squares
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
@@ -138,7 +138,7 @@ def test_an_interrupt_keeps_the_best():
 
 def problem_of(lens, vary, **options):
     free = freedom(lens, vary)
-    return Problem(Model(free.lens, free.variables, free.solves), rows_of(lens, "spot"), **options)
+    return Problem(Model(free.lens, free.variables, free.solves), DefaultMerit().rows(lens), **options)
 
 
 def test_a_triplet_becomes_sharper_and_the_merit_is_that_of_the_lens_it_gives(triplet):
@@ -178,20 +178,20 @@ def test_both_engines_end_at_the_same_lens(triplet):
     ends = []
     for engine in ("eager", "auto"):
         with rt.trace_engine(engine):
-            found = rt.optimize(triplet, merit="spot", vary="curvature:1-3 sensor", rings=2)
+            found = rt.optimize(triplet, merit=rt.DefaultMerit("spot", rings=2), vary="curvature:1-3 sensor")
             ends.append(found.variables_after)
     assert torch.allclose(*ends, rtol=1e-6, atol=1e-9)
 
 
 def test_the_order_of_rows_does_not_matter(triplet):
-    rows = [row for row in rows_of(triplet, "spot") if row.operand == "TRAC"]
+    rows = [row for row in DefaultMerit().rows(triplet) if row.operand == "TRAC"]
     ends = [rt.optimize(triplet, merit=one, vary="curvature:1-3 sensor") for one in (rows, rows[::-1])]
     assert ends[0].merit_after == pytest.approx(ends[1].merit_after, rel=1e-9)
     assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-5)
 
 
 def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
-    rows = rows_of(triplet, "spot")
+    rows = DefaultMerit().rows(triplet)
     variables = tuple(Vary(k, "curvature") for k in (1, 2, 3))
     ends = []
     for unit in (1.0, 25.4):
@@ -202,7 +202,7 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
 
 
 def test_boundaries_are_known_on_both_sides_and_add_up_to_their_rows(triplet):
-    rows = rows_of(triplet, "spot", boundaries=Boundaries((4.0, 8.0), (1.0, 9.0), 3.0))
+    rows = DefaultMerit(glass_thickness=(4.0, 8.0), air_thickness=(1.0, 9.0), edge=3.0).rows(triplet)
     free = freedom(triplet, "curvature thickness")
     problem = Problem(Model(free.lens, free.variables, free.solves), rows)
     x = problem.model.start
@@ -223,9 +223,11 @@ def test_boundaries_are_known_on_both_sides_and_add_up_to_their_rows(triplet):
 def test_boundaries_end_a_descent_without_chattering(triplet):
     """Thicknesses come to rest where the rest of the merit presses them, each within a few steps of its boundary."""
     found = rt.optimize(
-        triplet, merit="spot", vary="curvature thickness", hold=[Condition(Row("EFFL", target=101.2))],
-        glass_thickness="2:9", air_thickness="0.5:90", edge=1.0,
-    )  # fmt: skip
+        triplet,
+        merit=rt.DefaultMerit("spot", glass_thickness="2:9", air_thickness="0.5:90", edge=1.0),
+        vary="curvature thickness",
+        hold=[Condition(Row("EFFL", target=101.2))],
+    )
     assert found.stopped in ("gradient", "merit")
     assert found.cycles < 80
     assert found.merit_after < 0.5 * found.merit_before
@@ -426,7 +428,7 @@ def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_opti
     state = problem.state(problem.model.start, True)
     assert state.lost
     assert np.isfinite(state.jacobian).all()
-    found = rt.optimize(lens, merit="spot", vary="curvature:1", rings=1, arms=2, cycles=1)
+    found = rt.optimize(lens, merit=rt.DefaultMerit("spot", rings=1, arms=2), vary="curvature:1", cycles=1)
     assert "nan" not in str(found)
     assert "DLASCL" not in capfd.readouterr().out
 
@@ -442,7 +444,7 @@ def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
     """Rows without a weight are shown at both ends alone; those that a row of arithmetic takes are evaluated."""
     called = []
     idle = Row(rt.Measure("idle", lambda lens: called.append(1) or lens.surfaces[1].curvature))
-    rows = [*rows_of(triplet, "spot", rings=1, arms=2), idle]
+    rows = [*DefaultMerit(rings=1, arms=2).rows(triplet), idle]
     found = rt.optimize(triplet, merit=rows, vary="curvature:1-3", cycles=6)
     assert found.values_after[-1] == pytest.approx(float(found.lens.surfaces[1].curvature))
     assert len(called) < 10 < found.evaluations

@@ -34,7 +34,7 @@ from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
-BOUNDS = {"glass_thickness": (2.0, 20.0), "air_thickness": (0.3, 100.0), "edge": 1.0}
+MERIT = rt.DefaultMerit("spot", glass_thickness=(2.0, 20.0), air_thickness=(0.3, 100.0), edge=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def triplet():
 
 
 def choice_of(lens, words="curvature thickness glass", **options) -> Choice:
-    function = merit_for(lens, "spot", **BOUNDS)
+    function = merit_for(lens, MERIT)
     free, surfaces = without_glass(freedom(lens, words), words)
     far = np.full(len(free.variables), np.inf)
     pool = pool_of(lens, catalogs_of(lens))
@@ -53,7 +53,7 @@ def choice_of(lens, words="curvature thickness glass", **options) -> Choice:
 
 @pytest.fixture(scope="module")
 def found(triplet):
-    return rt.optimize(triplet, merit="spot", vary="curvature thickness glass", hold="efl=100", cycles=40, **BOUNDS)
+    return rt.optimize(triplet, merit=MERIT, vary="curvature thickness glass", hold="efl=100", cycles=40)
 
 
 # -- the glasses -------------------------------------------------------------------------------------------------------
@@ -142,7 +142,7 @@ def test_what_is_foretold_ranks_what_is_reached(triplet):
 
 
 def test_a_lens_ends_with_glasses_of_the_catalog_and_no_worse_than_with_its_own(triplet, found):
-    own = rt.optimize(triplet, merit="spot", vary="curvature thickness", hold="efl=100", cycles=40, **BOUNDS)
+    own = rt.optimize(triplet, merit=MERIT, vary="curvature thickness", hold="efl=100", cycles=40)
     assert found.merit_after <= own.merit_after * 1.0001
     assert found.merit_after < 0.95 * own.merit_after
     glasses = [found.lens.surfaces[k].glass for k in (1, 3, 6)]
@@ -165,7 +165,7 @@ def test_the_lens_is_written_with_its_glasses_and_reads_the_same(found, tmp_path
 
 @pytest.mark.slow
 def test_it_is_reproducible(triplet, found):
-    again = rt.optimize(triplet, merit="spot", vary="curvature thickness glass", hold="efl=100", cycles=40, **BOUNDS)
+    again = rt.optimize(triplet, merit=MERIT, vary="curvature thickness glass", hold="efl=100", cycles=40)
     assert again.merit_after == found.merit_after
     assert [step.name for step in again.glasses] == [step.name for step in found.glasses]
 
@@ -191,7 +191,7 @@ def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
     optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))
     lens = dataclasses.replace(triplet, optimization_data=optimization_data)
-    found = rt.optimize(lens, merit="spot", vary="curvature sensor glass", hold="efl=100", cycles=6, **BOUNDS)
+    found = rt.optimize(lens, merit=MERIT, vary="curvature sensor glass", hold="efl=100", cycles=6)
     assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
     assert {step.surface for step in found.glasses} <= {0, 1, 3}
 
@@ -215,7 +215,7 @@ def test_the_command_prints_the_sequence(capsys):
 def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypatch):
     """Ended hard behind the first exchanges, and begun again from the checkpoint: the same lens to the last digit."""
     path, done = tmp_path / "kept.json", []
-    how = {"merit": "spot", "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 5, "checkpoint": path, **BOUNDS}
+    how = {"merit": MERIT, "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 5, "checkpoint": path}
     whole = rt.optimize(triplet, **how)
     swap = Choice._swap
 

@@ -11,7 +11,7 @@ from problems import field, number, sharp_double_gauss
 
 import raytrace as rt
 from raytrace.maths.grid import Grid, grid
-from raytrace.psf_models import EmptyPsf, NotConverged, psf
+from raytrace.psf_models import DRT, EmptyPsf, Execution, Fourier, Gaussian, NotConverged, Paraxial, Wave, model_of, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.launch import launch
@@ -92,9 +92,9 @@ def test_plain_numbers_are_as_good_as_tensors():
         "wavelengths": number([0.5, 0.6]),
         "grid": grid(0.01, 7),
     }
-    one, other = (psf(double_gauss(), "gaussian", order=3, **o) for o in ({**numbers, "pixel": 0.01}, tensors))
+    one, other = (psf(double_gauss(), Gaussian(order=3), **o) for o in ({**numbers, "pixel": 0.01}, tensors))
     torch.testing.assert_close(one.kernel, other.kernel, rtol=0, atol=0)
-    with pytest.raises(ValueError, match="grid says pixel and size"):
+    with pytest.raises(ValueError, match="a grid has a pixel and a size"):
         psf(double_gauss(), "gaussian", grid=grid(0.01, 7), size=7)
     with pytest.raises(ValueError, match="below 90 degrees"):
         psf(double_gauss(), "gaussian", fields=[90])
@@ -103,7 +103,7 @@ def test_plain_numbers_are_as_good_as_tensors():
 @pytest.mark.parametrize("per_wavelength", [False, True])
 def test_a_psf_is_a_table_a_document_and_words(per_wavelength):
     options = {"fields": [0, (1, 2)], "object_distances": [25e3, math.inf], "wavelengths": [0.5, 0.6]}
-    found = psf(double_gauss(), "gaussian", order=3, center="chief", per_wavelength=per_wavelength, **options)
+    found = psf(double_gauss(), Gaussian(order=3), center="chief", per_wavelength=per_wavelength, **options)
     frame, entries = found.to_frame(), found.document()["results"]
     assert len(frame) == len(entries) == found.energy.numel() == (8 if per_wavelength else 4)
     for row, entry, line in zip(frame.itertuples(), entries, str(found).splitlines()[3:], strict=True):
@@ -236,21 +236,21 @@ def test_auto_stays_with_rays_where_waves_are_too_many():
 
 def test_number_of_rays_is_kept_to():
     options = {"fields": field(0.0), "object_distances": number([1e4]), "grid": grid(0.01, 11)}
-    plain = psf(double_gauss(), "drt", rays=256, **options)
+    plain = psf(double_gauss(), DRT(rays=256), **options)
     assert plain.rays == 256
     assert 0.01 < float(plain.error) < 1
-    few = psf(double_gauss(), "gaussian", rays=5, **options)
+    few = psf(double_gauss(), Gaussian(rays=5), **options)
     assert few.rays <= 5
     with pytest.raises(ValueError, match="wave needs at least"):
-        psf(slow(double_gauss()), "wave", rays=1, **options)
+        psf(slow(double_gauss()), Wave(rays=1), **options)
     with pytest.raises(ValueError, match="gaussian needs at least 2 rays a kernel; 1 given"):
-        psf(double_gauss(), "gaussian", rays=1, **options)
+        psf(double_gauss(), Gaussian(rays=1), **options)
 
 
 def test_an_order_repeats_what_a_tolerance_found():
     options = {"fields": field(14.0), "object_distances": number([1e4]), "center": "chief"}
     found = psf(double_gauss(), "gaussian", tol=1e-3, **options)
-    again = psf(double_gauss(), "gaussian", order=found.order, **options)
+    again = psf(double_gauss(), Gaussian(order=found.order), **options)
     torch.testing.assert_close(again.kernel, found.kernel, atol=0, rtol=0)
     assert again.rays == found.rays
     assert bool(again.error.isnan().all())
@@ -258,11 +258,11 @@ def test_an_order_repeats_what_a_tolerance_found():
 
 def test_rho_and_zernike_reach_their_models():
     options = {"fields": field(0.0), "object_distances": number([1e4])}
-    plain, narrow = (psf(double_gauss(), "paraxial", rho=rho, **options) for rho in (0.5, 0.25))
+    plain, narrow = (psf(double_gauss(), Paraxial(rho=rho), **options) for rho in (0.5, 0.25))
     torch.testing.assert_close(narrow.covariance, plain.covariance / 4)
     coma = number([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-4])  # Noll 7
     options["grid"] = grid(0.02, 5)
-    bent = psf(slow(double_gauss()), "fourier", zernike=coma, **options)
+    bent = psf(slow(double_gauss()), Fourier(zernike=coma), **options)
     assert float((bent.kernel - bent.kernel.flip(-2)).abs().sum()) > 1e-3
     assert float((bent.kernel - bent.kernel.flip(-1)).abs().sum()) < 1e-9
 
@@ -289,15 +289,14 @@ def test_a_tolerance_out_of_reach_is_said():
         ({"model": "geometric"}, "model 'geometric' is not known; expected auto, paraxial"),
         ({"center": "middle"}, "center 'middle' is not known"),
         ({"normalise": "peak"}, "normalise 'peak' is not known"),
-        ({"tol": 0.1, "rays": 5}, "exclude each other"),
+        ({"model": Gaussian(rays=5), "tol": 0.1}, "exclude each other"),
         ({"tol": 0.0}, "expected a number above 0"),
         ({"tol": math.nan}, "expected a number above 0"),
-        ({"rays": 0}, "rays 0: expected"),
-        ({"model": "auto", "rays": 100}, "auto chooses by a tolerance"),
-        ({"model": "paraxial", "rays": 100}, "paraxial traces no rays"),
-        ({"order": 3, "tol": 0.1}, "order belongs to one model and excludes tol and rays"),
-        ({"model": "auto", "order": 3}, "order belongs to one model"),
-        ({"order": 99}, "gaussian has no order 99; expected one of 2, 3, 4"),
+        ({"model": DRT(rays=0)}, "rays 0: expected"),
+        ({"model": DRT(rays=2.5)}, "rays 2.5: expected a whole number"),
+        ({"model": Gaussian(order=3), "tol": 0.1}, "an order fixes the amount of work: it excludes tol and rays"),
+        ({"model": DRT(rays=5, order=3)}, "an order fixes the amount of work"),
+        ({"model": Gaussian(order=99)}, "gaussian has no order 99; expected one of 2, 3, 4"),
         ({"fields": number([1.0, 2.0, 3.0])}, r"fields of shape \(3,\); expected \(2, F\)"),
         ({"object_distances": number(1e4)}, r"object_distances of shape .* expected one axis"),
         ({"object_distances": number([1e4, math.nan])}, "object_distances .* nan"),
@@ -308,6 +307,19 @@ def test_a_tolerance_out_of_reach_is_said():
 def test_arguments_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         psf(double_gauss(), **{"model": "gaussian", **options})
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "message"),
+    [
+        ("auto", {"rays": 100}, "auto chooses by a tolerance"),
+        ("paraxial", {"rays": 100}, "paraxial traces no rays"),
+        ("geometric", {}, "'geometric' has no numbers; expected paraxial"),
+    ],
+)
+def test_numbers_of_another_model_are_refused(name, numbers, message):
+    with pytest.raises(ValueError, match=message):
+        model_of(name, **numbers)
 
 
 # Nothing arrives ------------------------------------------------------------------------------------------------------
@@ -345,15 +357,14 @@ def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero(model):
 
 
 @pytest.mark.parametrize(
-    ("model", "work"),
-    [("gaussian", {"order": 3}), ("drt", {"order": 0}), ("drt", {"rays": 200}), ("wave", {"order": -2})],
+    "model", [Gaussian(order=3), DRT(order=0), DRT(rays=200), Wave(order=-2)], ids=lambda model: type(model).__name__
 )
-def test_a_kernel_without_light_has_no_place_and_no_width(model, work):
+def test_a_kernel_without_light_has_no_place_and_no_width(model):
     """nan, not 0: a width of 0 is what a merit likes best; the width of its neighbour keeps its derivative."""
     lens = double_gauss()
     curvature = lens.surfaces[1].curvature.clone().requires_grad_()
     lens = lens.replace(1, curvature=curvature)
-    work = {**work, "object_distances": number([25e3])}
+    work = {"object_distances": number([25e3])}
     both = psf(lens, model, fields=field(0, 85), **work)
     for name in ("centroid", "covariance", "ray_centroid", "ray_covariance"):
         assert getattr(both, name)[:, 0, 1].isnan().all()
@@ -365,7 +376,7 @@ def test_a_kernel_without_light_has_no_place_and_no_width(model, work):
     )
     assert whole == lit != 0
     with pytest.raises(EmptyPsf, match=r"1 of 2 PSFs, those of index \(0, 1\)"):
-        psf(lens, model, fields=field(0, 85), empty="error", **work)
+        psf(lens, model, fields=field(0, 85), execution=Execution(empty="error"), **work)
     with pytest.raises(EmptyPsf, match="all 144 rays lost: 86 missed surface 1, 58 totally reflected at surface 2"):
         psf(lens, model, fields=field(85), **work)
 

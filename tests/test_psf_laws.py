@@ -12,7 +12,7 @@ from problems import number, vector
 
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
-from raytrace.psf_models import Memo, psf, wave
+from raytrace.psf_models import Execution, Memo, model_of, psf, wave
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import scene
@@ -95,11 +95,12 @@ def test_a_memo_changes_no_kernel_and_traces_less(model, stop):
         "object_distances": number([1e4, 2e4]),
         "grid": grid(0.01, 5),
         "center": "chief",
-        "order": MODEL_ORDER[model],
     }
+    repeated = model_of(model, order=MODEL_ORDER[model])
     for shift in (0.0, 0.02):
         with_memo, plain = (
-            psf(with_sensor_distance(lens, sensor + shift), model, memo=m, **options) for m in (memo, None)
+            psf(with_sensor_distance(lens, sensor + shift), repeated, execution=Execution(memo=m), **options)
+            for m in (memo, None)
         )
         torch.testing.assert_close(with_memo.kernel, plain.kernel, atol=1e-13, rtol=0)
         gradients = [torch.autograd.grad(found.kernel[..., 2].sum(), sensor)[0] for found in (with_memo, plain)]
@@ -113,7 +114,7 @@ def test_a_memo_changes_no_kernel_and_traces_less(model, stop):
 
     Memo.front = counting
     try:
-        psf(with_sensor_distance(lens, sensor + 0.04), model, memo=memo, **options)
+        psf(with_sensor_distance(lens, sensor + 0.04), repeated, execution=Execution(memo=memo), **options)
     finally:
         Memo.front = original
     assert memo.crossed - crossed == len(bundles), "each bundle crosses the sensor and nothing else"

@@ -10,7 +10,7 @@ from problems import number
 
 from raytrace import read_lens
 from raytrace.maths.grid import centres, grid
-from raytrace.psf_models import psf
+from raytrace.psf_models import model_of, psf
 from raytrace.system.lens import with_sensor_distance
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -47,7 +47,7 @@ def test_what_is_said_of_waves_is_the_width_of_their_kernel_not_of_the_rays(mode
 def test_round_light_in_a_window_that_is_not(model, shape):
     """Along one radius, or at every node of the window: the same moments, and those of a fine kernel."""
     lens, pitch = read_lens("hubble"), 0.004
-    options = {"fields": axis(), "order": 2}
+    options, model = {"fields": axis()}, model_of(model, order=2)
     round_, plain = (
         psf(lens, model, grid=grid(number(pitch), shape, number([shift, 0.0])), **options) for shift in (0.0, 1e-9)
     )
@@ -75,7 +75,7 @@ def test_moments_of_waves_off_the_axis_are_those_of_a_fine_kernel():
 def test_geometric_models_keep_their_own_moments_whatever_the_window(model):
     lens = read_lens("double_gauss")
     wide, narrow = (
-        psf(lens, model, fields=axis(), grid=grid(number(0.005), size), order=0 if model != "gaussian" else 4)
+        psf(lens, model_of(model, order=0 if model != "gaussian" else 4), fields=axis(), grid=grid(number(0.005), size))
         for size in (21, 3)
     )
     torch.testing.assert_close(wide.covariance, narrow.covariance, rtol=1e-12, atol=0)
@@ -90,7 +90,9 @@ def test_derivatives_of_the_moments(model, shift):
 
     def variance(sensor: torch.Tensor) -> torch.Tensor:
         window = grid(number(0.005), 7, number([shift, 0.0]))
-        return psf(with_sensor_distance(lens, sensor), model, fields=axis(), grid=window, order=0).covariance.sum()
+        return psf(
+            with_sensor_distance(lens, sensor), model_of(model, order=0), fields=axis(), grid=window
+        ).covariance.sum()
 
     sensor, step = lens.surfaces[-2].thickness + 8.0, 3e-3
     (slope,) = torch.autograd.grad(variance(sensor.requires_grad_()), sensor)

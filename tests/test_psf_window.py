@@ -9,7 +9,7 @@ from test_psf_derivatives import moved
 
 import raytrace as rt
 from raytrace.maths.grid import grid
-from raytrace.psf_models import psf
+from raytrace.psf_models import DRT, Fourier, Gaussian, Paraxial, Wave, psf
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import chief_landing, scene
@@ -18,12 +18,12 @@ from raytrace.wave_optics.hybrid import hybrid_psf
 #: Model, what is done, whether of a narrow beam (few waves). All beams are clipped but those of plain rays, whose rim
 #: has no derivative: a ray that crosses it within a step would be a jump of the difference.
 WORK = {
-    "paraxial": ("paraxial", {"order": 0}, False),
-    "fourier": ("fourier", {"order": -2}, True),
-    "gaussian": ("gaussian", {"order": 2}, False),
-    "drt": ("drt", {"order": 0}, False),
-    "plain rays": ("drt", {"rays": 64}, False),
-    "wave": ("wave", {"order": -2}, True),
+    "paraxial": (Paraxial(order=0), {}, False),
+    "fourier": (Fourier(order=-2), {}, True),
+    "gaussian": (Gaussian(order=2), {}, False),
+    "drt": (DRT(order=0), {}, False),
+    "plain rays": (DRT(rays=64), {}, False),
+    "wave": (Wave(order=-2), {}, True),
     "auto": ("auto", {"tol": 2.0}, True),
 }
 LENGTHS = "thickness", "sensor_distance", "object_distance", "pitch"
@@ -115,7 +115,7 @@ def test_a_held_window_has_no_forward_derivative_either():
     def centre(unit, window):
         at = moved("curvature", unit, grid(scalar(0.03), 3))[0]
         found = psf(
-            at.lens, "gaussian", fields=at.fields, object_distances=vector(1e4), center="chief", window=window, order=2
+            at.lens, Gaussian(order=2), fields=at.fields, object_distances=vector(1e4), center="chief", window=window
         )
         return found.grid.centre.sum()
 
@@ -133,7 +133,7 @@ def test_a_window_on_the_axis_of_a_round_lens_is_a_constant():
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     lens = lens.replace(3, curvature=curvature)
     for center in ("chief", "centroid"):
-        centre = rt.psf(lens, "gaussian", fields=[0], center=center, order=2).grid.centre
+        centre = rt.psf(lens, rt.Gaussian(order=2), fields=[0], center=center).grid.centre
         assert not centre.requires_grad
         assert bool((centre == 0).all())
     view = scene(lens, vector(0.0, 0.0, 0.0, 3.0).reshape(2, 2), vector(1e4), vector(0.53))

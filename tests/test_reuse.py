@@ -9,7 +9,7 @@ from problems import number
 
 from raytrace.io import read_lens
 from raytrace.maths.pupil import gauss_rings
-from raytrace.psf_models import psf
+from raytrace.psf_models import Execution, Gaussian, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import Memo, cross_bundle, trace_bundle
@@ -207,6 +207,8 @@ def test_over_a_range_of_distances_lost_rays_change_nothing():
 
     def kernels(memo):
         axis = lens.wavelengths.new_zeros(2, 1)
-        return psf(clipped, "gaussian", fields=axis, object_distances=distances, order=4, memo=memo).kernel
+        return psf(
+            clipped, Gaussian(order=4), fields=axis, object_distances=distances, execution=Execution(memo=memo)
+        ).kernel
 
     torch.testing.assert_close(kernels(Memo(object_distances=(1e4, 5e4))), kernels(None))

@@ -15,7 +15,7 @@ import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.constraints import conditions_of
 from raytrace.optimization.conventions import conventions_of
-from raytrace.optimization.default_merit import rows_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner, least_squares
 from raytrace.optimization.lens_model import Model
@@ -29,7 +29,7 @@ from raytrace.optimization.variables import bounds_of, freedom
 
 PLANE = float("inf")
 PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem
-HOW = {"merit": "spot", "vary": "curvature thickness", "glass_thickness": "2:8", "edge": 1.0, "rings": 2}
+HOW = {"merit": rt.DefaultMerit("spot", glass_thickness="2:8", edge=1.0, rings=2), "vary": "curvature thickness"}
 
 
 def plates(*glasses, diameter=10.0, fields=(0.0, 7.0)):
@@ -104,7 +104,7 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
 def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():
     lens = rt.read_lens("cooke_triplet")
     model, own = Model(lens), float(rt.first_order(lens).effective_focal_length)
-    rows = rows_of(lens, "spot")
+    rows = DefaultMerit().rows(lens)
     assert length_of(model, rows, 1.0, ()) == pytest.approx(own)
     aimed = (*rows, rt.Row("EFFL", target=3.0, weight=1.0))
     assert length_of(model, aimed, 25.4, ()) == pytest.approx(76.2)
@@ -178,7 +178,11 @@ def test_the_best_singlet_is_that_of_a_scan_over_its_bending(plate, found):
 def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
     lens = rt.read_lens("cooke_triplet")
     free = freedom(lens, "curvature thickness:2,4 sensor curvature:6=-curvature:1")
-    rows = (*rows_of(lens, "spot"), rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1), rt.Row("MNEG", (1, 6)))
+    rows = (
+        *DefaultMerit().rows(lens),
+        rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1),
+        rt.Row("MNEG", (1, 6)),
+    )
     asked = Asked(free, rows, conditions_of(lens, "bfd>=40"), bounds_of(free.lens, free.variables), None, None, PLAIN)
     before = asked.whole.evaluated(asked.model.start)
     for k in (1, 2, 3, 4, 7):
@@ -209,7 +213,7 @@ def best_triplet():
     """What is asked of a triplet, and the lens at its minimum."""
     lens = rt.read_lens("cooke_triplet")
     free = freedom(lens, "curvature thickness")
-    rows, held = tuple(rows_of(lens, "spot", rings=2)), conditions_of(lens, "efl=100")
+    rows, held = tuple(DefaultMerit(rings=2).rows(lens)), conditions_of(lens, "efl=100")
     bounds = bounds_of(free.lens, free.variables, "thickness:1..30 sensor:60..120")
     asked = Asked(free, rows, held, bounds, (2.0, 8.0), (0.5, 30.0), PLAIN)
     x, space = asked.model.start, asked.space
@@ -273,8 +277,8 @@ def edge_of(lens, k):
 
 @pytest.mark.slow
 def test_from_a_triplet_to_better_lenses_of_four_elements():
-    how = {"merit": "spot", "vary": "curvature thickness", "hold": "efl=100", "glass_thickness": "2:12", "edge": 1.0}
-    how |= {"air_thickness": "0.5:40"}
+    merit = rt.DefaultMerit("spot", glass_thickness="2:12", air_thickness="0.5:40", edge=1.0)
+    how = {"merit": merit, "vary": "curvature thickness", "hold": "efl=100"}
     triplet = rt.read_lens("cooke_triplet")
     three = rt.optimize(triplet, cycles=200, **how)
     four = rt.search(triplet, insert=[1, 4, 7], **how)

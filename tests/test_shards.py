@@ -16,8 +16,7 @@ from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.maths.grid import grid
-from raytrace.psf_models import compute as sharing
-from raytrace.psf_models import psf
+from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, psf, sharing
 from raytrace.psf_models.result import mixture
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -62,7 +61,9 @@ def kernels(of: Lens, case: dict) -> dict[str, np.ndarray]:
     words = {"fields": [[0.0], [0.0]], **case}
     words = {key: torch.tensor(v, dtype=torch.float64) if isinstance(v, list) else v for key, v in words.items()}
     with torch.no_grad():
-        found = psf(of, words.pop("model"), grid=grid(0.01, 9), share=shards.share(), **words)
+        numbers = {key: words.pop(key) for key in ("order", "rays") if key in words}
+        model = model_of(words.pop("model"), **numbers)
+        found = psf(of, model, grid=grid(0.01, 9), execution=Execution(share=shards.share()), **words)
     numbers = {name: getattr(found, name) for name in ("kernel", "energy", "error", "centroid", "covariance")}
     return {**{name: t.numpy() for name, t in numbers.items()}, "rays": np.array(found.rays)}
 
@@ -247,6 +248,6 @@ def test_shared_kernels_have_no_gradient():
     sensor = of.surfaces[-2].thickness.clone().requires_grad_()
     of = rt.with_sensor_distance(of, sensor)
     with pytest.raises(ValueError, match="no gradient: leave share out"):
-        psf(of, "gaussian", order=3, share=Share(0, 2))
+        psf(of, Gaussian(order=3), execution=Execution(share=Share(0, 2)))
     with pytest.raises(ValueError, match="one rho and one zernike"):
-        psf(lens(), "fourier", order=0, zernike=torch.zeros(4, 1, 2, 1), share=Share(0, 2))
+        psf(lens(), Fourier(order=0, zernike=torch.zeros(4, 1, 2, 1)), execution=Execution(share=Share(0, 2)))

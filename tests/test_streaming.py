@@ -15,9 +15,8 @@ import raytrace as rt
 from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.psf_models import psf
-from raytrace.psf_models.compute import stream_kernels
-from raytrace.psf_models.drt import kernels_of_rays
+from raytrace.psf_models import DRT, Execution, psf
+from raytrace.psf_models.drt import kernels_of_rays, stream_kernels
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing import streaming
@@ -267,7 +266,10 @@ def test_psf_is_that_of_all_rays_at_once(width):
     batch = {"fields": vector(0.0, 14.0).expand(2, 2) * vector(0.0, 1.0)[:, None], "wavelengths": COLOURS}
     batch |= {"object_distances": vector(float("inf"), 3000.0), "wavelength_weights": vector(1.0, 2.0)}
     if width:
-        whole, found = (psf(system, "drt", rays=1501, grid=pixels, max_bytes=most, **batch) for most in (None, FEW))
+        whole, found = (
+            psf(system, DRT(rays=1501), grid=pixels, execution=Execution(max_bytes=most), **batch)
+            for most in (None, FEW)
+        )
         assert float((found.kernel - whole.kernel).abs().max()) < 1e-9
         assert torch.allclose(found.error, whole.error, rtol=1e-6, atol=0, equal_nan=True)
         assert float((found.centroid - whole.centroid).abs().max()) < PICOMETRE
@@ -287,13 +289,13 @@ def test_energy_of_a_psf_is_accounted_for():
     """A window that holds all that arrives holds `arrived`, which is the share of rays that were not lost."""
     system = clipped(field=fields("angle", (10.0,)))
     centroid = stream_spot(system, 2000).centroid[:, 0]
-    options = {"rays": 2000, "max_bytes": FEW, "center": "axis"}
-    found = psf(system, "drt", grid=grid(0.5, 9, centre=centroid[:, None]), **options)
+    options = {"execution": Execution(max_bytes=FEW), "center": "axis"}
+    found = psf(system, DRT(rays=2000), grid=grid(0.5, 9, centre=centroid[:, None]), **options)
     rays = stream_spot(system, 2000).rays
     assert float(found.arrived) == pytest.approx(float(rays) / 2000, rel=1e-14)
     assert float(found.energy) == pytest.approx(float(found.arrived), rel=1e-12)
     assert 0.3 < float(found.arrived) < 0.99
-    narrow = psf(system, "drt", grid=grid(0.005, 3, centre=centroid[:, None]), **options)
+    narrow = psf(system, DRT(rays=2000), grid=grid(0.005, 3, centre=centroid[:, None]), **options)
     assert float(narrow.energy) < 0.5 * float(narrow.arrived)
 
 
@@ -303,7 +305,7 @@ def test_psf_counts_vignetting_factors():
     options = {"grid": pixels, "object_distances": vector(float("inf")), "center": "axis"}
     share = torch.tensor([[0.9, 0.7 * 0.8]], dtype=torch.float64)
     for most in (None, FEW):
-        found = psf(system, "drt", rays=500, max_bytes=most, **options)
+        found = psf(system, DRT(rays=500), execution=Execution(max_bytes=most), **options)
         assert torch.allclose(found.arrived, share, rtol=1e-12)
         assert torch.allclose(found.energy, share, rtol=1e-12)
 
@@ -395,7 +397,7 @@ sys.path.insert(0, "tests")
 from problems import double_gauss, aspheric_singlet, vector
 from raytrace.tracing import streaming
 from raytrace.maths.grid import grid
-from raytrace.psf_models import psf
+from raytrace.psf_models import DRT, Execution, psf
 from raytrace.tracing.streaming import mean_square_gradient
 import dataclasses
 
@@ -425,7 +427,8 @@ print(growth(run, 2**16, 2**16 * 768))
 print(growth(lambda n, b: mean_square_gradient(bent, [curvature], n, max_bytes=b), 2**13, 2**13 * 9216))
 if RAYS > 10**7:
     pixels = grid(0.005, 21)
-    print(growth(lambda n, b: psf(gauss, "drt", rays=n, grid=pixels, fields=field, max_bytes=b), 2**17, 2**17 * 768))
+    run = lambda n, b: psf(gauss, DRT(rays=n), grid=pixels, fields=field, execution=Execution(max_bytes=b))
+    print(growth(run, 2**17, 2**17 * 768))
     print(growth(lambda n, b: streaming.stream_spot(gauss, n, max_bytes=b, **aim), 2**15, 2**15 * 8192))
 """
 

@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 from raytrace.materials.glass import constant
 from raytrace.maths.grid import centres, grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.psf_models import psf, wave
+from raytrace.psf_models import DRT, psf, wave
 from raytrace.system import sag_terms as sag_terms
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import sag_at
@@ -155,7 +155,7 @@ def ray_and_wave(coefficients, distance: float, size: int = 81):
     """Kernels of rays and of waves, the pixels, and the blur radius by first order."""
     blur = float(RADIUS * SENSOR * (1 / distance - 1 / FOCUS))
     pixels = grid(scalar(2.7 * blur / size), size)
-    rays = psf(traced(coefficients, distance), "drt", grid=pixels, order=5).kernel[0, 0]
+    rays = psf(traced(coefficients, distance), DRT(order=5), grid=pixels).kernel[0, 0]
     camera = WaveScene((even_powers(thin(coefficients)),), SENSOR, vector(distance), vector(0.55), pixels, exact=True)
     return rays, wave_psf(camera).kernel[0, 0], pixels, blur
 

@@ -12,8 +12,7 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
-from raytrace.psf_models.compute import PIXEL, SIZE, psf
-from raytrace.psf_models.models import MODELS, Model, NotConverged
+from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 from raytrace.tracing.aiming import need_axis
@@ -240,7 +239,7 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
     """
     changed, upright, rows = _with_conic(lens), largest_field(lens), []
     for model in _ROWS:
-        work = {"tol": _TOLERANCE} if "rays" in model.compared else model.compared
+        work = {"tol": _TOLERANCE} if "model" in model.compared else model.compared
         focused = _psf(lens, model, grid=pixels, **work)
         away = _psf(lens, model, fields=upright, grid=_about_light(lens, upright, focused.grid, model), **work)
         rows.append(
@@ -250,16 +249,16 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
                 "asymmetry": _relative(away.kernel.flip(-2, -1), away.kernel),
                 "dark_ring": _dark_ring(lens, model, work),
                 "parameters": _parameters(lens, model, work),
-                "rays": model.compared.get("rays", focused.rays),
+                "rays": model.compared["model"].rays if "model" in model.compared else focused.rays,
             }
         )
     table = {key: lens.wavelengths.new_tensor([float(row[key]) for row in rows]) for key in _SHOWN}
     return Abilities(**table, models=tuple(model.title for model in _ROWS))
 
 
-def _psf(lens: Lens, model: Model, **options) -> Psf:
-    """Kernels as `psf` gives them; on the axis and at the lens's own object distance unless told otherwise."""
-    return psf(lens, model.name, **{"fields": lens.wavelengths.new_zeros(2, 1), **options})
+def _psf(lens: Lens, model: Model, /, **options) -> Psf:
+    """Kernels as `psf` gives them; on the axis and at the lens's object distance by default."""
+    return psf(lens, **{"model": model.name, "fields": lens.wavelengths.new_zeros(2, 1), **options})
 
 
 def _relative(one: Tensor, other: Tensor) -> Tensor:

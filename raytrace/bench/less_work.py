@@ -16,7 +16,7 @@ from raytrace.bench.measure import field_rays, in_turns, nothing, slope, with_le
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import sobol
-from raytrace.psf_models import psf
+from raytrace.psf_models import model_of, psf
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
@@ -195,13 +195,12 @@ def _kernels(
     with torch.no_grad():
         found = psf(
             _focused(),
-            model,
+            model_of(model, order=_ORDERS[model]),
             fields=distances.new_tensor(field)[:, None],
             object_distances=distances,
             wavelengths=distances.new_tensor(wavelengths),
             grid=grid(0.005, 21),
             center="chief" if FIELD in field else "axis",
-            order=_ORDERS[model],
         )
     return found.kernel[:, 0]
 

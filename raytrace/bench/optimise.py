@@ -19,7 +19,7 @@ import numpy as np
 from raytrace.bench.report import Asked, Measured, digits, in_words, table
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
-from raytrace.optimization.default_merit import rows_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
@@ -138,7 +138,7 @@ def _jacobian(lens: Lens, repeats: int) -> tuple[float, float, int, int]:
     lens = lens.at(wavelengths=[0.5876, 0.4861, 0.6563])
     free = freedom(lens, "curvature thickness")
     model = Model(free.lens, free.variables[:20], free.solves)
-    problem = Problem(model, rows_of(lens, "spot", rings=6))
+    problem = Problem(model, DefaultMerit("spot", rings=6).rows(lens))
     seconds = []
     for derivatives in (False, True):
         each = []

@@ -483,7 +483,7 @@ def window(group, *, normalise: str) -> None:
 
 
 def merit(parser: argparse.ArgumentParser) -> None:
-    """--merit and what goes with it: `optimization.merit.merit_for`."""
+    """--merit and what goes with it: `optimization.merit.merit_of_options`."""
     parser.add_argument(
         "--merit",
         metavar="KIND",

@@ -1,6 +1,7 @@
 """The runner of every command: open the lens, call the public function once, print or save the result."""
 
 import argparse
+import dataclasses
 import inspect
 import json
 import math
@@ -18,6 +19,7 @@ from raytrace.files import check_output, check_output_folder, shipped
 from raytrace.io import FORMATS, LensFileError, read_lens, shipped_lens
 from raytrace.materials.catalogs import shipped_file
 from raytrace.maths.result import Result
+from raytrace.psf_models import Execution, model_of
 from raytrace.shards import processes, share
 from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
@@ -31,6 +33,8 @@ RUNNER_OPTIONS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "spelled"),
     *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
+#: Options that are fields of the parameter `execution`.
+_EXECUTION = tuple(field.name for field in dataclasses.fields(Execution))
 _FIGURE = "plot_"  # prefix of options of the figure: --log, dest="plot_log"
 #: Outputs that may be an input: a checkpoint replaces the one that is resumed.
 _REPLACES = {("checkpoint", "resume")}
@@ -93,7 +97,8 @@ def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[floa
 def _takes(arguments: argparse.Namespace, keyword: str) -> bool:
     """Whether the command calls a public function with this parameter; codesign and bench call none."""
     verb = arguments.run.verb
-    return verb in raytrace.PUBLIC and keyword in inspect.signature(getattr(raytrace, verb)).parameters
+    parameters = inspect.signature(getattr(raytrace, verb)).parameters if verb in raytrace.PUBLIC else ()
+    return keyword in parameters or ("execution" in parameters and keyword in _EXECUTION)
 
 
 def options_of(arguments: argparse.Namespace) -> dict:
@@ -110,14 +115,28 @@ def options_of(arguments: argparse.Namespace) -> dict:
         options["progress"] = partial(progress, what=arguments.command)
     if _takes(arguments, "share"):
         options["share"] = share()
+    if _takes(arguments, "execution"):
+        options["execution"] = Execution(**{name: options.pop(name) for name in _EXECUTION if name in options})
+    numbers = {key: options.pop(key) for key in ("rays", "rho") if arguments.run.verb == "psf" and key in options}
+    if numbers:
+        options["model"] = model_of(options.get("model", "auto"), **numbers)
     return options
 
 
 def result_of_lens(arguments: argparse.Namespace) -> Result:
-    """Call the public function with the lens and the options. Its errors begin with the name of the lens."""
-    lens = open_lens(arguments)
+    """Call the public function with the lens and the options. Its errors begin with the name of the lens.
+
+    Options that a function of a merit function has no parameters for define the merit function.
+    """
+    lens, options = open_lens(arguments), options_of(arguments)
     try:
-        return getattr(raytrace, arguments.run.verb)(lens, **options_of(arguments))
+        if _takes(arguments, "merit"):
+            names = [name for name in options if name == "merit" or not _takes(arguments, name)]
+            if of_merit := {name: options.pop(name) for name in names}:
+                from raytrace.optimization.merit import merit_of_options  # loads the package of merit functions
+
+                options["merit"] = merit_of_options(lens, **of_merit)
+        return getattr(raytrace, arguments.run.verb)(lens, **options)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
 

@@ -24,7 +24,7 @@ from raytrace.imaging.image import as_picture, blur
 from raytrace.imaging.sensor import add_noise
 from raytrace.imaging.variables import Variables
 from raytrace.maths.grid import Grid, grid
-from raytrace.psf_models import MODELS, NotConverged, psf
+from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, model_of, psf
 from raytrace.system.lens import Lens, field_points
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.scene import Memo, chief_landing, scene
@@ -100,21 +100,20 @@ class Camera(nn.Module):
         order = self.plan() if self._order is None else self._order
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
 
-    def _psf(self, distances: Tensor, fields: Tensor, **work):
+    def _psf(self, distances: Tensor, fields: Tensor, *, tol: float | None = None, order: int | None = None):
         # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
         # traced one by the distortion.
         fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
         lens, distances = self.variables(), distances.to(self.fields.dtype)
         return psf(
             lens,
-            self.model,
+            Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
+            tol=tol,
             fields=fields,
             object_distances=distances,
             grid=self._window(lens, fields, distances),
             normalise=self.normalise,
-            rho=self.rho,
-            memo=self._memo,
-            **work,
+            execution=Execution(memo=self._memo),
         )
 
     def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:

@@ -10,18 +10,23 @@ a field above it, else all. They lie half a step off the y axis. The weights v a
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from numbers import Integral
 
 import numpy as np
 
 from raytrace.maths.pupil import gauss_legendre
+from raytrace.optimization.conventions import Conventions, conventions_of
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import parse_range
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.words import did_you_mean
 
-#: More rows than any merit function is worth: each is a ray, with its derivatives by all variables.
+#: Most rows of a default merit function: each is a ray, with its derivatives by all variables.
 MOST_ROWS = 100_000
+
+REFERENCES = ("centroid", "chief")
 
 
 class BadMerit(ValueError):
@@ -30,15 +35,23 @@ class BadMerit(ValueError):
 
 @dataclass(frozen=True)
 class Boundaries:
-    """Least and greatest thickness in mm at the axis, of glass and of air; edge: least of glass at its edge.
+    """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum at the edge.
 
-    None: no such row. Air is at its edge as thick as at its axis at least. The space before the image has no greatest
-    thickness.
+    None: no such row. `edge` is of glass; the minimum of air also holds at its edge. The space before the image has
+    no maximum.
     """
 
     glass: tuple[float, float] | None = None
     air: tuple[float, float] | None = None
     edge: float | None = None
+
+    @classmethod
+    def of(
+        cls, glass_thickness: str | tuple[float, float] | None, air_thickness: str | tuple[float, float] | None, edge
+    ) -> "Boundaries":
+        """From ranges, which may be text as "2:15", or "2" without a maximum. Raises ValueError."""
+        ranges = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+        return cls(*ranges, edge)
 
     def rows(self, lens: Lens) -> Iterator[Row]:
         """The rows, each over all surfaces."""
@@ -54,90 +67,97 @@ class Boundaries:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """How a default merit function is made; arguments as for `rows_of`."""
-
-    rings: int
-    arms: int
-    field_weights: Sequence[float] | None
-    wavelength_weights: Sequence[float] | None
-    frequencies: Sequence[float]
-
-
-@dataclass(frozen=True)
 class Kind:
-    """One kind of default merit function: its operand by what it refers to, how its rows are made, what it is."""
+    """A kind of default merit function: its operand for each reference, how its rows are made, and its description."""
 
     operands: dict[str, str]
-    rows: Callable[[Lens, str, Choice], Iterator[Row]]
+    rows: "Callable[[Lens, str, DefaultMerit], Iterator[Row]]"
     text: str
 
 
-def rows_of(
-    lens: Lens,
-    kind: str = "spot",
-    *,
-    rings: int = 3,
-    arms: int = 6,
-    reference: str = "centroid",
-    frequencies: Sequence[float] = (),
-    field_weights: Sequence[float] | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    boundaries: Boundaries | None = None,
-    configurations: Sequence[int] | None = None,
-) -> tuple[Row, ...]:
-    """The rows of a default merit function, lengths in mm.
+@dataclass(frozen=True)
+class DefaultMerit:
+    """Settings of a default merit function, as in OpticStudio's wizard of sequential merit functions.
 
-    kind: a key of KINDS; rings, arms: of the pupil, arms even; reference: what rays are told from: "centroid" of each
-    field, or the "chief" ray. frequencies: cycles/mm, of kind "mtf". field_weights, wavelength_weights: (F,), (W,)
-    instead of the lens's own. configurations: from 1, all of them by default; their rows weigh alike. Raises BadMerit.
+    kind: "spot", "wavefront", "angular" or "mtf"; rings, arms (even): of Gaussian quadrature of the pupil; reference:
+    "centroid" or "chief" ray; frequencies: cycles/mm, of "mtf"; field_weights (F,), wavelength_weights (W,): by default
+    those of the lens. glass_thickness, air_thickness: (minimum, maximum) on the axis, mm, or text "2:15"; edge: minimum
+    thickness of glass at its edge, mm: boundary rows in addition. conventions: of operands, as "opd_tilt=common"
+    (`Conventions`). Raises BadMerit, ValueError.
     """
-    choice = Choice(rings, arms, field_weights, wavelength_weights, tuple(frequencies))
-    operand = _operand(kind, reference, choice)
-    about = f"{kind}, from the {reference}" if len(KINDS[kind].operands) > 1 else kind
-    found = [Row("DMFS"), Row("BLNK", text=f"{about}: {KINDS[kind].text}")]
-    for setting, one in _configurations(lens, configurations):
-        found += (*setting, *(boundaries or Boundaries()).rows(one), *KINDS[kind].rows(one, operand, choice))
-    return tuple(found)
+
+    kind: str = "spot"
+    _: KW_ONLY
+    rings: int = 3
+    arms: int = 6
+    reference: str = "centroid"
+    frequencies: Sequence[float] = ()
+    field_weights: Sequence[float] | None = None
+    wavelength_weights: Sequence[float] | None = None
+    glass_thickness: str | tuple[float, float] | None = None
+    air_thickness: str | tuple[float, float] | None = None
+    edge: float | None = None
+    conventions: Conventions | str | Sequence[str] | None = None
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise BadMerit(f"`merit={self.kind}`: expected one of {', '.join(KINDS)}{did_you_mean(self.kind, KINDS)}")
+        if self.reference not in REFERENCES:
+            raise BadMerit(f"`reference={self.reference}`: expected one of {', '.join(REFERENCES)}")
+        whole = isinstance(self.rings, Integral) and isinstance(self.arms, Integral)
+        if not whole or self.rings < 1 or self.arms < 2 or self.arms % 2:
+            raise BadMerit(f"`rings={self.rings}` and `arms={self.arms}`: expected 1 or more, and an even number")
+        object.__setattr__(self, "frequencies", tuple(np.atleast_1d(self.frequencies).astype(float).tolist()))
+        if not all(0 <= frequency < np.inf for frequency in self.frequencies):
+            raise BadMerit(f"`frequencies={self.frequencies}`: expected finite numbers, 0 or more, cycles/mm")
+        if bool(self.frequencies) != (self.kind == "mtf"):
+            raise BadMerit("`merit=mtf` goes with `frequencies`, cycles/mm, and no other merit does")
+        object.__setattr__(self, "conventions", conventions_of(self.conventions))
+
+    @property
+    def boundaries(self) -> Boundaries:
+        return Boundaries.of(self.glass_thickness, self.air_thickness, self.edge)
+
+    def rows(self, lens: Lens, configurations: Sequence[int] | None = None) -> tuple[Row, ...]:
+        """The rows for a lens, lengths in mm, in these configurations (from 1; by default all, with equal weight).
+
+        Raises BadMerit.
+        """
+        kind = KINDS[self.kind]
+        operand = kind.operands.get(self.reference) or next(iter(kind.operands.values()))
+        about = f"{self.kind}, from the {self.reference}" if len(kind.operands) > 1 else self.kind
+        rows = [Row("DMFS"), Row("BLNK", text=f"{about}: {kind.text}")]
+        for setting, configured in _configurations(lens, configurations):
+            rows += (*setting, *self.boundaries.rows(configured), *kind.rows(configured, operand, self))
+        return tuple(rows)
 
 
-def boundary_rows(lens: Lens, boundaries: Boundaries, configurations: Sequence[int] | None = None) -> tuple[Row, ...]:
+def boundary_rows(lens: Lens, boundaries: Boundaries) -> tuple[Row, ...]:
     """The rows of boundaries alone, in every configuration."""
-    found: list[Row] = []
-    for setting, one in _configurations(lens, configurations):
-        rows = tuple(boundaries.rows(one))
-        found += (*setting, *rows) if rows else ()
-    return tuple(found)
+    rows: list[Row] = []
+    for setting, configured in _configurations(lens, None):
+        limits = tuple(boundaries.rows(configured))
+        rows += (*setting, *limits) if limits else ()
+    return tuple(rows)
 
 
 def _configurations(lens: Lens, chosen: Sequence[int] | None) -> Iterator[tuple[tuple[Row, ...], Lens]]:
-    """The row that says which configuration the rows below are of, if there are several, and the lens in it."""
+    """The row CONF of each configuration, if there are several, and the lens in it."""
     for number in range(1, len(lens.configurations) + 1) if chosen is None else chosen:
         yield ((Row("CONF", (number, 0)),), lens.configuration(number)) if lens.operands else ((), lens)
 
 
-def _operand(kind: str, reference: str, choice: Choice) -> str:
-    """The operand of a kind. Raises BadMerit for what does not go together."""
-    if kind not in KINDS:
-        raise BadMerit(f"`merit={kind}`: expected one of {', '.join(KINDS)}{did_you_mean(kind, KINDS)}")
-    operands = KINDS[kind].operands
-    if reference not in REFERENCES:
-        raise BadMerit(f"`reference={reference}`: expected one of {', '.join(REFERENCES)}")
-    if choice.rings < 1 or choice.arms < 2 or choice.arms % 2:
-        raise BadMerit(f"`rings={choice.rings}` and `arms={choice.arms}`: expected 1 or more, and an even number")
-    if bool(choice.frequencies) != (kind == "mtf"):
-        raise BadMerit("`merit=mtf` goes with `frequencies`, cycles/mm, and no other merit does")
-    return operands.get(reference) or next(iter(operands.values()))
-
-
-def _by_rays(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
+def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
     """A row for every ray, by field, wavelength, arm and ring."""
-    fields, colours = _fields(lens, choice), _weights(lens.wavelength_weights, choice.wavelength_weights, "wavelength")
-    count = sum(_arm_count(lens, field, choice.arms) for field, _ in fields) * len(colours) * choice.rings
-    _refuse_many(count, f"`rings={choice.rings}` and `arms={choice.arms}`")
-    nodes, weights = gauss_legendre(choice.rings)
+    fields, colours = (
+        _fields(lens, settings),
+        _weights(lens.wavelength_weights, settings.wavelength_weights, "wavelength"),
+    )
+    count = sum(_arm_count(lens, field, settings.arms) for field, _ in fields) * len(colours) * settings.rings
+    _refuse_many(count, f"`rings={settings.rings}` and `arms={settings.arms}`")
+    nodes, weights = gauss_legendre(settings.rings)
     for field, field_weight in fields:
-        angles = _arms(lens, field, choice.arms)
+        angles = _arms(lens, field, settings.arms)
         for wavelength, weight in enumerate(colours, 1):
             share = np.pi * weight * field_weight / (len(colours) * len(fields) * len(angles))
             for angle in angles if share else ():
@@ -146,22 +166,22 @@ def _by_rays(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
                     yield Row(operand, (0, wavelength), (*field, *pupil), weight=float(share * g))
 
 
-def _by_frequencies(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
+def _by_frequencies(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
     """A row for every field and frequency, all wavelengths together; the best that there is is 1."""
-    fields = _fields(lens, choice)
-    _refuse_many(len(fields) * len(choice.frequencies), f"{len(choice.frequencies)} `frequencies`")
+    fields = _fields(lens, settings)
+    _refuse_many(len(fields) * len(settings.frequencies), f"{len(settings.frequencies)} `frequencies`")
     for number, (_, weight) in enumerate(fields, 1):
-        for frequency in choice.frequencies if weight else ():
-            share = weight / (len(fields) * len(choice.frequencies))
+        for frequency in settings.frequencies if weight else ():
+            share = weight / (len(fields) * len(settings.frequencies))
             yield Row(operand, (1, 0), (float(number), float(frequency), 0.0, 0.0), target=1.0, weight=share)
 
 
-def _fields(lens: Lens, choice: Choice) -> list[tuple[tuple[float, float], float]]:
+def _fields(lens: Lens, settings: DefaultMerit) -> list[tuple[tuple[float, float], float]]:
     """(Hx, Hy) as parts of the largest field, and its weight, of every field."""
     points = np.stack([lens.fields.x.detach().numpy(), lens.fields.y.detach().numpy()], -1)
     largest = np.hypot(*points.T).max()
     points = (points / largest if largest > 0 else points) + 0.0
-    weights = _weights(lens.fields.weight, choice.field_weights, "field")
+    weights = _weights(lens.fields.weight, settings.field_weights, "field")
     return [(tuple(point), weight) for point, weight in zip(points.tolist(), weights, strict=True)]
 
 
@@ -169,6 +189,7 @@ def _weights(own, given: Sequence[float] | None, what: str) -> list[float]:
     """The weights of fields or wavelengths: those of the lens, or those given, one each."""
     if given is None:
         return own.detach().tolist()
+    given = np.atleast_1d(given).tolist()
     if len(given) != len(own):
         raise BadMerit(f"`{what}_weights`: {len(given)} weights, and the lens has {len(own)} {what}s")
     if min(given) < 0 or not sum(given) > 0:
@@ -199,8 +220,6 @@ def _clean(number: float) -> float:
     """Without what rounding leaves of 0."""
     return round(float(number), 15) + 0.0
 
-
-REFERENCES = ("centroid", "chief")
 
 KINDS = {
     "spot": Kind({"centroid": "TRAC", "chief": "TRAR"}, _by_rays, "where rays land on the image"),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, cell, rows
 from raytrace.maths.value import value
-from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_rows import Evaluation
@@ -135,35 +135,16 @@ class MeritResult(Result):
 def evaluate(
     lens: Lens,
     *,
-    merit: Merit | Sequence[Row] | str | None = None,
-    rings: int | None = None,
-    arms: int | None = None,
-    reference: str | None = None,
-    frequencies: Sequence[float] | None = None,
-    field_weights: Sequence[float] | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    glass_thickness: tuple[float, float] | str | None = None,
-    air_thickness: tuple[float, float] | str | None = None,
-    edge: float | None = None,
-    skip_unknown: bool = False,
-    conventions: Conventions | str | Sequence[str] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
     configuration: int | None = None,
     each: bool = False,
 ) -> MeritResult:
     """What the lens is worth by a merit function, row by row.
 
-    merit: `Merit`, rows, or the name of a default one ("spot", "wavefront", "angular", "mtf"); by default the file's.
-    rings, arms (even), reference ("centroid", "chief"), frequencies (cycles/mm, of "mtf"), field_weights,
-    wavelength_weights: of a default one. glass_thickness, air_thickness: least and greatest in mm, edge: least of glass
-    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. conventions: where
-    the meaning of an operand is open, as "opd_tilt=common" (`Conventions`). configuration: its rows alone. each: list
-    every row in the text. Raises BadMerit, UnknownOperand.
+    merit: `Merit`, `DefaultMerit`, rows, or a kind of default one ("spot", "wavefront", "angular", "mtf"); by default
+    the file's. configuration: its rows alone. each: list every row in the text. Raises BadMerit, UnknownOperand.
     """
-    function = merit_for(
-        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
-        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
-        configurations=configuration and [configuration],
-    )  # fmt: skip
+    function = merit_for(lens, merit, configuration and [configuration])
     warn_of_filling(lens, field_points(None, like=lens))
     where = configurations_of(function, lens.current_configuration)
     if configuration is not None:
@@ -173,8 +154,8 @@ def evaluate(
         Model(lens),
         function.rows,
         unit=function.unit,
-        skip_unknown=skip_unknown,
-        conventions=conventions_of(conventions),
+        skip_unknown=function.skip_unknown,
+        conventions=function.conventions,
     )
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and where[k] in (configuration or where[k],)

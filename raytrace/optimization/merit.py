@@ -1,21 +1,21 @@
 """Merit functions as values: the rows of a file, of a list or of a default, which can be joined and weighed anew.
 
-rt.Merit.of(lens)                      the file's own
-rt.Merit.default(lens, "spot")         `default_merit.rows_of`
-one + other, 2 * one                   joined; with all weights doubled
-one.with_weights(EFFL=1)               of all rows of an operand; with_targets likewise
+rt.Merit.of(lens)                      the merit function of the file
+rt.Merit.default(lens, "spot")         a default one, of the settings `DefaultMerit`
+merit + other, 2 * merit               joined; with all weights doubled
+merit.with_weights(EFFL=1)             of all rows of an operand; with_targets likewise
 """
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 
 from raytrace.optimization.context import Line
-from raytrace.optimization.default_merit import BadMerit, Boundaries, boundary_rows, rows_of
+from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.default_merit import BadMerit, Boundaries, DefaultMerit, boundary_rows
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
-from raytrace.system.parameter_paths import parse_range
 from raytrace.words import did_you_mean
 
 
@@ -24,22 +24,48 @@ class Merit:
     """Rows of a merit function, in order; `rows[i - 1]` is row i.
 
     unit: mm in the unit of length of targets and values, which matters beside rows of pure numbers or waves.
+    conventions: of operands whose meaning the file's program leaves open, as "opd_tilt=common" (`Conventions`);
+    skip_unknown: leave rows of unknown operands out. boundaries: those among the rows, between which `search`
+    spreads its starts. Raises ValueError for other conventions.
     """
 
-    rows: tuple[Row, ...] = field(default=())
+    rows: tuple[Row, ...] = ()
     unit: float = 1.0
+    _: KW_ONLY
+    conventions: Conventions | str | Sequence[str] | None = None
+    skip_unknown: bool = False
+    boundaries: Boundaries = field(default_factory=Boundaries)
+
+    def __post_init__(self):
+        object.__setattr__(self, "conventions", conventions_of(self.conventions))
 
     @classmethod
-    def of(cls, lens: Lens) -> "Merit":
-        """That of the lens's file. Raises BadMerit where it has none."""
+    def of(
+        cls,
+        lens: Lens,
+        *,
+        glass_thickness: str | tuple[float, float] | None = None,
+        air_thickness: str | tuple[float, float] | None = None,
+        edge: float | None = None,
+        conventions: Conventions | str | Sequence[str] | None = None,
+        skip_unknown: bool = False,
+    ) -> "Merit":
+        """The merit function of the lens's file, with boundaries in mm (as of `DefaultMerit`) in addition.
+
+        Raises BadMerit if the file has none.
+        """
         if lens.optimization_data is None or not lens.optimization_data.merit:
             raise BadMerit("the lens has no merit function of its own: choose one by `merit=spot`")
-        return cls(lens.optimization_data.merit, lens.optimization_data.unit)
+        boundaries = Boundaries.of(glass_thickness, air_thickness, edge)
+        options = {"conventions": conventions, "skip_unknown": skip_unknown, "boundaries": boundaries}
+        stored = cls(lens.optimization_data.merit, lens.optimization_data.unit, **options)
+        limits = boundary_rows(lens, boundaries)
+        return stored + Merit(limits) if limits else stored
 
     @classmethod
-    def default(cls, lens: Lens, kind: str = "spot", **how) -> "Merit":
-        """A default merit function of the lens, in mm; how: as for `default_merit.rows_of`."""
-        return cls(rows_of(lens, kind, **how))
+    def default(cls, lens: Lens, kind: str = "spot", **settings) -> "Merit":
+        """A default merit function of the lens, in mm; settings: those of `DefaultMerit`."""
+        return merit_for(lens, DefaultMerit(kind, **settings))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -59,14 +85,15 @@ class Merit:
             raise BadMerit("rows behind a row PRIM would be of that wavelength: join them the other way round")
         reset = (Row("CONF", (1, 0)),) if any(row.operand == "CONF" for row in self.rows) else ()
         ahead = (*self.rows, *reset)
-        return Merit((*ahead, *(_moved(row, len(ahead)) for row in behind)), self.unit)
+        return dataclasses.replace(self, rows=(*ahead, *(_moved(row, len(ahead)) for row in behind)))
 
     def __radd__(self, other: Sequence[Row]) -> "Merit":
         return Merit(tuple(other)) + self
 
     def __mul__(self, factor: float) -> "Merit":
         """With all weights larger."""
-        return self._each(lambda row: dataclasses.replace(row, weight=row.weight * factor))
+        rows = tuple(dataclasses.replace(row, weight=row.weight * factor) for row in self.rows)
+        return dataclasses.replace(self, rows=rows)
 
     __rmul__ = __mul__
 
@@ -91,10 +118,7 @@ class Merit:
             row if number is None else dataclasses.replace(row, **{name: float(number)})
             for row, number in zip(self.rows, given, strict=True)
         )
-        return Merit(tuple(changed), self.unit)
-
-    def _each(self, change) -> "Merit":
-        return Merit(tuple(map(change, self.rows)), self.unit)
+        return dataclasses.replace(self, rows=tuple(changed))
 
     def __str__(self) -> str:
         lines = [f"{'row':>5}  {'operand':<8}{'arguments':<40}{'target':>14}{'weight':>14}"]
@@ -108,29 +132,32 @@ class Merit:
 
 def merit_for(
     lens: Lens,
-    merit: "Merit | Sequence[Row] | str | None" = None,
-    *,
-    glass_thickness: tuple[float, float] | str | None = None,
-    air_thickness: tuple[float, float] | str | None = None,
-    edge: float | None = None,
+    merit: "Merit | DefaultMerit | Sequence[Row] | str | None" = None,
     configurations: Sequence[int] | None = None,
-    **how,
 ) -> Merit:
-    """The merit function that is meant: a value, rows, the name of a default one, or by default the file's.
+    """A merit function as a value: as it is, of rows, of the settings or the name of a default one, or the file's.
 
-    glass_thickness, air_thickness, edge: boundaries in mm, also as words "2:15", beside the rows that there are. how:
-    as for `default_merit.rows_of`, of a default one; what is None is left to it. Raises BadMerit.
+    configurations: those of the rows of a default one, from 1; by default all. Raises BadMerit.
     """
-    how = {name: given for name, given in how.items() if given is not None}
-    glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
-    boundaries = Boundaries(glass, air, edge)
+    if merit is None:
+        return Merit.of(lens)
     if isinstance(merit, str):
-        return Merit.default(lens, merit, boundaries=boundaries, configurations=configurations, **how)
-    if how:
-        raise BadMerit(f"`{next(iter(how))}` belongs to a default merit function: name it by `merit`, as spot")
-    found = Merit.of(lens) if merit is None else merit if isinstance(merit, Merit) else Merit(tuple(merit))
-    bounds = boundary_rows(lens, boundaries, configurations)
-    return found + Merit(bounds) if bounds else found
+        merit = DefaultMerit(merit)
+    if isinstance(merit, DefaultMerit):
+        rows = merit.rows(lens, configurations)
+        return Merit(rows, conventions=merit.conventions, boundaries=merit.boundaries)
+    return merit if isinstance(merit, Merit) else Merit(tuple(merit))
+
+
+def merit_of_options(
+    lens: Lens, merit: str | None = None, *, skip_unknown: bool = False, **settings
+) -> Merit | DefaultMerit:
+    """The merit function of the options of a command: a default one of that kind, or the file's. Raises BadMerit."""
+    if merit is not None:
+        return DefaultMerit(merit, **settings)
+    if other := {*settings} - {"glass_thickness", "air_thickness", "edge", "conventions"}:
+        raise BadMerit(f"`{min(other)}` belongs to a default merit function: name it by `merit`, as spot")
+    return Merit.of(lens, skip_unknown=skip_unknown, **settings)
 
 
 def arguments(row: Row) -> str:

@@ -33,7 +33,7 @@ from raytrace.optimization.checkpoint import (
     resumed,
 )
 from raytrace.optimization.constraints import conditions_of
-from raytrace.optimization.conventions import Conventions, conventions_of
+from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of, without_glass
 from raytrace.optimization.least_squares import Cycle, Manner, least_squares
 from raytrace.optimization.lens_model import Model
@@ -119,24 +119,13 @@ LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
 def optimize(
     lens: Lens,
     *,
-    merit: str | Merit | Sequence[Row] | Callable[[Lens], torch.Tensor] | None = None,
+    merit: str | Merit | DefaultMerit | Sequence[Row] | Callable[[Lens], torch.Tensor] | None = None,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = None,
-    rings: int | None = None,
-    arms: int | None = None,
-    reference: str | None = None,
-    frequencies: Sequence[float] | None = None,
-    field_weights: Sequence[float] | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    glass_thickness: str | tuple[float, float] | None = None,
-    air_thickness: str | tuple[float, float] | None = None,
-    edge: float | None = None,
     cycles: int | None = None,
     seconds: float | None = None,
     paths: int = 1,
-    skip_unknown: bool = False,
-    conventions: Conventions | str | Sequence[str] | None = None,
     catalog: Sequence[str | PathLike] = (),
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
@@ -145,19 +134,14 @@ def optimize(
 ) -> Optimized:
     """The lens at the least of its merit function, by damped least squares on the exact derivatives of every row.
 
-    merit: `Merit`, rows, by default the file's, or the kind of a default merit function: "spot", "wavefront",
-    "angular", "mtf", which rings, arms, reference, frequencies (cycles/mm) and the weights of fields and wavelengths
-    belong to, as in `default_merit.rows_of`; boundaries, mm: glass_thickness, air_thickness (least, greatest),
-    edge (least); or any function of a lens that gives one number (), to be least, which L-BFGS descends on.
-    vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
-    "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`optimization.constraints`). cycles,
-    seconds: after
-    which it ends, by default 500 cycles a path; paths: how many ways of damping are tried. skip_unknown: leave rows of
-    unknown operands out; conventions: of operands (`Conventions`). catalog: names of shipped catalogs, or AGF
-    files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
-    with a
-    line for every cycle; checkpoint: a file (.json) that keeps all that decides the next cycle; resume: one of the same
-    lens, variables and merit function, which is resumed bit-identically, cycles counted from its beginning
+    merit: `Merit`, the settings `DefaultMerit` of a default merit function or its kind ("spot", "wavefront", "angular",
+    "mtf"), rows, by default the file's; or any function of a lens that returns one number () to minimise, by L-BFGS.
+    vary: variables, or their syntax, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
+    "thickness:2,15"; hold: constraints met exactly, as "efl=50 total_track<=80" (`optimization.constraints`). cycles,
+    seconds: limits, by default 500 cycles a path; paths: damping strategies to try. catalog: shipped catalogs or
+    AGF files for variable glasses, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
+    with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
+    lens, variables and merit function, from which the descent resumes bit-identically, cycles counted from its start
     (`checkpoint.py`). Ctrl-C ends with the best lens.
     Conditions that exclude one another for certain are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason; they are warned of (NotReached), as are surfaces and gaps that cannot
@@ -176,7 +160,7 @@ def optimize(
     how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles}
     of = {**identity(lens), "variables": list(names), "solves": digest(repr(free.solves)), "paths": paths}
     of |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
-    if callable(merit) and not isinstance(merit, Merit):
+    if callable(merit):
         if glasses:
             raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
         if hold:
@@ -186,12 +170,9 @@ def optimize(
         with _Told(log, Checkpoint(checkpoint, of, names), progress and progress(cycles, "cycle"), kept.course) as told:
             start, function = np.clip(model.start, lower, upper), Function(model, merit, kept.evaluated)
             return _warned(_by_gradient(lens, function, names, start, how, told, begun, until))
-    function = merit_for(
-        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
-        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
-    )  # fmt: skip
+    function = merit_for(lens, merit)
     conditions = _conditions(lens, hold, function.unit)
-    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "conventions": conventions_of(conventions)}
+    of_rows = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
     problem = Problem(model, function.rows, conditions, **of_rows)
     of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
     kept = Kept(model.start, {}) if resume is None else resumed(resume, of, names)

@@ -18,8 +18,7 @@ from raytrace.files import NotWritten, check_output_folder
 from raytrace.io import LensFileError
 from raytrace.optimization.attained import refuse_contradictions
 from raytrace.optimization.constraints import Condition, conditions_of
-from raytrace.optimization.conventions import Conventions, conventions_of
-from raytrace.optimization.default_merit import KINDS
+from raytrace.optimization.default_merit import KINDS, DefaultMerit
 from raytrace.optimization.journal import Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner
 from raytrace.optimization.merit import Merit, in_unit, merit_for
@@ -33,7 +32,6 @@ from raytrace.optimization.variables import Freedom, bounds_of, freedom
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
-from raytrace.system.parameter_paths import parse_range
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
@@ -55,21 +53,10 @@ _DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.valu
 def search(
     lens: Lens,
     *,
-    merit: str | Merit | Sequence[Row] | None = None,
+    merit: str | Merit | DefaultMerit | Sequence[Row] | None = None,
     vary: str | Sequence[str] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str] | Sequence[Condition] | None = None,
-    rings: int | None = None,
-    arms: int | None = None,
-    reference: str | None = None,
-    frequencies: Sequence[float] | None = None,
-    field_weights: Sequence[float] | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    glass_thickness: str | tuple[float, float] | None = None,
-    air_thickness: str | tuple[float, float] | None = None,
-    edge: float | None = None,
-    skip_unknown: bool = False,
-    conventions: Conventions | str | Sequence[str] | None = None,
     starts: int | None = None,
     insert: bool | Sequence[int] | None = None,
     seconds: float | None = None,
@@ -80,7 +67,7 @@ def search(
 ) -> Searched:
     """The distinct minima of a merit function, from starts spread over all that the bounds allow; the lens is one.
 
-    merit to conventions: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
+    merit, vary, bounds, hold: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
     which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
     more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. folder: keeps the minima as lens
@@ -93,18 +80,15 @@ def search(
     prepare()
     warn_of_filling(lens, field_points(None, like=lens))
     begun = time.monotonic()
-    function = merit_for(
-        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
-        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
-    )  # fmt: skip
+    function = merit_for(lens, merit)
     free = freedom(lens, vary)
     if any(one.quantity == "glass" for one in free.variables):
         raise NoProblem(
             "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
         )
-    glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+    glass, air = function.boundaries.glass, function.boundaries.air
     ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
-    how = {"unit": function.unit, "skip_unknown": skip_unknown, "conventions": conventions_of(conventions)}
+    how = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
     asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
     until = begun + (np.inf if seconds is None else seconds)
     places = () if insert is None or insert is False else _places(free, insert, starts)

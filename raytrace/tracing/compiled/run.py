@@ -101,10 +101,8 @@ def task_of(
 
 def _batch(rays: Rays, numbers: Sequence[Tensor]) -> torch.Size | None:
     """Batch shape; None if a number has another dtype than the rays, or differs from ray to ray of the last axis."""
-    parts = [rays.position.shape[1:], rays.direction.shape[1:], rays.valid.shape]
-    shape = broadcast_shape(
-        *parts, *(n.shape for n in numbers if n.dim()), *([(1,)] if rays.opl is None else [rays.opl.shape])
-    )
+    parts = [rays.position[0], rays.direction[0], rays.valid, *([] if rays.opl is None else [rays.opl]), *numbers]
+    shape = broadcast_shape(*(part.shape for part in parts))
     if any(n.dtype != rays.direction.dtype or (n.dim() and n.shape[-1] != 1) for n in numbers) or 0 in shape:
         return None
     return shape
