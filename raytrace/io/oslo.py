@@ -571,11 +571,8 @@ def _aperture(commands: _Commands, unit: float) -> tuple[float | None, tuple[Ape
         raise LensFileError(f"AP is {radius:g}, expected a radius of 0 or more", record.place)
     if len(record.words) > 1 + checked:
         raise UnsupportedSurface(f"AP {shown(' '.join(record.words))}: expected AP r or AP CHK r", record.place)
-    sizes = (0.0, radius * unit)
-    clips = checked and sizes[1]
-    return sizes[1] or None, (
-        clear_aperture("circular", sizes, False, (0.0, 0.0), "AP", record.place),
-    ) if clips else ()
+    radius *= unit
+    return radius or None, (Aperture("circular", (0.0, radius), False, (0.0, 0.0)),) if checked and radius else ()
 
 
 def _poses(commands: _Commands, unit: float) -> dict[str, Pose]:
