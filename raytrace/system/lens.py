@@ -16,7 +16,6 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import check_unit, check_wavelengths, refractive_index
-from raytrace.maths.result import lent
 from raytrace.maths.value import check_precision, value
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
@@ -122,8 +121,15 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
-    __str__ = lent("tracing.lens_report.text")
-    _repr_html_ = lent("plotting.notebook.page")
+    def __str__(self) -> str:
+        from raytrace.tracing.lens_report import text
+
+        return text(self)
+
+    def _repr_html_(self) -> str:
+        from raytrace.analysis.layout import page
+
+        return page(self)
 
     @both_spellings
     def at(
@@ -354,6 +360,22 @@ def name_of_field(field: Tensor) -> str:
     """A field point (2,) in words: its y alone on the axis of x."""
     x, y = field.tolist()
     return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
+def field_label(lens: Lens, field: Sequence[float]) -> str:
+    """A field point in a figure: `10°`, `(3, 4)°`, `5 mm`; its y alone where x is 0."""
+    x, y = (float(component) + 0.0 for component in field)
+    point = f"{y:.6g}" if x == 0 else f"({x:.6g}, {y:.6g})"
+    return point.replace("-", "−") + ("°" if lens.fields.kind == "angle" else " mm")
+
+
+def field_title(lens: Lens) -> str:
+    """The kind of field of this lens, in a figure."""
+    return (
+        "Image height"
+        if lens.fields.kind == "real_image_height"
+        else ("Field angle" if lens.fields.kind == "angle" else lens.fields.kind.replace("_", " ").capitalize())
+    )
 
 
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
