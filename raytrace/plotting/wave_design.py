@@ -7,7 +7,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytrace.imaging.wave_camera import Judged, WaveCameraConfig, depth_text
+from raytrace.imaging.wave_camera import ElementReport, WaveCameraConfig, depth_text
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
 from raytrace.wave_optics.compute import ElementPsf
 from raytrace.wave_optics.element import Element, height
@@ -16,18 +16,18 @@ _MARGIN = 1e-5  # of the brightest pixel, shown black
 
 
 @styled
-def element_figure(judged: Judged) -> Figure:
+def element_figure(judged: ElementReport) -> Figure:
     """Height over the radius, kernels over depth × colour, PSNR over depth, of one element."""
-    own, world = judged.quality, judged.world
+    own, config = judged.quality, judged.config
     figure = new_figure(9.2, 7.0)
     top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
     profile, quality = top.subplots(1, 2)
     _draw_profile(profile, judged.elements)
-    dioptres = [1e3 / depth for depth in world.depths]
+    dioptres = [1e3 / depth for depth in config.depths]
     for filter, mark in (("wiener", "o--"), ("blind", "s-")):
         label = "Wiener, 1 m kernel" if filter == "wiener" else "best depth-invariant filter"
         quality.plot(dioptres, own.by_depth[filter], mark, ms=4, label=label, color=FIELD_COLOURS[filter == "blind"])
-    mark_depths(quality, world)
+    mark_depths(quality, config)
     quality.set(xlabel="object distance", ylabel="PSNR (dB)")
     quality.legend(fontsize=8)
     _draw_kernels(bottom, judged.kernels)
@@ -66,7 +66,7 @@ def _draw_kernels(figure, found: ElementPsf) -> None:
     )
 
 
-def mark_depths(axes: Axes, world: WaveCameraConfig) -> None:
+def mark_depths(axes: Axes, config: WaveCameraConfig) -> None:
     """Near objects on the left, even in dioptres."""
-    axes.set_xticks([1e3 / depth for depth in world.depths], [depth_text(depth, "∞") for depth in world.depths])
+    axes.set_xticks([1e3 / depth for depth in config.depths], [depth_text(depth, "∞") for depth in config.depths])
     axes.invert_xaxis()
