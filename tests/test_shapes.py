@@ -30,8 +30,7 @@ from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
 from raytrace.system.surface import sag, sag_at
-from raytrace.tracing.compiled import trace_engine
-from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Memo, symmetry, trace_bundle

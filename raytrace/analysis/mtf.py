@@ -27,7 +27,7 @@ from raytrace.maths.value import value
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.scene import Scene
+from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
@@ -167,7 +167,7 @@ def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Te
     """Tangential and sagittal MTF (1, K) of a field (2, 1), and whether of rays."""
     if geometric:
         return *_geometric(lens, field, frequencies), True
-    scene = scene_of(lens, field)
+    scene = dataclasses.replace(scene_of(lens, field), memo=Memo(1))  # the beam is aimed and traced once
     sheared = _sheared(scene, frequencies)
     if sheared is not None:
         return *sheared, False

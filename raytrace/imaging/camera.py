@@ -140,7 +140,7 @@ class Camera(nn.Module):
             traced = trace_scene(light, points)
             valid = traced.valid.expand(*light.shape, len(weights))
             rays = gaussian.Light(traced.position[:2].expand(2, *valid.shape), valid, weights, len(weights))
-            centroid, covariance, arrived = gaussian.moments(rays, "none")
+            centroid, covariance, arrived = gaussian.spot_moments(rays, "none")
             mirrored = points * points.new_tensor([[-1.0], [1.0]])
             distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
             if symmetry(light) != "none" and bool((distance < 1e-12).all()):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
 
@@ -41,6 +42,18 @@ def differentiating() -> bool:
     False only under `torch.no_grad()` with no forward derivative; then what serves derivatives alone is left out.
     """
     return torch.is_grad_enabled() or getattr(forward_ad, "_current_level", 0) >= 0
+
+
+def varies(number: Tensor | float | None) -> bool:
+    """Whether a derivative by this number may be requested: backward, forward, or by a transform of torch.func.
+
+    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
+    """
+    if not isinstance(number, Tensor):
+        return False
+    if number.requires_grad or is_functorch_wrapped_tensor(number):
+        return True
+    return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None
 
 
 def with_batch_axes(vector: Tensor, count: int) -> Tensor:

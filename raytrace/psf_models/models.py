@@ -20,7 +20,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import OverBudget, within
 from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
@@ -33,7 +33,7 @@ from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
-from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry, varies
+from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
 from raytrace.words import calling_level
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import torch
 
+from raytrace.io.assembly import by_figures, catalogs_in_folder, catalogs_of_lens, is_code, is_left_out, listed_glass
 from raytrace.io.codev.keywords import unquoted
-from raytrace.io.materials import by_figures, catalogs_in_folder, catalogs_of_lens, is_code, is_left_out, listed_glass
 from raytrace.io.report import FORMULA, Draft
 from raytrace.io.source import LensFileError, Place, Record, double, exact, exact_list, is_number, number, shown
 from raytrace.materials.catalogs import Catalog, UnknownGlass, find_glass, plain_names, same_catalog

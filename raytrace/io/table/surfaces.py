@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from raytrace.io.materials import by_figures, is_code, listed_glass
+from raytrace.io.assembly import by_figures, is_code, listed_glass
 from raytrace.io.report import Draft
 from raytrace.io.source import LensFileError, Place, UnsupportedSurface, double, is_infinite, is_number, number, shown
 from raytrace.io.table.columns import order
