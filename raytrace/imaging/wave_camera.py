@@ -23,14 +23,16 @@ from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
+from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf
-from raytrace.wave_optics.element import Element, Rings
+from raytrace.wave_optics.element import Element, Rings, height
 from raytrace.wave_optics.plan import plan
 from raytrace.wave_optics.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")  # of restoration
 WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
+_BLACK = 1e-5  # of the brightest pixel of a row of kernels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,4 +272,51 @@ class ElementReport(Result):
     kernels: ElementPsf
     quality: Quality
 
-    FIGURE = "plotting.wave_design.element_figure"
+    @styled
+    def draw(self):
+        """Height over the radius, PSNR over depth, kernels over depth and wavelength."""
+        figure = new_figure(9.2, 7.0)
+        top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
+        profile, psnrs = top.subplots(1, 2)
+        radius = self.elements[0].radius
+        r = torch.linspace(0, float(radius) * (1 - 1e-9), 4000, dtype=radius.dtype)
+        for number, element in enumerate(self.elements):
+            h = height(element, r, torch.zeros_like(r)).detach()
+            colour, label = FIELD_COLOURS[number % 3], element.glass.name
+            profile.plot(array(r), 1e3 * array(h - h.min()), lw=0.9, color=colour, label=label)
+        profile.set(xlabel="radius (mm)", ylabel="height (µm)", title="element")
+        profile.legend(fontsize=8)
+        dioptres = [1e3 / depth for depth in self.config.depths]
+        labels = {"wiener": "Wiener, 1 m kernel", "blind": "best depth-invariant filter"}
+        for filter, mark, colour in (("wiener", "o--", FIELD_COLOURS[0]), ("blind", "s-", FIELD_COLOURS[1])):
+            psnrs.plot(dioptres, self.quality.by_depth[filter], mark, ms=4, label=labels[filter], color=colour)
+        mark_depths(psnrs, self.config)
+        psnrs.set(xlabel="object distance", ylabel="PSNR (dB)")
+        psnrs.legend(fontsize=8)
+        _draw_kernels(bottom, self.kernels)
+        return figure
+
+
+def _draw_kernels(figure, psf: ElementPsf) -> None:
+    kernels, (D, W) = array(psf.kernel.detach()), psf.kernel.shape[:2]
+    axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(psf.wavelengths.tolist())
+    half = 1e3 * float(psf.pitch) * kernels.shape[-1] / 2
+    for w in range(W):
+        brightest = kernels[:, w].max()
+        for d in range(D):
+            logarithm = np.log10(np.maximum(kernels[d, w] / brightest, _BLACK))
+            extent = (-half, half, -half, half)
+            axes[w, d].imshow(logarithm, cmap="inferno", vmin=np.log10(_BLACK), vmax=0, extent=extent)
+            axes[w, d].set(xticks=[], yticks=[])
+        axes[w, 0].set_ylabel(f"{1e3 * float(psf.wavelengths[w]):.0f} nm", color=colours[w], fontsize=9)
+    for panel, depth in zip(axes[0], psf.depths.tolist(), strict=True):
+        panel.set_title(depth_text(depth, "∞"), fontsize=9)
+    figure.supxlabel(
+        f"PSFs, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row", fontsize=8
+    )
+
+
+def mark_depths(axes, config: WaveCameraConfig) -> None:
+    """Near objects on the left, even in dioptres."""
+    axes.set_xticks([1e3 / depth for depth in config.depths], [depth_text(depth, "∞") for depth in config.depths])
+    axes.invert_xaxis()

@@ -91,8 +91,6 @@ class Psf(Result):
     finely sampled.
     """
 
-    FIGURE = "plotting.psf.psf_grid"
-
     kernel: Tensor
     grid: Grid
     energy: Tensor
@@ -121,6 +119,12 @@ class Psf(Result):
     def wavelengths_summed(self) -> bool:
         """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
         return self.kernel.dim() == 4
+
+    def draw(self, **options):
+        """The kernels over object distance and field; options: as for `psf_models.figure.psf_grid`."""
+        from raytrace.psf_models.figure import psf_grid
+
+        return psf_grid(self, **options)
 
     def columns(self) -> dict[str, Tensor]:
         """A row for every kernel: mm, widths of the light before pixels."""

@@ -497,9 +497,8 @@ class _Compiled(torch.autograd.Function):
         # The gradient as a graph of its own, through the eager trace.
         end = ctx.again(valid, *inputs)
         ends = (end.position, end.direction, end.opl)
-        outputs, weights = zip(
-            *[pair for pair in zip(ends, cotangents, strict=True) if pair[1] is not None], strict=True
-        )
+        pairs = [pair for pair in zip(ends, cotangents, strict=True) if pair[1] is not None]
+        outputs, weights = zip(*pairs, strict=True)
         wanted = [x if n else None for x, n in zip(inputs, needed, strict=True)]
         leaves = [x for x in wanted if x is not None]
         gradients = iter(torch.autograd.grad(outputs, leaves, weights, create_graph=True, allow_unused=True))

@@ -103,7 +103,7 @@ def check_file(name: str, folder: int) -> None:
 
 @contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new temporary folder for this user alone, removed after the block. Raises Untrusted if others can exchange it."""
+    """A new temporary folder for this user alone, removed after the block. Raises Untrusted."""
     with tempfile.TemporaryDirectory(prefix="raytrace-") as made:
         os.close(open_folder(Path(made).absolute()))
         yield Path(made)
@@ -143,8 +143,8 @@ SOURCES = (
     *("search.h", "careful.h", "adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
-#: Flags that not every compiler, processor or torch supports: tried in this order, the last none. With -fopenmp, threads
-#: are those of the OpenMP that torch has loaded: two OpenMP libraries would wait for each other at full power.
+#: Flags that not every compiler, processor or torch supports: tried in this order, the last none. With -fopenmp,
+#: threads are those of the OpenMP that torch has loaded: two OpenMP libraries would wait for each other at full power.
 _THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
 _TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
 _COMPILERS = ("c++", "g++", "clang++")

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from raytrace.maths.grid import Grid, centres, grid
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height_range
@@ -43,8 +44,6 @@ class ElementPsf(Result):
     axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
     None where it is a pixel of the window.
     """
-
-    FIGURE: ClassVar[str] = "plotting.wave.element_figure"
 
     kernel: Tensor
     scene: WaveScene
@@ -138,6 +137,16 @@ class ElementPsf(Result):
                 *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
             ]
         )
+
+    def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
+        """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
+        if what == "heights":
+            return figures.height_figure(self.scene.elements, title=self.title)
+        if what == "caustic":
+            return figures.caustic_figure(self, *caustic(self.scene, **({"progress": progress} if progress else {})))
+        if what not in ("kernels", "encircled"):
+            raise ValueError(f"no figure {what!r}; expected one of kernels, heights, caustic, encircled")
+        return figures.psf_figure(self) if what == "kernels" else figures.encircled_figure(self)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""

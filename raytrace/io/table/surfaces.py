@@ -15,7 +15,7 @@ from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.environment import Environment
-from raytrace.materials.formulas import MODEL_LINES
+from raytrace.materials.glass import MODEL_LINES
 from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
@@ -38,7 +38,7 @@ def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     """The medium of a row without a named glass; air where no figure is given.
 
     One index alone is constant. n_d, V_d and ΔP_gF are kept unchanged; any other set of figures is met by the model
-    glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.formulas`), on the normal line of glasses where two are
+    glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.glass`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
     given = {name: number(cell, name.replace("_", " "), place) for name, cell in figures(cells).items()}
