@@ -36,7 +36,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_even
 from raytrace.tracing.compiled import prepare
-from raytrace.tracing.compiled.library import NoCompiler, compiler, private_folder, run_compiler
+from raytrace.tracing.compiler import NoCompiler, compiler, private_folder, run_compiler
 from raytrace.tracing.trace import media
 
 #: Ratio, its words in addition to those of `speed.WORDS`, its bound, and whether that is the largest allowed.

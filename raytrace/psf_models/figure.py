@@ -4,26 +4,20 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from raytrace.analysis import Comparison
 from raytrace.maths.grid import Grid
-from raytrace.plotting.panels import field_labels
-from raytrace.plotting.style import GREY, INK, array, bar_on_dark, fill, new_figure, round_length, styled
+from raytrace.plotting.style import GREY, INK, array, bar_on_dark, fill, framed, new_figure, round_length, styled
 from raytrace.psf_models.closeup import CloseUp
 from raytrace.psf_models.closeup import close_up as light_of
 from raytrace.psf_models.result import Psf
+from raytrace.system.lens import field_label
 
 DECADES = 4  # of light on a logarithmic scale
 _MOST_PIXELS = 16  # across a panel, whose edges are drawn
 
 
 @styled
-def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) -> Figure:
+def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
     Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
@@ -33,7 +27,8 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     """
     if close_up is None and not found.framed and found.order is not None:
         close_up = light_of(found)
-    distances, labels = found.object_distances.tolist(), field_labels(found)
+    distances = found.object_distances.tolist()
+    labels = [field_label(found.lens, field) for field in array(found.fields).T]
     if not found.wavelengths_summed:
         labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in found.wavelengths.tolist()]
     title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))
@@ -45,19 +40,19 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     pitch = float(found.grid.pitch)
     half = 0.5 * pitch * found.grid.columns
     if close_up is None:
-        figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
-        return _worded(figure, title, [f"{_window(found.grid)}; max: light of the brightest pixel", _brightness(log)])
+        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+        return worded(figure, title, [f"{window(found.grid)}; max: light of the brightest pixel", brightness(log)])
     drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
-    figure, axes = _panels(drawn, halves, distances, labels, notes, log)
+    figure, axes = panels(drawn, halves, distances, labels, notes, log)
     centre = array(found.grid.centre).reshape(2, *(found.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
         for d, panel in enumerate(row):
             _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
     one = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
-    drawn = f"{one}; energy and brightest pixel (max): of the {_window(found.grid)}, outlined where they lie inside"
-    return _worded(figure, title, [drawn, _brightness(log)])
+    drawn = f"{one}; energy and brightest pixel (max): of the {window(found.grid)}, outlined where they lie inside"
+    return worded(figure, title, [drawn, brightness(log)])
 
 
 def _rows(values: np.ndarray, kept: int) -> np.ndarray:
@@ -66,36 +61,7 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
     return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
 
 
-@styled
-def model_grid(found: Comparison, *, log: bool = False) -> Figure:
-    """Kernels over object distance (columns) and model (rows, with the number of its rays).
-
-    Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
-    log: four decades of brightness below the peak.
-    """
-    kernels = [array(one.kernel)[:, 0] for one in found.psfs]
-    notes = [
-        [
-            f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if one is not kernels[-1] else "")
-            for k, d in zip(one, row, strict=True)
-        ]
-        for one, row in zip(kernels, array(found.difference), strict=True)
-    ]
-    labels = [
-        f"{name}\n" + (f"({one.rays} rays)" if one.rays else "")
-        for name, one in zip(found.models, found.psfs, strict=True)
-    ]
-    grid = found.psfs[-1].grid
-    pitch, distances = float(grid.pitch), found.object_distances.tolist()
-    half = 0.5 * pitch * grid.columns
-    figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
-    title = ": ".join(filter(None, (found.psfs[-1].lens.name, found.sensor)))
-    return _worded(
-        figure, title, [_window(grid), _brightness(log), f"Δ: relative L¹ difference from {found.models[-1]}"]
-    )
-
-
-def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figure, np.ndarray]:
+def panels(kernels, halves, distances, labels, notes, log: bool):
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
     Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
@@ -115,10 +81,8 @@ def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figur
         panel.imshow(
             kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
         )
-        panel.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
-        for spine in panel.spines.values():
-            spine.set_visible(True)
-            spine.set_color(GREY)
+        framed(panel)
+        panel.set(xlim=extent[:2], ylim=extent[2:])
         panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
         if not alike or (row, column) == (0, 0):
             bar_on_dark(panel, -0.88 * half, -0.86 * tall, round_length(0.5 * half))
@@ -133,14 +97,16 @@ def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figur
     return figure, axes
 
 
-def _norm(kernel: np.ndarray, log: bool) -> Normalize:
+def _norm(kernel: np.ndarray, log: bool):
     """Brightness from 0, or four decades below, to the peak."""
+    from matplotlib.colors import LogNorm, Normalize
+
     peak = float(kernel.max())
     peak = peak if peak > 0 else 1.0
     return LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
 
 
-def _brightness(log: bool) -> str:
+def brightness(log: bool) -> str:
     return (
         f"each panel from {10.0**-DECADES:g} of its own peak, logarithmic"
         if log
@@ -148,8 +114,11 @@ def _brightness(log: bool) -> str:
     )
 
 
-def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
+def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
     """Outline the window of a kernel about a centre (2,) mm; and its pixels, where a panel holds only a few."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
+
     (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
     corner = centre - 0.5 * pitch * np.array([columns, rows])
     if pitch * _MOST_PIXELS >= high - low:
@@ -167,7 +136,7 @@ def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, ro
     panel.set(xlim=(low, high), ylim=(bottom, top))
 
 
-def _worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
+def worded(figure, title: str, said: Sequence[str]):
     """The title above and one caption below, both in lines that fit."""
     width = figure.get_figwidth()
     figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)
@@ -175,7 +144,7 @@ def _worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
     return figure
 
 
-def _window(grid: Grid) -> str:
+def window(grid: Grid) -> str:
     pitch = 1e3 * float(grid.pitch)
     return f"window of {pitch * grid.columns:.3g} µm, {grid.columns} × {grid.rows} pixels of {pitch:.3g} µm"
 

@@ -2,13 +2,11 @@
 
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, PowerNorm, to_rgb
-from matplotlib.figure import Figure
+from torch import Tensor
 
 from raytrace.maths.grid import centres
 from raytrace.plotting.style import (
@@ -17,12 +15,12 @@ from raytrace.plotting.style import (
     array,
     bar_on_dark,
     field_colour,
+    framed,
     new_figure,
     round_length,
     styled,
     wavelength_colours,
 )
-from raytrace.wave_optics.compute import ElementPsf, Progress, caustic
 from raytrace.wave_optics.element import Element, height, is_flat, is_smooth
 
 _GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
@@ -31,12 +29,14 @@ _ACROSS = 700  # points across a disc of heights
 
 
 @styled
-def psf_figure(found: ElementPsf) -> Figure:
+def psf_figure(found):
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
     share of the light, on one scale for the row. Below each: the light inside the window and its peak.
     """
+    from matplotlib.colors import PowerNorm
+
     kernels, energy, peak = array(found.kernel), array(found.energy), array(found.peak)
     wavelengths = found.wavelengths.tolist()
     colours, together = wavelength_colours(wavelengths), len(wavelengths) > 1
@@ -74,7 +74,7 @@ def psf_figure(found: ElementPsf) -> Figure:
 
 
 @styled
-def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
+def height_figure(elements: Sequence[Element], *, title: str = ""):
     """The heights of elements in contact as they are made, a row for each: the disc, the profile along x, and the rim
     of one that has steps."""
     figure = new_figure(7.6, 3.1 * len(elements))
@@ -99,7 +99,7 @@ def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
     return figure
 
 
-def _disc(axes: Axes, element: Element) -> None:
+def _disc(axes, element: Element) -> None:
     """Height over the aperture as a map."""
     R = float(element.radius)
     line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
@@ -119,12 +119,13 @@ def _kind(element: Element) -> str:
 
 
 @styled
-def caustic_figure(found: ElementPsf, *, progress: Progress | None = None) -> Figure:
-    """Light per mm² over the distance behind the element, logarithmic (`wave_optics.compute.caustic`).
+def caustic_figure(found, light: Tensor, distances: Tensor, half: float):
+    """Light per mm² over the distance behind the element, logarithmic; arguments: of `wave_optics.compute.caustic`.
 
     A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
     """
-    light, distances, half = caustic(found.scene, **({"progress": progress} if progress else {}))
+    from matplotlib.colors import LogNorm
+
     values, z = array(light), array(distances)
     wavelengths, depths = found.wavelengths.tolist(), found.depths.tolist()
     colours = wavelength_colours(wavelengths)
@@ -150,7 +151,7 @@ def caustic_figure(found: ElementPsf, *, progress: Progress | None = None) -> Fi
 
 
 @styled
-def encircled_figure(found: ElementPsf) -> Figure:
+def encircled_figure(found):
     """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
     x, y = (array(line) for line in centres(found.grid))
     radius = np.hypot(x, y[:, None]).ravel()
@@ -177,23 +178,7 @@ def encircled_figure(found: ElementPsf) -> Figure:
     return figure
 
 
-#: What can be drawn of what `wave_psf` gives: (it) -> figure.
-FIGURES: dict[str, Callable[..., Figure]] = {
-    "kernels": psf_figure,
-    "heights": lambda found: height_figure(found.scene.elements, title=found.title),
-    "caustic": caustic_figure,
-    "encircled": encircled_figure,
-}
-
-
-def element_figure(found: ElementPsf, *, what: str = "kernels", progress: Progress | None = None) -> Figure:
-    """One of FIGURES of what `wave_psf` gives; progress: of a caustic."""
-    if what not in FIGURES:
-        raise ValueError(f"no figure {what!r}; expected one of {', '.join(FIGURES)}")
-    return FIGURES[what](found, **({"progress": progress} if progress and what == "caustic" else {}))
-
-
-def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
+def _profile(panel, element: Element, first: float, last: float) -> None:
     """h(x) at y = 0 as a line."""
     x = torch.linspace(first, last, 4001, dtype=element.radius.dtype)
     with torch.no_grad():
@@ -203,8 +188,10 @@ def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
     panel.grid(True, color=FAINT, linewidth=0.5)
 
 
-def _dark(colour: str | tuple[float, float, float]) -> Colormap:
+def _dark(colour: str | tuple[float, float, float]):
     """From black through a colour to white: what is as bright as the peak is white, as on film."""
+    from matplotlib.colors import LinearSegmentedColormap, to_rgb
+
     return LinearSegmentedColormap.from_list("light", [(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")])
 
 
@@ -218,15 +205,7 @@ def _mixed(kernels: np.ndarray, wavelengths: Sequence[float]) -> np.ndarray:
     return np.moveaxis((np.clip(picture, 0, None) / (peak if peak > 0 else 1)) ** _GAMMA, 0, -1)
 
 
-def framed(panel: Axes) -> None:
-    panel.set_xticks([])
-    panel.set_yticks([])
-    for spine in panel.spines.values():
-        spine.set_visible(True)
-        spine.set_color(GREY)
-
-
-def _bar(panel: Axes, found: ElementPsf) -> None:
+def _bar(panel, found) -> None:
     """A bar of a round length in the corner of a kernel."""
     pitch, columns = float(found.pitch), found.grid.columns
     length = round_length(0.35 * pitch * columns)

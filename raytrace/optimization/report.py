@@ -2,17 +2,23 @@
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from raytrace.optimization.result import STOPPED, Optimized
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.analysis.panels import first_order_text
+from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
+from raytrace.maths.value import detached
 from raytrace.plotting import style
-from raytrace.plotting.layout import draw_layout, on_one_scale
-from raytrace.plotting.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
-from raytrace.system.lens import Lens
-from raytrace.tracing.paraxial import first_order
+from raytrace.system.lens import Lens, field_label
 
+#: Why a descent ends, by `Optimized.stopped`.
+STOPPED = {
+    "gradient": "no variable makes the merit any less",
+    "step": "no step makes the merit any less",
+    "merit": "the merit hardly changes any more",
+    "cycles": "the limit on cycles was reached",
+    "seconds": "as much time as was asked for",
+    "interrupted": "interrupted; this is the best so far",
+}
 _MOST_FIELDS = 5
 _MOST_BARS = 10
 _MOST_CONFIGURATIONS = 4
@@ -20,7 +26,7 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 
 @style.styled
-def optimize_report(found: Optimized) -> Figure:
+def optimize_report(found):
     """One page: the lens and its spots before and after in its configurations, on one scale, the merit by cycle, the
     operands that are left, and what conditions and boundaries asked for and reached."""
     each, conditions = _configurations(found), found.shown_conditions()
@@ -46,18 +52,18 @@ def optimize_report(found: Optimized) -> Figure:
     return figure
 
 
-def _configurations(found: Optimized) -> list[tuple[str, Lens, Lens]]:
+def _configurations(found) -> list[tuple[str, Lens, Lens]]:
     """The configurations that are drawn, spread over all: label, before and after; one alone has no label."""
     pairs = [*zip(found.before.configurations, found.lens.configurations, strict=True)]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_CONFIGURATIONS)).round().astype(int))
     several = len(pairs) > 1
     return [
-        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(style.detached(one) for one in pairs[k]))
+        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(detached(one) for one in pairs[k]))
         for k in chosen.tolist()
     ]
 
 
-def _draw_conditions(axes: Axes, found: Optimized) -> None:
+def _draw_conditions(axes, found) -> None:
     """The table of what was asked for and what was reached, what is not met in red."""
     lines, shown = found.conditions_in_words(), found.shown_conditions()
     axes.axis("off")
@@ -70,11 +76,11 @@ def _draw_conditions(axes: Axes, found: Optimized) -> None:
         )  # fmt: skip
 
 
-def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
+def _draw_lens(axes, lens: Lens, title: str) -> None:
     draw_layout(axes, lens, fields=drawn_fields(lens), rays=5)
     axes.set_title(f"{title}\n", fontweight="bold", pad=4)
     axes.annotate(
-        style.first_order_text(lens, first_order(lens)), (0.5, 1.0), (0, 5), xycoords="axes fraction",
+        first_order_text(lens), (0.5, 1.0), (0, 5), xycoords="axes fraction",
         textcoords="offset points", ha="center", fontsize=7.5, color=style.GREY,
     )  # fmt: skip
 
@@ -108,16 +114,16 @@ def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
             draw_spot_to_scale(panel, whole, dots, f, **look)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
-                panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
+                panel.set_title(field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
         row[0].set_ylabel(f"Spots {when}" + (f"\n{label}" if label else ""), fontweight="bold")
     page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
 
 
-def _draw_history(axes: Axes, found: Optimized) -> None:
+def _draw_history(axes, found) -> None:
     merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
     _scale_merit(axes, merit)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.locator_params(axis="x", integer=True)
     axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
     axes.set_ylabel("merit")
     axes.set_title("Merit function", fontweight="bold")
@@ -127,7 +133,7 @@ def _draw_history(axes: Axes, found: Optimized) -> None:
     axes.grid(alpha=0.25)
 
 
-def _scale_merit(axes: Axes, merit: np.ndarray) -> None:
+def _scale_merit(axes, merit: np.ndarray) -> None:
     """Logarithmic over more than a factor of three; else even, about a value that is told where the change is small."""
     least, most = float(np.min(merit)), float(np.max(merit))
     if least > 0 and most > 3 * least:
@@ -138,7 +144,7 @@ def _scale_merit(axes: Axes, merit: np.ndarray) -> None:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=True)
 
 
-def _draw_left(axes: Axes, found: Optimized) -> None:
+def _draw_left(axes, found) -> None:
     """What the square of the merit is made of now, and was."""
     shares: dict[str, np.ndarray] = {}
     for i, name in _groups(found):
@@ -155,7 +161,7 @@ def _draw_left(axes: Axes, found: Optimized) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
 
 
-def _groups(found: Optimized) -> list[tuple[int, str]]:
+def _groups(found) -> list[tuple[int, str]]:
     """Rows with weight and the names of their bars: each its own, or by operand and field, or by operand, if few."""
     counts = [i for i in found.rows if found.merit[i - 1].weight != 0]
     rows = {i: found.merit[i - 1] for i in counts}

@@ -1,26 +1,25 @@
 """What figures of curves share: ruled panels, titles and legends, and the curves of every wavelength or field."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from raytrace.maths.result import masked
+from raytrace.maths.result import masked, object_text
 from raytrace.plotting.style import (
     GREY,
     INK,
     array,
     field_colours,
-    field_label,
-    field_title,
     fill,
+    length_text,
     new_figure,
     number_text,
     wavelength_colours,
 )
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_label, field_title
+from raytrace.tracing.paraxial import first_order
 
 #: Dashes of wavelengths, in order, for readers who do not tell their colours apart; and of sagittal curves.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
@@ -29,7 +28,7 @@ SAGITTAL = (0, (4, 2))
 _FEW = 5  # fields that are drawn as points, for a line of one would not be seen
 
 
-def by_wavelength(panel: Axes, found, x: np.ndarray, y: np.ndarray, *, suffix="", dashes=DASHES, **look) -> None:
+def by_wavelength(panel, found, x: np.ndarray, y: np.ndarray, *, suffix="", dashes=DASHES, **look) -> None:
     """A curve of every wavelength in its colour, x or y (N, W); dashes: one after another; look: of all lines."""
     for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
         places = (values[:, w] if values.ndim == 2 else values for values in (x, y))
@@ -37,7 +36,7 @@ def by_wavelength(panel: Axes, found, x: np.ndarray, y: np.ndarray, *, suffix=""
         panel.plot(*places, label=wavelength_label(found, w) + suffix, color=colour, linestyle=dash, **look)
 
 
-def by_field(panel: Axes, found, x: np.ndarray, **curves: np.ndarray) -> None:
+def by_field(panel, found, x: np.ndarray, **curves: np.ndarray) -> None:
     """Curves (F, N) of every field in its colour, the first solid, the second dashed; the legend names them if two."""
     drawn = [*zip(curves, ("solid", SAGITTAL), strict=False)]
     for f, (label, colour) in enumerate(zip(field_labels(found), field_colours(found.fields.shape[1]), strict=True)):
@@ -48,18 +47,18 @@ def by_field(panel: Axes, found, x: np.ndarray, **curves: np.ndarray) -> None:
         panel.plot([], [], color=INK, linewidth=1.2, linestyle=dash, label=name)
 
 
-def mark_fields(panel: Axes, x: np.ndarray, *curves: np.ndarray) -> None:
+def mark_fields(panel, x: np.ndarray, *curves: np.ndarray) -> None:
     """What was asked for on curves (F, N) of fields."""
     for f, colour in enumerate(field_colours(len(curves[0]))):
         for values in curves:
             marks(panel, x, values[f], colour)
 
 
-def marks(panel: Axes, x: np.ndarray, y: np.ndarray, colour) -> None:
+def marks(panel, x: np.ndarray, y: np.ndarray, colour) -> None:
     panel.plot(x, y, "o", color=colour, markersize=3.5, clip_on=False, zorder=4)
 
 
-def over_field(panel: Axes, found, values: Tensor, **options) -> None:
+def over_field(panel, found, values: Tensor, **options) -> None:
     """Curves (F, W) drawn upwards over the field, as lens designers do; options: as for `by_wavelength`."""
     ruled(panel)
     order = np.argsort(field_axis(found), kind="stable")
@@ -80,7 +79,7 @@ def seen(values: Tensor, valid: Tensor) -> np.ndarray:
     return array(masked(values, valid))
 
 
-def drawn_at_least(axes: Iterable[Axes], floor: float, along: str) -> None:
+def drawn_at_least(axes: Iterable, floor: float, along: str) -> None:
     """Keep axes of one scale from magnifying rounding: where no curve passes the floor, they end there and say so."""
     panels = list(axes)
     curves = [line for panel in panels for line in panel.lines if not line.get_label().startswith("_")]  # no rulers
@@ -110,7 +109,18 @@ def wavelength_label(found, w: int) -> str:
     return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
 
 
-def chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
+def first_order_text(lens: Lens) -> str:
+    """`EFL 99.51 mm · F/2.99 · object at 25.00 m`, as a subtitle."""
+    data, distance, parts = first_order(lens), float(lens.surfaces[0].thickness), []
+    if math.isfinite(focal_length := float(data.effective_focal_length)):
+        parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(data.f_number), 3)}"]
+    parts.append(f"object at {object_text(distance)}")
+    if math.isfinite(distance) and math.isfinite(working := float(data.paraxial_working_f_number)):
+        parts.append(f"working F/{number_text(working, 3)}")
+    return "  ·  ".join(parts)
+
+
+def chart(width: float, height: float, x: str, y: str):
     """A figure of one ruled panel, its axes named."""
     figure = new_figure(width, height)
     panel = ruled(figure.add_subplot())
@@ -119,13 +129,13 @@ def chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
     return figure, panel
 
 
-def ruled(panel: Axes) -> Axes:
+def ruled(panel):
     panel.grid(color="#ececec", linewidth=0.6, zorder=0)
     panel.set_axisbelow(True)
     return panel
 
 
-def finished(panel: Axes, found, what: str, columns: int = 0) -> Figure:
+def finished(panel, found, what: str, columns: int = 0):
     """The figure of a panel with its title, and a legend of so many columns below it."""
     figure, name = panel.figure, found.lens.name
     if columns:

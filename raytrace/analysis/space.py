@@ -4,13 +4,11 @@ import math
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import proj3d
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from torch import Tensor
 
+from raytrace.analysis import outline
 from raytrace.maths.pupil import fan
-from raytrace.plotting import outline, style
+from raytrace.plotting import style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, sag_at
@@ -22,7 +20,7 @@ _LEAD = 0.14  # of the size of the system: how far in front of it rays of a far 
 _MIRROR = "#b9c2ca"
 
 
-def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> Figure:
+def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
     """Surfaces as shaded meshes, glass with its edge, and the rays of both fans: z to the right, y upward."""
     figure = style.new_figure(7.5, 6.0)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
@@ -80,6 +78,18 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
     return np.concatenate([mesh.reshape(3, -1) for mesh in meshes.values()], axis=1)
 
 
+def _add_tiles(axes, tiles, **look) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    axes.add_collection3d(Poly3DCollection(tiles, **look))
+
+
+def _add_lines(axes, lines, **look) -> None:
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    axes.add_collection3d(Line3DCollection(lines, **look))
+
+
 def _shade(axes, mesh: np.ndarray, colour, alpha: float) -> None:
     p = _seen(mesh)
     tiles = [
@@ -87,19 +97,19 @@ def _shade(axes, mesh: np.ndarray, colour, alpha: float) -> None:
         for i in range(p.shape[1] - 1)
         for j in range(p.shape[2] - 1)
     ]
-    axes.add_collection3d(Poly3DCollection(tiles, facecolor=colour, edgecolor="none", alpha=alpha, shade=False))
+    _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=alpha, shade=False)
 
 
 def _edge(axes, front: np.ndarray, back: np.ndarray, colour) -> None:
     """The ground edge of glass, from rim to rim."""
     a, b = _seen(front[:, -1]), _seen(back[:, -1])
     tiles = [np.stack([a[:, j], b[:, j], b[:, j + 1], a[:, j + 1]]) for j in range(a.shape[1] - 1)]
-    axes.add_collection3d(Poly3DCollection(tiles, facecolor=colour, edgecolor="none", alpha=0.25, shade=False))
+    _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=0.25, shade=False)
 
 
 def _rim(axes, mesh: np.ndarray, colour: str, width: float) -> None:
     lines = [_seen(mesh[:, -1]).T, *([_seen(mesh[:, 0]).T] if np.ptp(mesh[:, 0], axis=1).max() > 0 else [])]
-    axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=width))
+    _add_lines(axes, lines, colors=colour, linewidths=width)
 
 
 def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int, start: float) -> list[np.ndarray]:
@@ -112,7 +122,7 @@ def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int,
         for colour, paths in zip(row, found, strict=True):
             whole = [path.points for path in paths if path.status == "ok"]
             lines = [_seen(path).T for path in whole]
-            axes.add_collection3d(Line3DCollection(lines, colors=[colour], linewidths=0.7, alpha=0.9))
+            _add_lines(axes, lines, colors=[colour], linewidths=0.7, alpha=0.9)
             arrived += whole
     return arrived
 
@@ -129,9 +139,7 @@ def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
     u = frame.origin.new_tensor([-half, half, half, -half]) + middle[0]
     v = frame.origin.new_tensor([-half, -half, half, half]) + middle[1]
     corners = style.array(frame.outside(torch.stack([u, v, torch.zeros_like(u)])))
-    axes.add_collection3d(
-        Poly3DCollection([_seen(corners).T], facecolor="#f6f0d8", edgecolor=style.INK, linewidths=1.2, alpha=0.7)
-    )
+    _add_tiles(axes, [_seen(corners).T], facecolor="#f6f0d8", edgecolor=style.INK, linewidths=1.2, alpha=0.7)
     return corners
 
 
@@ -154,6 +162,8 @@ def _fill_page(axes, points: np.ndarray, span: np.ndarray) -> None:
 def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
     """Width and height in dots of what points (3, N) need about the middle of the box."""
     axes.apply_aspect()
+    from mpl_toolkits.mplot3d import proj3d
+
     x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
     (left, low), (right, high) = axes.viewLim.get_points()  # the middle of the box stands at (0, 0)
     dots = axes.bbox.width / (right - left), axes.bbox.height / (high - low)

@@ -1,65 +1,139 @@
 """Layout: the cross section of a lens, from the side or from above, with the rays of its fields."""
 
+import html
+import io
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from torch import Tensor
 
+from raytrace.analysis import outline, space
+from raytrace.analysis.panels import first_order_text
 from raytrace.maths.pupil import fan, hexapolar
-from raytrace.plotting import outline, space, style
+from raytrace.maths.result import Result, numbers
+from raytrace.maths.value import detached, value
+from raytrace.plotting import style
 from raytrace.system.apertures import reach
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_label,
+    field_points,
+    field_title,
+    name_of_field,
+    wavelengths_of,
+)
 from raytrace.system.phases import IdealLens
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import edge_radius
-from raytrace.tracing.launch import launch, stop_radius
-from raytrace.tracing.lens_report import ALL, Layout
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.geometry import edge_radius, warn_of_defects
+from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
+from raytrace.tracing.lens_report import Info, text
 from raytrace.tracing.trace import media, trace_lens
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
 
 
-@style.styled
-def layout(found: Layout) -> Figure:
-    """The lens in cross section, or in space: glass filled by index, mirrors hatched, the stop marked, rays by field.
+#: From where a lens is looked at.
+VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
 
-    Rays are those of the primary wavelength, or coloured by wavelength where several are asked for. Lost ones are drawn
-    faint and dashed up to where they are lost, with a cross where a surface is missed or reflects totally. A folded
-    system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
+
+#: All configurations of a lens, drawn together.
+ALL = "all"
+
+
+@value
+class Layout(Result):
+    """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
+
+    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
+    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
     """
-    lens, fields = style.detached(found.lens), found.fields.detach()
-    wavelengths = lens.primary[None] if found.wavelengths is None else found.wavelengths
-    if found.configuration == ALL:
-        return _superimposed(found, lens.configurations, fields, wavelengths.detach())
-    if found.view == "3d":
-        return _finished(space.draw(lens, fields, wavelengths.detach(), found.rays), lens, fields, wavelengths, 7.5)
-    figure = style.new_figure(8.0, 4.0)
-    axes, spectrum = figure.add_subplot(), None
-    if len(wavelengths) > 1:
-        figure.delaxes(axes)
-        axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
-    draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=found.rays, view=found.view)
-    (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    shape = (y1 - y0) / (z1 - z0)
-    width = min(max(6.0 / shape, 5.5), 8.0)
-    height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
-    if spectrum is not None:
-        width, height = 1.2 * width, max(height, 3.6)
-        _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
-    figure.set_size_inches(width, height)
-    axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
-    return _finished(figure, lens, fields, wavelengths, width)
+
+    lens: Lens
+    fields: Tensor
+    rays: int = 7
+    view: str = "yz"
+    wavelengths: Tensor | None = None
+    configuration: str | None = None
+    has_fields: bool = True
+
+    def document(self) -> dict:
+        return {"fields": [numbers(point) for point in self.fields.unbind(1)]}
+
+    def __str__(self) -> str:
+        points = ", ".join(map(name_of_field, self.fields.unbind(1)))
+        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
+
+    @style.styled
+    def draw(self):
+        """The lens in cross section or in space: glass filled by index, mirrors hatched, the stop marked.
+
+        Rays are those of the primary wavelength, coloured by field, or coloured by wavelength where several are
+        given. Failed and vignetted rays are faint and dashed and end at their last surface, with a cross where they
+        miss it or are totally reflected. A folded system is drawn in its real geometry.
+        Raises ValueError for a lens with an infinite thickness inside.
+        """
+        lens, fields = detached(self.lens), self.fields.detach()
+        wavelengths = lens.primary[None] if self.wavelengths is None else self.wavelengths
+        if self.configuration == ALL:
+            return _superimposed(self, lens.configurations, fields, wavelengths.detach())
+        if self.view == "3d":
+            return _finished(space.draw(lens, fields, wavelengths.detach(), self.rays), lens, fields, wavelengths, 7.5)
+        figure = style.new_figure(8.0, 4.0)
+        axes, spectrum = figure.add_subplot(), None
+        if len(wavelengths) > 1:
+            figure.delaxes(axes)
+            axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
+        draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=self.rays, view=self.view)
+        (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+        shape = (y1 - y0) / (z1 - z0)
+        width = min(max(6.0 / shape, 5.5), 8.0)
+        height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
+        if spectrum is not None:
+            width, height = 1.2 * width, max(height, 3.6)
+            _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
+        figure.set_size_inches(width, height)
+        axes.set_title(first_order_text(lens), fontsize=8.5, color=style.GREY, pad=4)
+        return _finished(figure, lens, fields, wavelengths, width)
 
 
-def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor) -> Figure:
+def layout(
+    lens: Lens,
+    *,
+    fields: Tensor | Sequence | None = None,
+    rays: int = 7,
+    view: str = "yz",
+    wavelengths: Tensor | Sequence[float] | None = None,
+    configuration: int | str | None = None,
+) -> Layout:
+    """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
+
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
+    in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
+    coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
+    configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made. Raises ValueError for a view or a
+    configuration that there is not.
+    """
+    if view not in VIEWS:
+        raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
+    if configuration == ALL and view == "3d":
+        raise ValueError("`view=3d`: shows one configuration; `configuration=all` is drawn from the side or from above")
+    if configuration not in (None, ALL):
+        lens = lens.configuration(configuration)
+    chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
+    for one in lens.configurations if configuration == ALL else (lens,):
+        warn_of_defects(one)
+    every = ALL if configuration == ALL else None
+    points = field_points(fields, like=lens)
+    warn_of_filling(lens, points)
+    return Layout(lens, points, rays, view, chosen, every, fields is not None)
+
+
+def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor):
     """The lens in all its configurations in one cross section, rays coloured by configuration."""
     figure, colours = style.new_figure(8.0, 4.0), style.field_colours(len(lenses))
     axes = figure.add_subplot()
@@ -72,15 +146,15 @@ def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelen
     width = min(max(6.0 * shape[1] / shape[0], 5.5), 8.0)
     figure.set_size_inches(width, min(max(0.98 * width * shape[0] / shape[1], 1.2), 6.0) + 1.1)
     figure.suptitle(style.fill(lenses[0].name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
-    handles = [Line2D([], [], color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
+    handles = [style.legend_entry(color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
     figure.legend(
-        handles=[Line2D([], [], linestyle="", label="Configuration"), *handles],
+        handles=[style.legend_entry(linestyle="", label="Configuration"), *handles],
         loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
 
 
-def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
+def _draw_spectrum(axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
     """Where rays of every wavelength land on the image."""
     points = hexapolar(4, dtype=wavelengths.dtype, device=wavelengths.device)[0]
     end = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelengths), wavelengths[:, None])
@@ -97,25 +171,25 @@ def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) 
     axes.set_title("on the image", fontsize=8.5, color=style.GREY, pad=4)
 
 
-def _finished(figure: Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float) -> Figure:
+def _finished(figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float):
     """The figure with its title and its legend: fields, or wavelengths where there are several."""
     figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     if len(wavelengths) > 1:
         title, labels = "Wavelength", [f"{float(wavelength):g} µm" for wavelength in wavelengths]
     else:
-        title, labels = style.field_title(lens), [style.field_label(lens, field) for field in style.array(fields).T]
+        title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T]
     colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
     colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
-    handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
+    handles = [style.legend_entry(color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
     figure.legend(
-        handles=[Line2D([], [], linestyle="", label=title), *handles],
+        handles=[style.legend_entry(linestyle="", label=title), *handles],
         loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
 
 
 def draw_layout(
-    axes: Axes,
+    axes,
     lens: Lens,
     *,
     fields: Tensor,
@@ -128,7 +202,7 @@ def draw_layout(
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
 
 
-def on_one_scale(panels: Sequence[Axes]) -> None:
+def on_one_scale(panels: Sequence) -> None:
     """Give cross sections in axes of one size the same scale: each stays in the middle of what it shows."""
     limits = [(panel.get_xlim(), panel.get_ylim()) for panel in panels]
     width, height = (max(abs(one[k][1] - one[k][0]) for one in limits) for k in (0, 1))
@@ -147,7 +221,7 @@ class _Drawn(NamedTuple):
 
 
 def _drawn(
-    axes: Axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
+    axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
 ) -> _Drawn:
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
@@ -180,7 +254,7 @@ def _drawn(
     return _Drawn(places, outline.is_bent(lens), (min(first, start), last), heights)
 
 
-def _framed(axes: Axes, drawn: Sequence[_Drawn]) -> None:
+def _framed(axes, drawn: Sequence[_Drawn]) -> None:
     """The frame of one cross section, or of several in each other's place."""
     if any(one.is_bent for one in drawn):
         _frame_bent(axes, [one.places for one in drawn])
@@ -208,9 +282,7 @@ def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> flo
     return float(min(0.0, *places[1].at(outline.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 
 
-def _draw_glass(
-    axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]
-) -> None:
+def _draw_glass(axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]) -> None:
     for k in range(1, len(places) - 1):
         if indices[k] <= outline.GLASSY or lens.surfaces[k].is_break:
             continue
@@ -223,7 +295,7 @@ def _draw_glass(
             _draw_thin(axes, lens.surfaces[k], places[k], radii[k])
 
 
-def _draw_thin(axes: Axes, surface: Surface, place: outline.Section, radius: float) -> None:
+def _draw_thin(axes, surface: Surface, place: outline.Section, radius: float) -> None:
     """A thin structure: a line along the surface, with arrows at the ends of an ideal lens."""
     height = np.linspace(-radius, radius, 81)
     line = place.at(outline.depth(surface, height, place.direction), height)
@@ -238,7 +310,7 @@ def _draw_thin(axes: Axes, surface: Surface, place: outline.Section, radius: flo
             axes.plot(*corners, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
+def _draw_mirrors(axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
     bent = outline.is_bent(lens)
     for k, side in enumerate(outline.sides(lens)):
         surface = lens.surfaces[k]
@@ -261,7 +333,7 @@ def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: 
             axes.plot(*front, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
 
 
-def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_apertures(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
@@ -284,7 +356,7 @@ def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_stop(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
     surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
     radius = float(stop_radius(lens))
@@ -298,7 +370,7 @@ def _draw_stop(axes: Axes, lens: Lens, places: list[outline.Section], radii: lis
         axes.fill(*corners, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
 
 
-def _draw_rays(axes: Axes, paths, colours) -> None:
+def _draw_rays(axes, paths, colours) -> None:
     for field, colour in zip(paths, colours, strict=True):
         for path in field:
             if path.status == "ok":
@@ -311,7 +383,7 @@ def _draw_rays(axes: Axes, paths, colours) -> None:
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
 
-def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
+def _draw_sensor(axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
     """The image surface, as far as the rays need it; returns its half height in mm."""
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
@@ -325,7 +397,7 @@ def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[flo
     return half
 
 
-def _draw_object(axes: Axes, lens: Lens, place: outline.Section, paths) -> None:
+def _draw_object(axes, lens: Lens, place: outline.Section, paths) -> None:
     heights = [abs(path.y[0]) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
@@ -340,7 +412,7 @@ def _ray_heights(paths) -> tuple[float, float]:
     return (float(np.concatenate(y).min()), float(np.concatenate(y).max())) if y else (0.0, 0.0)
 
 
-def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
+def _frame(axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
     """Optical axis, limits and scale bar."""
     length = extent[1] - extent[0]
     margin = 0.025 * length
@@ -355,7 +427,7 @@ def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]
     axes.axis("off")
 
 
-def _frame_bent(axes: Axes, ways: Sequence[Sequence[outline.Section]]) -> None:
+def _frame_bent(axes, ways: Sequence[Sequence[outline.Section]]) -> None:
     """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
     axes.relim()
     for patch in axes.patches:
@@ -372,3 +444,15 @@ def _frame_bent(axes: Axes, ways: Sequence[Sequence[outline.Section]]) -> None:
     axes.set_xlim(left - 0.025 * size, right + 0.025 * size)
     axes.set_ylim(bottom - 0.03 * size, high + 0.025 * size)
     axes.axis("off")
+
+
+def page(lens: Lens) -> str:
+    """A lens in a notebook: HTML of its cross section and its prescription, or plain text if it cannot be traced."""
+    try:
+        title, drawing = first_order_text(lens), io.StringIO()
+        layout(lens).plot().savefig(drawing, format="svg")
+        table = Info(lens).to_frame().to_html(index=False, float_format="{:.7g}".format, na_rep="")
+    except (ValueError, RuntimeError):
+        return f"<pre>{html.escape(text(lens))}</pre>"
+    svg = drawing.getvalue()
+    return f"<b>{html.escape(lens.name or 'Lens')}</b><br>{html.escape(title)}{svg[svg.index('<svg') :]}{table}"

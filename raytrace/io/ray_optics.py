@@ -26,8 +26,7 @@ from typing import NamedTuple
 
 import torch
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble
-from raytrace.io.materials import listed_glass
+from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, listed_glass
 from raytrace.io.report import IGNORED, READ, Draft
 from raytrace.io.source import MAX_SURFACES, LensFileError, Place, UnsupportedSurface, double, shown
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index

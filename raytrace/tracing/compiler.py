@@ -1,25 +1,13 @@
-"""Choice: which trace carries a batch of rays, torch's own operators ("eager") or the compiled one ("compiled").
-
-The program chooses by what is there and what pays; `trace_engine` and the environment variable RAYTRACE_TRACE force
-either.
-
-
-Trust: what may be executed is what nobody but this user, and root, can have written.
-
-A folder is reached from the root step by step, each step checked on the opened folder itself and links followed by
-hand, so that nobody can swap one meanwhile. Known from ssh's StrictModes and from Tsafrir et al., "Portably solving
-file TOCTTOU races with hardness amplification" (2008): behind a path of safe folders there is no race.
-
-
-Library: the C++ of this folder, compiled once for this machine and kept on disk for every process after.
+"""The C++ of `cpp/`, compiled once for this machine and kept on disk for every later process.
 
 The name of the kept file is a digest of the sources, the flags, the compiler and the processor, so that none of them
-can change unnoticed. Nothing else is built, whatever the lens: its structure is data to the compiled trace.
+can change unnoticed. Nothing else is compiled, whatever the lens: its structure is data to the compiled trace.
 
+Only files that this user or root alone can have written are executed. A folder is reached from the root step by step,
+each step checked on the opened folder and links followed by hand, so that nobody can exchange one meanwhile: as ssh's
+StrictModes, and Tsafrir et al., "Portably solving file TOCTTOU races with hardness amplification" (2008).
 """
 
-import contextlib
-import contextvars
 import ctypes
 import errno
 import functools
@@ -39,106 +27,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
-from torch import Tensor
-from torch.autograd import forward_ad
-
-from raytrace.system.rays import Rays
-
-ENGINES = ("auto", "eager", "compiled")
-
-WORTH_COMPILING = 2**23  # rays × surfaces of one call: it takes torch 0.3 s, and compiling, once for a machine, 10 s
-
-_engine: contextvars.ContextVar[str | None] = contextvars.ContextVar("engine", default=None)
-_refused: list[str] = []
-
-
-@contextlib.contextmanager
-def trace_engine(engine: str) -> Iterator[None]:
-    """Within the block, trace by this engine: "eager", "compiled" or "auto".
-
-    "auto", the default, takes the compiled trace for tensors on the CPU where it has been compiled already, compiles
-    it for a batch that is worth it, and else falls back to eager. "compiled" raises NoCompiler where it cannot be had,
-    but still leaves to torch what it has no form for: other devices, forward derivatives, transforms of torch.func,
-    height maps, kinds of sag that are not compiled, and Fresnel lenses but of even aspheres.
-    Raises ValueError for another name.
-    """
-    token = _engine.set(_checked(engine, "trace_engine"))
-    try:
-        yield
-    finally:
-        _engine.reset(token)
-
-
-def engine() -> str:
-    """The engine asked for: by `trace_engine`, by RAYTRACE_TRACE, or "auto"."""
-    return _engine.get() or _checked(os.environ.get("RAYTRACE_TRACE") or "auto", "RAYTRACE_TRACE")
-
-
-def prepare() -> str:
-    """Make the compiled trace ready, compiling it if need be: "compiled", or "eager" without it.
-
-    For loops of many small batches, which would not compile it by themselves, and for runs whose numbers must not
-    depend on when somebody else compiled it.
-    """
-    return "compiled" if engine() != "eager" and _available(build=True) else "eager"
-
-
-def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
-    """Whether the compiled trace carries these rays; numbers: any number of the lens, for its device and dtype."""
-    asked = engine()
-    if asked == "eager" or not _has_form(rays, numbers):
-        return False
-    if asked == "compiled":
-        library()
-        return True
-    return _available(build=rays.direction[0].numel() * surfaces >= WORTH_COMPILING)
-
-
-def _has_form(rays: Rays, numbers: Tensor) -> bool:
-    """Whether these are plain tensors of float32 or float64 on the CPU, and no forward derivative is under way."""
-    kinds = {rays.direction.dtype, rays.position.dtype, *(() if rays.opl is None else (rays.opl.dtype,))}
-    return (
-        rays.direction.device.type == "cpu"
-        and numbers.device.type == "cpu"
-        and kinds in ({torch.float32}, {torch.float64})
-        and not torch._C._are_functorch_transforms_active()
-        and getattr(forward_ad, "_current_level", -1) < 0
-        and not torch.compiler.is_compiling()
-    )
-
-
-def _available(*, build: bool) -> bool:
-    if _refused or not (build or is_built()):
-        return False
-    try:
-        library()
-    except NoCompiler as error:
-        _refused.append(str(error))
-        print(f"raytrace: {error}; tracing by torch alone", file=sys.stderr)
-        return False
-    return True
-
-
-def _checked(name: str, origin: str) -> str:
-    if name not in ENGINES:
-        raise ValueError(f"{origin} {name!r}: expected one of {', '.join(ENGINES)}")
-    return name
-
 
 _MOST_LINKS = 40
-#: To pass through a folder takes no right to list it. Systems that are not POSIX lack these, and the compiled trace.
+#: Passing through a folder needs no right to list it. Systems that are not POSIX lack these, and the compiled trace.
 _FOLDER = getattr(os, "O_PATH", 0) | sum(getattr(os, name, 0) for name in ("O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC"))
 
 
 class Untrusted(OSError):
-    """Somebody else could write here; the message says where, and who."""
+    """Another user could write here; the message says where, and who."""
 
 
 def open_folder(path: Path, *, make: bool = False) -> int:
-    """A descriptor of a folder that, with all above it, nobody else can change; the caller closes it.
+    """A descriptor of a folder that no other user can change, nor those above it; the caller closes it.
 
-    make: make what is missing of it, for this user alone. Raises Untrusted where somebody else can change it or
-    where `path` is relative, OSError where it is missing or cannot be read or made.
+    make: create missing folders, for this user alone. Raises Untrusted for a folder that another user can change and
+    for a relative `path`, OSError for one that is missing or cannot be read or created.
     """
     path = Path(path)
     if not path.is_absolute():
@@ -147,7 +50,8 @@ def open_folder(path: Path, *, make: bool = False) -> int:
     here = os.open(path.root, _FOLDER)
     try:
         while True:
-            _refuse(os.fstat(here), so_far, passing=bool(names))
+            if reason := objection(os.fstat(here), passing=bool(names)):
+                raise Untrusted(f"{so_far} {reason}")
             if not names:
                 return here
             name = names.pop(0)
@@ -168,9 +72,9 @@ def open_folder(path: Path, *, make: bool = False) -> int:
 
 
 def objection(status: os.stat_result, *, passing: bool = False, mine: bool = False) -> str:
-    """Why somebody else could change this file or folder, or what is in it; "" where nobody can.
+    """Why another user could change this file or folder or its contents; "" if none can.
 
-    passing: of this folder only the one way on matters, which is checked for itself: it may be like /tmp, where only
+    passing: only the next folder of the path matters, which is checked itself: this one may be like /tmp, where only
     owners rename and remove. mine: it has to be this user's, not root's.
     """
     user = os.geteuid()
@@ -184,7 +88,7 @@ def objection(status: os.stat_result, *, passing: bool = False, mine: bool = Fal
 
 
 def check_file(name: str, folder: int) -> None:
-    """Raise Untrusted unless the file of that name in a trusted folder is a plain one, written by this user alone.
+    """Raise Untrusted unless a file in a trusted folder is a plain one that this user alone can write.
 
     Checked on the opened file; OSError where there is none.
     """
@@ -193,24 +97,19 @@ def check_file(name: str, folder: int) -> None:
         status = os.fstat(file)
     finally:
         os.close(file)
-    said = objection(status, mine=True) if stat.S_ISREG(status.st_mode) else "is no plain file"
-    if said:
-        raise Untrusted(f"{name} {said}")
+    if reason := objection(status, mine=True) if stat.S_ISREG(status.st_mode) else "is no plain file":
+        raise Untrusted(f"{name} {reason}")
 
 
 @contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder for this user alone in the system's folder for temporary files; removed behind the block.
-
-    Raises Untrusted where others could exchange it.
-    """
+    """A new temporary folder for this user alone, removed after the block. Raises Untrusted."""
     with tempfile.TemporaryDirectory(prefix="raytrace-") as made:
         os.close(open_folder(Path(made).absolute()))
         yield Path(made)
 
 
 def _step(here: int, name: str, path: Path, *, make: bool) -> int:
-    """The folder of that name in `here`."""
     try:
         return os.open(name, _FOLDER, dir_fd=here)
     except OSError as error:
@@ -225,7 +124,7 @@ def _step(here: int, name: str, path: Path, *, make: bool) -> int:
 
 
 def _link(name: str, folder: int, path: Path) -> Path | None:
-    """Where a link points to, None for what is no link. Raises Untrusted for a link of somebody else's."""
+    """The target of a link, None if it is none. Raises Untrusted for a link of another user's."""
     try:
         status = os.stat(name, dir_fd=folder, follow_symlinks=False)
     except FileNotFoundError:
@@ -237,22 +136,15 @@ def _link(name: str, folder: int, path: Path) -> Path | None:
     return Path(os.readlink(name, dir_fd=folder))
 
 
-def _refuse(status: os.stat_result, path: Path, *, passing: bool) -> None:
-    said = objection(status, passing=passing)
-    if said:
-        raise Untrusted(f"{path} {said}")
-
-
 #: The folder of the C++ sources.
-CPP = Path(__file__).absolute().parents[1] / "cpp"
+CPP = Path(__file__).absolute().parent / "cpp"
 SOURCES = (
     *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "sag_terms.h", "loops.h", "facets.h", "phases.h"),
     *("search.h", "careful.h", "adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
-#: Flags that not every compiler, processor or torch knows: tried in this order, the last none. With -fopenmp, which
-#: stands only where it compiles, threads are those of the OpenMP that torch has loaded: two of them would wait for each
-#: other's turn at full power.
+#: Flags that not every compiler, processor or torch supports: tried in this order, the last none. With -fopenmp,
+#: threads are those of the OpenMP that torch has loaded: two OpenMP libraries would wait for each other at full power.
 _THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
 _TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
 _COMPILERS = ("c++", "g++", "clang++")
@@ -262,15 +154,14 @@ _LONG = 90 * _DAY
 
 
 class NoCompiler(RuntimeError):
-    """The compiled trace cannot be had on this machine; the message says why."""
+    """The compiled trace is unavailable on this machine; the message says why."""
 
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The compiled trace, built now if it was not before. Raises NoCompiler.
+    """The compiled trace, compiled now if it was not before. Raises NoCompiler.
 
-    Only a file that nobody but this user can have written is loaded (see `trust`). Where the cache folder is not
-    safe or cannot be written, the trace is built for this process alone, in a private temporary folder.
+    Where the cache folder is not safe or cannot be written, it is compiled for this process alone, in a private folder.
     """
     if os.name != "posix":
         raise NoCompiler("the compiled trace is for POSIX systems")
@@ -278,8 +169,13 @@ def library() -> ctypes.CDLL:
         try:
             _keep(cache_folder())
         except OSError as error:
-            _say(f"{_told(error)}; compiling in a private folder for this process alone (RAYTRACE_CACHE sets another)")
-            return _for_this_process()
+            reason = _reason(error)
+            _say(f"{reason}; compiling in a private folder for this process alone (RAYTRACE_CACHE sets another)")
+            try:
+                with private_folder() as private:
+                    return _loaded(_build(private))
+            except OSError as error:
+                raise NoCompiler(f"the trace cannot be compiled: {_reason(error)}") from None
     path = cache_folder() / _file_name()
     with suppress(OSError):
         os.utime(path)  # when it was used last, for `_remove_old`
@@ -288,7 +184,7 @@ def library() -> ctypes.CDLL:
 
 @functools.cache
 def is_built() -> bool:
-    """Whether an earlier process, or this one, has compiled the trace: then it costs a millisecond to load."""
+    """Whether the trace has been compiled: then it loads in a millisecond."""
     try:
         return os.name == "posix" and _is_kept()
     except NoCompiler:
@@ -296,26 +192,25 @@ def is_built() -> bool:
 
 
 def compiler(named: str | None = None) -> tuple[str, ...]:
-    """The C++ compiler, its path and words: the one named, the environment's CXX, or the first of c++, g++, clang++.
+    """The C++ compiler, its path and options: the one named, the environment's CXX, or the first of c++, g++, clang++.
 
-    Looked for in the absolute folders of PATH alone, never in the current one. Raises NoCompiler.
+    Searched in the absolute folders of PATH alone, never in the current one. Raises NoCompiler.
     """
-    own = named or os.environ.get("CXX")
+    wish = named or os.environ.get("CXX")
     try:
-        given = [tuple(shlex.split(own))] if own and own.strip() else [(name,) for name in _COMPILERS]
+        candidates = [tuple(shlex.split(wish))] if wish and wish.strip() else [(name,) for name in _COMPILERS]
     except ValueError as error:
-        raise NoCompiler(f"CXX {own!r}: {error}") from None
-    for program, *words in given:
+        raise NoCompiler(f"CXX {wish!r}: {error}") from None
+    for program, *words in candidates:
         if os.sep in program and not os.path.isabs(program):
             raise NoCompiler(f"CXX {program!r}: expected an absolute path, or a name to look for in PATH")
-        found = shutil.which(program, path=_safe_path())
-        if found:
-            return (found, *words)
-    raise NoCompiler(f"no C++ compiler found ({own or ', '.join(_COMPILERS)})")
+        if path := shutil.which(program, path=_safe_path()):
+            return (path, *words)
+    raise NoCompiler(f"no C++ compiler found ({wish or ', '.join(_COMPILERS)})")
 
 
 def run_compiler(*words: str, folder: Path) -> subprocess.CompletedProcess:
-    """Run a program of `compiler` in a private folder, which then is where it finds what has no absolute path."""
+    """Run a program of `compiler` in a private folder, so that no relative path leads elsewhere."""
     environment = os.environ | {"PATH": _safe_path()}
     return subprocess.run(
         words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600
@@ -326,11 +221,11 @@ def run_compiler(*words: str, folder: Path) -> subprocess.CompletedProcess:
 def cache_folder() -> Path:
     """Where compiled code is kept: RAYTRACE_CACHE, or raytrace/ in the user's cache folder; an absolute path."""
     for name, below in (("RAYTRACE_CACHE", ""), ("XDG_CACHE_HOME", "raytrace")):
-        given = os.environ.get(name)
-        if given and os.path.isabs(given):
-            return Path(given) / below
-        if given:
-            _say(f"{name} {given!r} is not an absolute path: ignored")
+        folder = os.environ.get(name)
+        if folder and os.path.isabs(folder):
+            return Path(folder) / below
+        if folder:
+            _say(f"{name} {folder!r} is not an absolute path: ignored")
     return Path(os.path.expanduser("~/.cache/raytrace"))
 
 
@@ -359,7 +254,7 @@ def _digest(*known: object, length: int) -> str:
 
 
 def _is_kept() -> bool:
-    """Whether the compiled trace is there, and nobody else can have written it."""
+    """Whether the compiled trace is there and no other user can have written it."""
     try:
         folder = open_folder(cache_folder())
     except OSError:
@@ -374,32 +269,24 @@ def _is_kept() -> bool:
 
 
 def _keep(folder: Path) -> None:
-    """Build the trace into the cache folder. Raises OSError where that is not safe or cannot be written, NoCompiler."""
+    """Compile into the cache folder. Raises OSError where that is not safe or cannot be written, NoCompiler."""
     os.close(open_folder(folder, make=True))
     path = folder / _file_name()
     if path.exists():
-        _say(f"{path} can be somebody else's: compiled anew")
+        _say(f"{path} can be another user's: compiled anew")
     with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
         os.replace(_build(Path(private)), path)
     _remove_old(folder)
 
 
-def _for_this_process() -> ctypes.CDLL:
-    try:
-        with private_folder() as private:
-            return _loaded(_build(private))
-    except OSError as error:
-        raise NoCompiler(f"the trace cannot be compiled: {_told(error)}") from None
-
-
-def _told(error: OSError) -> str:
+def _reason(error: OSError) -> str:
     return f"{error.filename}: {error.strerror}" if error.filename else str(error)
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove what this installation compiled before, and what none of this machine has used for long.
+    """Remove earlier files of this installation, and those that nothing on this machine has used for _LONG.
 
-    A process that runs on such a file keeps it until it ends.
+    A process that has loaded such a file keeps it until it ends.
     """
     now = time.time()
     for path in folder.glob("trace-*.so"):
@@ -416,7 +303,7 @@ def _remove_old(folder: Path) -> None:
 
 
 def _processor(*only: str) -> str:
-    """What tells processors apart for which other code is made."""
+    """The properties of the processor that the compiled code depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return "\n".join(
@@ -434,28 +321,21 @@ def _build(folder: Path) -> Path:
     note.start()
     made, compiled = folder / _file_name(), folder / "trace.o"
     try:
-        for own in _TRIED:
-            done = run_compiler(*program, *FLAGS, *own, "-c", str(source), "-o", str(compiled), folder=folder)
+        for flags in _TRIED:
+            done = run_compiler(*program, *FLAGS, *flags, "-c", str(source), "-o", str(compiled), folder=folder)
             if done.returncode == 0:
                 done = run_compiler(*program, "-shared", str(compiled), "-o", str(made), folder=folder)
-            if done.returncode == 0 and _can_be_loaded(made):
-                made.chmod(0o600)
-                return made
+            if done.returncode == 0:
+                with suppress(OSError):  # its threads are torch's: the code needs those that torch has loaded
+                    ctypes.CDLL(str(made))
+                    made.chmod(0o600)
+                    return made
     except subprocess.TimeoutExpired as error:
         raise NoCompiler(f"{program[0]} has not compiled the trace in {error.timeout:g} s") from None
     finally:
         note.cancel()
-    said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[0]
-    raise NoCompiler(f"{' '.join(program)} cannot compile the trace: {said}")
-
-
-def _can_be_loaded(path: Path) -> bool:
-    """Whether what the code needs is there: its threads are torch's."""
-    try:
-        ctypes.CDLL(str(path))
-    except OSError:
-        return False
-    return True
+    reason = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[0]
+    raise NoCompiler(f"{' '.join(program)} cannot compile the trace: {reason}")
 
 
 def _loaded(path: Path) -> ctypes.CDLL:
