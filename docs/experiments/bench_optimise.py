@@ -62,7 +62,7 @@ def bench(request: Request) -> Measured:
     """The files, and the Jacobian of a default merit function."""
     prepare()
     files = request.arguments.lenses
-    with progress(len(files), "file", what="bench optimise") as bar:
+    with progress(len(files), "file", what="optimising") as bar:
         rows = [_of_file(name, bar) for name in files]
     forward, whole, variables, rays = _jacobian(request.open_lens("double_gauss"), request.arguments.repeats)
     about = request.about()
