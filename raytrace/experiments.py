@@ -1,6 +1,6 @@
 """Experiments of the documentation: a grid of cases, a keyed store that resumes, and a page with tables and figures.
 
-Scripts in `docs/experiments` use it; `raytrace codesign compare` writes its page by it.
+Scripts in `docs/experiments` use it.
 """
 
 import io

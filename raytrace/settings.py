@@ -25,18 +25,8 @@ def read(kind: type, document: Mapping):
 
 #: PSF models that a lens is trained with.
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
-#: Gaussian DRT, started at the sensor distance where the paraxial run of the same seed ended.
-AFTER_PARAXIAL = "gaussian-after-paraxial"
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"
-#: Names of models in tables and figures.
-NAMES = {
-    "paraxial": "paraxial",
-    "fourier": "Fourier",
-    "gaussian": "Gaussian DRT",
-    "drt": "DRT",
-    AFTER_PARAXIAL: "Gaussian DRT from paraxial",
-}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
-from raytrace.io.zemax.keywords import AIMINGS
+from raytrace.io.zemax.surfaces import AIMINGS
 from raytrace.materials import glass
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.environment import Environment

@@ -15,14 +15,16 @@ from PIL import Image
 from scripts import script
 
 import raytrace
-from raytrace.cli import codesign_runs as codesign_setup
+from raytrace.cli import codesign_run
+from raytrace.cli.progress import Lines
 from raytrace.imaging.codesign import lens_at_start
-from raytrace.imaging.codesign_study import COLUMNS
 from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.training import OtherSettings
 from raytrace.io import read_lens
-from raytrace.settings import AFTER_PARAXIAL, CodesignSettings
+from raytrace.settings import CodesignSettings
 from raytrace.tracing.paraxial import paraxial_image_distance
 
+study = script("codesign_study")
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
 SMALL = tuple(_LITTLE.split(" "))
 
@@ -52,12 +54,27 @@ def rows(path):
 
 def interrupt(monkeypatch, name: str, step: int):
     """Stop like a user at a step of one of the two steps of a run."""
+    run_model = codesign_run.run_model
 
-    def progress(self, found, number, record):
-        if (found, number) == (name, step):
-            raise KeyboardInterrupt
+    def interrupted(*positional, **named):
+        for found, number, record in run_model(*positional, **named):
+            if (found, number) == (name, step):
+                raise KeyboardInterrupt
+            yield found, number, record
 
-    monkeypatch.setattr(codesign_setup.Progress, "__call__", progress)
+    monkeypatch.setattr(codesign_run, "run_model", interrupted)
+
+
+@pytest.fixture
+def compare(capsys, tmp_path, monkeypatch):
+    """Run the script of a study in an empty folder: standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        script("codesign").main(list(map(str, words)))
+        return capsys.readouterr()
+
+    return run
 
 
 # ---------------------------------------------------------------- one model
@@ -72,7 +89,7 @@ def test_a_run_says_what_it_found(run, pictures):
     assert [float(d) for d in kept["by_distance"]] == [1e3 * z for z in (10, 15, 20, 25, 30, 35, 40, 45, 50)]
     for step in ("joint", "refine"):
         assert [int(row["step"]) for row in rows(f"one/{step}/log.csv")] == list(range(8))
-    assert re.search(r"paraxial, seed 0, joint, epoch 1 of 1: loss 0\.\d+, sensor 57\.8\d+ mm, focus 2\d\.\d m, ", err)
+    assert re.search(r"paraxial, seed 0, joint, epoch 1 of 1: loss 0\.\d+, sensor 57\.8\d+ mm, focus 2\d\.\d m\n", err)
     code, text, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--resume")
     assert code == 0
     assert "finished before, nothing to train" in err
@@ -90,7 +107,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(run, pictures, monkeypat
             assert (code, out, err.splitlines()[-1]) == (130, "", "raytrace: error: interrupted")
     code, _, err = run(*command, "-o", "parts", "--resume")
     assert code == 0
-    assert "going on behind step 8 of 16" in err
+    assert "resumes after step 8 of 16" in err
     for name in ("outcome.json", "joint/log.csv", "refine/log.csv"):
         assert Path(f"parts/{name}").read_bytes() == Path(f"whole/{name}").read_bytes()
     found = read("whole/outcome.json")
@@ -173,7 +190,9 @@ def test_the_penalty_is_said_beside_the_loss(run, pictures):
     log = rows("thin/joint/log.csv")
     assert all(float(row["penalty"]) == pytest.approx(found["penalty"], rel=1e-12) for row in log)
     code, text, _ = run("phone", *options[:-1], "--glass-thickness", "0.3:0.9", "--edge", "0.1", "-o", "thin")
-    assert f"penalty {found['penalty']:.6g} mm² beside the loss; thicknesses: glass 0.3 to 0.9, its edge 0.1" in text
+    assert (
+        f"penalty {found['penalty']:.6g} mm², not part of the loss; thicknesses: glass 0.3 to 0.9, its edge 0.1" in text
+    )
     code, _, err = run("phone", *options, "--glass-thickness", "0.9:0.3", "-o", "wrong")
     assert code == 1
     assert "'0.9:0.3': expected 0 ≤ least < greatest" in err
@@ -214,17 +233,21 @@ def test_spectral_at_infinity_is_valid_json(run, pictures):
     assert "in focus: infinity (paraxial), infinity (least RMS spot)" in run(*bounded)[1]
 
 
-def test_tests_are_told(run, pictures, monkeypatch, capsys):
-    """Off a terminal a line for the tests behind each step; on one the bar counts their batches."""
-    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o")
-    err = run(*command, "one")[2]
-    assert err.splitlines().count("raytrace: paraxial, seed 0: testing") == 2
-    drawn = functools.partial(codesign_setup.tqdm, mininterval=0)
-    monkeypatch.setattr(codesign_setup, "tqdm", lambda *a, **k: drawn(*a, **{**k, "disable": False}))
-    monkeypatch.setattr(codesign_setup.tqdm, "format_interval", lambda left: "00:00", raising=False)
-    err = run(*command, "two")[2]
-    assert "paraxial, seed 0, testing: " in err
-    assert "batch 2 of 2" in err
+def test_progress_counts_the_batches_of_a_test(run, pictures, monkeypatch):
+    words = []
+    monkeypatch.setattr(Lines, "set_postfix_str", lambda self, text="", refresh=True: words.append(text))
+    assert run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")[0] == 0
+    assert words.count("testing, batch 2 of 2") == 3 + 9
+    assert any(text.startswith("refine, loss 0.") for text in words)
+
+
+def test_the_figure_has_the_curves_of_training_and_of_the_closed_form(run, pictures):
+    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")
+    for options in ((), ("--loss", "spectral")):
+        code, _, err = run(*command, *options, "--plot", "loss.png")
+        assert code == 0, err
+        assert Path("loss.png").read_bytes().startswith(b"\x89PNG")
+        Path("loss.png").unlink()
 
 
 def test_spectral_prints_its_course(run, pictures):
@@ -252,7 +275,6 @@ WRONG = {
     "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
     "resume": (["--resume"], "out: no run was begun here"),
     "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
-    "seeds": (["--seeds", "1"], "--seeds belongs to codesign compare LENS"),
     "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8,12"),
     "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables: sensor"),
     "field": (["--field", "95"], "a field angle is below 90 degrees"),
@@ -271,14 +293,7 @@ def test_errors_are_one_line(run, pictures, options, message):
     ("arguments", "message"),
     [
         (("double_gauss",), "no folder to keep the run in: give -o FOLDER"),
-        (
-            ("comparing", "double_gauss", "-o", "out"),
-            "expected LENS, or compare LENS; did you mean compare?",
-        ),
-        (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
-        (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
         (("double_gauss", "--loss", "spectral", "--resume", "-o", "out"), "--resume belongs to training"),
-        (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),
     ],
 )
 def test_words_and_options_that_do_not_fit(run, arguments, message):
@@ -308,18 +323,28 @@ def test_two_processes_find_what_one_does(run, pictures, tmp_path):
 # ---------------------------------------------------------------- compare
 
 
-def test_compare_writes_the_table_and_the_page(run, pictures):
+def test_a_study_that_was_not_begun_is_refused(compare):
+    for options in (("--report-only",), ("--resume",)):
+        with pytest.raises(codesign_run.CommandError, match="out: no study was begun here"):
+            compare("double_gauss", "-o", "out", *options)
+    with pytest.raises(codesign_run.CommandError, match="give -o FOLDER"):
+        compare("double_gauss")
+    with pytest.raises(codesign_run.CommandError, match="add paraxial to --models"):
+        compare("double_gauss", *SMALL, "--limit", 5, "-o", "out", "--models", study.AFTER_PARAXIAL)
+
+
+def test_compare_writes_the_table_and_the_page(compare, pictures):
     """Paraxial, and Gaussian DRT begun where that ended; then the page again with a seed that is missing."""
-    after = AFTER_PARAXIAL
-    command = ("compare", "double_gauss", "--data", pictures, "-o", "study", "--docs", "docs")
-    code, out, err = run(*command, *SMALL, "--models", after, "paraxial", "--seeds", "3", "--json")
-    assert code == 0, err
+    after = study.AFTER_PARAXIAL
+    options = ("--data", pictures, "-o", "study", "--docs", "docs")
+    again = (*SMALL, "--models", after, "paraxial", "--seeds", "3", "--json")
+    document = json.loads(compare("double_gauss", *options, *again).out)
     kept = {model: read(f"study/{model}-3/outcome.json") for model in ("paraxial", after)}
     table = rows("docs/codesign/table2.csv")
     assert [row["model"] for row in table] == ["paraxial", after]
     for row in table:
-        assert tuple(row) == COLUMNS
-        of_file = [key for key in COLUMNS[1:] if "last_epochs" not in key]
+        assert tuple(row) == study.COLUMNS
+        of_file = [key for key in study.COLUMNS[1:] if "last_epochs" not in key]
         assert {key: float(row[key]) for key in of_file} == {key: kept[row["model"]][key] for key in of_file}
         with open(f"study/{row['model']}-3/joint/log.csv", newline="") as file:
             course = [float(step["sensor"]) for step in csv.DictReader(file)]
@@ -327,9 +352,9 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
         assert float(row["sensor_range_last_epochs_mm"]) == pytest.approx(max(course) - min(course))
     begun = read(f"study/{after}-3/joint/settings.json")
     assert (begun["model"], float(begun["start"])) == ("gaussian", kept["paraxial"]["sensor_mm"])
-    document = json.loads(out)
     assert [row["sensor_mm"] for row in document["rows"]] == [kept[model]["sensor_mm"] for model in kept]
-    assert (document["claims"], document["missing"]) == ([], [])
+    assert document["missing"] == []
+    assert {claim["answer"] for claim in document["claims"]} == {"not applicable"}
     page = Path("docs/codesign.md").read_text(encoding="utf-8")
     for name in re.findall(r"\(codesign/(\w+\.\w+)\)", page):
         assert Path("docs/codesign", name).read_bytes().startswith(b"\x89PNG") == name.endswith(".png")
@@ -342,50 +367,40 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
     assert [row["model"] for row in optimum] == ["paraxial", after]
     assert [one["model"] for one in document["closed_form"]] == ["paraxial", after]
     assert f"| {float(optimum[0]['sensor_mm']):.4f} | {one['sensor_mm']:.4f} |" in page
-    assert "paper" not in page
-    options = ["--data", str(pictures), "-o", "study", "--docs", "published", "--report-only", "--json"]
-    script("codesign").main(["double_gauss", *options])
-    published = Path("published/codesign.md").read_text(encoding="utf-8")
-    assert "| 0.0415 | 0.0504 | 33.9 |" in published
-    assert "Gaussian DRT is not among the models of this study" in published
-    again(run, command, page)
-
-
-def again(run, command, page):
-    """The page of a study with a seed that is missing, and words written by hand."""
+    assert "| 0.0415 | 0.0504 | 33.9 |" in page
+    assert "Gaussian DRT is not among the models of this study" in page
+    # The page of a study with a seed that is missing, and words written by hand.
+    assert page.endswith("again -->\n")
     Path("docs/codesign.md").write_text(f"{page}\nWritten by hand.\n", encoding="utf-8")
-    code, out, err = run(*command, "--report-only", "--models", "paraxial", "--seeds", "3", "4")
-    assert code == 0, err
+    out = compare("double_gauss", *options, "--report-only", "--models", "paraxial", "--seeds", "3", "4").out
     new = Path("docs/codesign.md").read_text(encoding="utf-8")
     assert "**Unfinished: 1 of 2 runs.** Missing, by model and seed: paraxial 4." in new
     assert new.endswith("Written by hand.\n")
-    assert page.endswith("again -->\n")
     assert "not finished: paraxial 4" in out
     assert len(rows("docs/codesign/table2.csv")) == 1
-    code, _, err = run(*command, *SMALL, "--noise", "0.2", "--models", "paraxial", "--seeds", "3")
-    assert code == 1
-    assert "study holds another run: noise was 0.1, now 0.2" in err
+    with pytest.raises(OtherSettings, match=r"study holds another run: noise was 0\.1, now 0\.2"):
+        compare("double_gauss", *options, *SMALL, "--noise", "0.2", "--models", "paraxial", "--seeds", "3")
 
 
 def test_precision_that_was_found_is_kept(run, pictures, monkeypatch):
     """A machine that would choose otherwise the second time goes on with the first choice."""
-    monkeypatch.setattr(codesign_setup, "faster_precision", lambda shape: "float32")
+    monkeypatch.setattr(codesign_run, "faster_precision", lambda shape: "float32")
     options = [word for word in SMALL if word not in ("--precision", "float32")]
     command = ("double_gauss", "--data", pictures, *options, "--model", "paraxial", "-o", "one", "--json")
     first = json.loads(run(*command)[1])
-    monkeypatch.setattr(codesign_setup, "faster_precision", lambda shape: "bfloat16")
+    monkeypatch.setattr(codesign_run, "faster_precision", lambda shape: "bfloat16")
     assert json.loads(run(*command)[1]) == first
 
 
 def test_focus_of_a_sensor_is_its_paraxial_conjugate():
     """There and back: the paraxial image of an object, and the object of that image, to 0.01 %."""
-    lens = read_lens(codesign_setup.find_lens("double_gauss"))
-    focus = codesign_setup.focus_of(lens, CodesignSettings())
+    lens = read_lens(codesign_run.find_lens("double_gauss"))
+    focus = codesign_run.focus_of(lens, CodesignSettings())
     begun = lens_at_start(lens, CodesignSettings())
     for distance in (12.0, 25.0, 33.9):
         image = paraxial_image_distance(begun, torch.tensor(1e3 * distance, dtype=torch.float64))
         assert focus(float(image)) == pytest.approx(distance, rel=1e-4)
-    assert codesign_setup.focus_of(lens, CodesignSettings(vary="sensor thickness:5")) is None
+    assert codesign_run.focus_of(lens, CodesignSettings(vary="sensor thickness:5")) is None
 
 
 @pytest.mark.slow

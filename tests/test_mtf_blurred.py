@@ -13,7 +13,6 @@ from raytrace.analysis import pupil_autocorrelation as smooth_pupil
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import TakesLong
 from raytrace.cli import main
-from raytrace.plotting.analysis import mtf_curves
 
 
 def defocused(by: float) -> rt.Lens:
@@ -131,7 +130,8 @@ def test_text_json_and_figure_report_which_fields_are_geometric(rough, monkeypat
     assert part.document()["transfer"] == "geometric"
     assert mixed.document()["transfer"] == "diffraction (geometric for 10 degrees)"
     assert str(mixed).splitlines()[-1] == "transfer: diffraction (geometric for 10 degrees)"
-    titles = [text.get_text() for text in mtf_curves(mixed).findobj(Text)]
+    monkeypatch.setattr(mtf.Mtf, "drawn", lambda result: result)
+    titles = [text.get_text() for text in mixed.plot().findobj(Text)]
     assert any("diffraction (geometric for 10 degrees) MTF" in title for title in titles)
     assert main(["mtf", "tessar", "--frequency", "5", "--geometric", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["transfer"] == "geometric"

@@ -50,7 +50,7 @@ def lens(tmp_path):
         ("search lens.zmx --merit spot --vary curvature -o lens.zmx", "lens.zmx: is a file; give the name of a folder"),
         ("wave psf --element e.json --aperture 1 --plot no/x.png", "no/x.png: cannot be written"),
         ("bench trace --csv no/x.csv", "no/x.csv: cannot be written"),
-        ("codesign lens.zmx -o lens.zmx", "lens.zmx: is the file of WORDS too"),
+        ("codesign lens.zmx -o lens.zmx", "lens.zmx: is the file of LENS too"),
     ],
 )
 def test_outputs_are_refused_before_the_work(words, said, lens, command_line, tmp_path):

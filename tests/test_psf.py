@@ -94,7 +94,7 @@ def test_plain_numbers_are_as_good_as_tensors():
     }
     one, other = (psf(double_gauss(), Gaussian(order=3), **o) for o in ({**numbers, "pixel": 0.01}, tensors))
     torch.testing.assert_close(one.kernel, other.kernel, rtol=0, atol=0)
-    with pytest.raises(ValueError, match="grid says pixel and size"):
+    with pytest.raises(ValueError, match="a grid has a pixel and a size"):
         psf(double_gauss(), "gaussian", grid=grid(0.01, 7), size=7)
     with pytest.raises(ValueError, match="below 90 degrees"):
         psf(double_gauss(), "gaussian", fields=[90])

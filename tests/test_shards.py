@@ -16,8 +16,7 @@ from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.maths.grid import grid
-from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, psf
-from raytrace.psf_models import compute as sharing
+from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, psf, sharing
 from raytrace.psf_models.result import mixture
 from raytrace.shards import Share
 from raytrace.system.lens import Lens

@@ -16,8 +16,7 @@ from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.psf_models import DRT, Execution, psf
-from raytrace.psf_models.compute import stream_kernels
-from raytrace.psf_models.drt import kernels_of_rays
+from raytrace.psf_models.drt import kernels_of_rays, stream_kernels
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing import streaming

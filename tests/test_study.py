@@ -11,8 +11,7 @@ from scripts import script
 
 from raytrace.cli import build_parser
 from raytrace.cli.codesign import ROWS
-from raytrace.cli.codesign_compare import CAPTIONS, Report
-from raytrace.cli.codesign_runs import settings_of
+from raytrace.cli.codesign_run import settings_of
 from raytrace.cli.settings import words as words_of
 from raytrace.files import shipped, write_table
 from raytrace.imaging import codesign as optima
@@ -23,34 +22,25 @@ from raytrace.imaging.codesign import (
     batch,
     camera,
     closed_form,
-    closed_forms,
     lens_at_start,
     write_outcome,
-)
-from raytrace.imaging.codesign_study import (
-    COLUMNS,
-    StepTime,
-    blur_diameters,
-    courses,
-    losses_by_distance,
-    outcomes,
-    run_folder,
-    run_settings,
-    settled,
-    step_times,
-    summaries,
 )
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.io import read_lens
 from raytrace.pages import kept_of, markdown
-from raytrace.plotting.codesign import _marks
-from raytrace.settings import AFTER_PARAXIAL, CodesignSettings
+from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 from raytrace.tracing.focus import best_focus
 from raytrace.tracing.paraxial import first_order
 
-study = script("codesign")
-CLAIMS, Seen, claims, is_of_paper = study.CLAIMS, study.Seen, study.claims, study.is_of_paper
+page_script, study, judged = script("codesign"), script("codesign_study"), script("codesign_claims")
+focus_marks = script("codesign_figures").focus_marks
+CAPTIONS, Report = page_script.CAPTIONS, page_script.Report
+CLAIMS, Seen, claims, is_of_paper = judged.CLAIMS, judged.Measurements, judged.claims, judged.is_of_paper
+AFTER_PARAXIAL, COLUMNS, StepTime = study.AFTER_PARAXIAL, study.COLUMNS, study.StepTime
+blur_diameters, closed_forms, courses = study.blur_diameters, study.closed_forms, study.courses
+losses_by_distance, outcomes, run_folder = study.losses_by_distance, study.outcomes, study.run_folder
+run_settings, settled, step_times, summaries = study.run_settings, study.settled, study.step_times, study.summaries
 SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3
 
@@ -75,7 +65,7 @@ def pictures():
 
 
 def run(model, seed, *, l1_joint, l1_drt, focus, sensor, by_distance=None):
-    return Outcome(
+    return study.StudyOutcome(
         model=model,
         seed=seed,
         l1_joint=l1_joint,
@@ -278,7 +268,7 @@ def test_summaries_are_means_and_deviations_of_the_runs(tmp_path):
 def keep(study, row, one):
     folder = run_folder(study, row, one.seed)
     (folder / "joint").mkdir(parents=True)
-    write_outcome(one, folder)
+    write_outcome(Outcome(**{field.name: getattr(one, field.name) for field in dataclasses.fields(Outcome)}), folder)
     (folder / "joint" / "log.csv").write_text(f"step,loss,sensor\n0,0.5,{one.sensor_mm}\n1,0.25,57.5\n")
 
 
@@ -337,7 +327,7 @@ def test_closed_forms_of_rows_begin_where_the_rows_do(lens, spectrum, monkeypatc
         begun.append((settings.model, settings.start))
         return Optimum(settings.model, 57.8, 33.0, 19.0, 0.01, 0.01)
 
-    monkeypatch.setattr(optima, "closed_form", instantly)
+    monkeypatch.setattr(study, "closed_form", instantly)
     rows = ("gaussian", AFTER_PARAXIAL)
     assert [one.model for one in closed_forms(lens, SMALL, spectrum, rows)] == list(rows)
     assert begun == [("gaussian", "paraxial"), ("paraxial", "paraxial"), ("gaussian", "57.8")]
@@ -393,13 +383,13 @@ def test_the_page_names_settings_that_are_not_usual():
         lens="double_gauss",
         pictures="6 pictures",
         settings=dataclasses.replace(SMALL, f_number=4.0, fields=(0.0, 10.0), vary="sensor thickness:5"),
-        found=tuple(paper()),
+        outcomes=tuple(paper()),
         missing=(("drt", 2),),
         optima=(),
         times=tuple(TIMES),
         figures=("loss.png",),
         machine={"cores": 2},
-        publication=study.publication(read_lens(shipped("lenses") / "double_gauss.zmx")),
+        is_of_paper=True,
     )
     page = markdown(report.parts(), "By hand.")
     command = page.splitlines()[2].strip()
@@ -413,11 +403,10 @@ def test_the_page_names_settings_that_are_not_usual():
     assert kept_of(page) == "By hand."
     assert "## The paper's claims" in page
     assert "[codesign_sweep.md](codesign_sweep.md)" in page
-    other = markdown(dataclasses.replace(report, publication=None).parts())
+    other = markdown(dataclasses.replace(report, is_of_paper=False).parts())
     assert "paper" not in other
     assert "codesign_sweep.md" not in other
-    assert other.splitlines()[2].startswith("    raytrace codesign compare double_gauss --data DIR")
-    second = markdown(dataclasses.replace(report, folder="second", publication=None).parts())
+    second = markdown(dataclasses.replace(report, folder="second", is_of_paper=False).parts())
     assert "--page second" in second.splitlines()[2]
     assert "](second/loss.png)" in second
     assert "codesign/" not in second
@@ -454,7 +443,7 @@ def test_marks_of_the_focus_axis_are_round_and_apart():
     images = [1 / (1 / 100 - 1 / (1e3 * z)) for z in distances]
     conjugates = images[::-1], distances[::-1]
     low, high = images[distances.index(100.0)], images[distances.index(20.0)]
-    marks = _marks(conjugates, low - 1e-6, high + 1e-6)
+    marks = focus_marks(conjugates, low - 1e-6, high + 1e-6)
     assert {20, 25, 30, 50, 100} <= set(marks)
     assert all(20 <= z <= 100 for z in marks)
     places = [images[distances.index(z)] for z in marks]

@@ -19,11 +19,11 @@ from raytrace.cli import wave_options
 from raytrace.cli.commands import WAVE_COMMANDS
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
-from raytrace.plotting.wave import height_figure
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import BASELINES, aim, baseline
 from raytrace.wave_optics.element import as_rings
 from raytrace.wave_optics.element_files import read_element, read_label, write_element
+from raytrace.wave_optics.figures import height_figure
 from raytrace.wave_optics.height_maps import write_heights
 from raytrace.wave_optics.plan import ENGINES, plan
 from raytrace.wave_optics.scene import WaveScene

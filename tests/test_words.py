@@ -43,7 +43,7 @@ def test_frozen_pages_name_their_commit():
 def test_quoted_scripts_understand_their_options(page):
     for name, words in re.findall(r"python docs/experiments/(\w+)\.py([^`\n]*)", page.read_text("utf-8")):
         parser = argparse.ArgumentParser()
-        (script(name).codesign if name == "codesign" else script(name)).options(parser)
+        script(name).options(parser)
         parser.parse_args(shlex.split(words))
 
 

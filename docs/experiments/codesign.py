@@ -1,372 +1,465 @@
-"""Co-design of the double Gauss: the claims of the published study, compared with our runs.
+"""A study of co-design: every PSF model and seed trained, and the page of the results.
 
     python docs/experiments/codesign.py double_gauss --data DIR -o FOLDER --docs docs
     python docs/experiments/codesign.py double_gauss --data DIR -o F1.9 --docs docs --page codesign_f1.9 --f-number 1.9
 
-Arguments and runs are those of `raytrace codesign compare`; the page has the published numbers and claims in addition.
-A claim is a row (text, criterion, function that judges it).
+Settings are those of `raytrace codesign`. The page of the double Gauss compares the results with the published study.
 """
 
 import argparse
 import dataclasses
 import math
-import statistics
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import codesign_figures as figures
+import codesign_study as runs
+import numpy as np
+from codesign_claims import PAPER, Claim, Measurements, claims, is_of_paper
+from codesign_study import (
+    AFTER_PARAXIAL,
+    NAMES,
+    StepTime,
+    StudyOutcome,
+    Summary,
+    closed_forms,
+    loss_increase,
+    percent,
+    summaries,
+)
+from torch import Tensor
 
 from raytrace.cli import codesign
-from raytrace.cli.codesign_compare import Publication, Report, compare
-from raytrace.imaging.codesign import Outcome
-from raytrace.imaging.codesign_study import StepTime, Summary, losses_by_distance, penalty, percent, summaries
-from raytrace.settings import NAMES
-from raytrace.system.lens import Lens
+from raytrace.cli.codesign_run import (
+    Experiment,
+    conjugates,
+    focus_of,
+    open_experiment,
+    recorded_settings,
+    settings_of,
+    train_run,
+)
+from raytrace.cli.options import file_name, seed_number
+from raytrace.cli.run import CommandError, present, say
+from raytrace.cli.settings import documents, words
+from raytrace.experiments import publish
+from raytrace.files import table
+from raytrace.imaging.closed_form import even_distances, scan
+from raytrace.imaging.codesign import OPTIMUM_COLUMNS, STEPS, Optimum, batch, camera, lens_at_start, outcome, usual
+from raytrace.imaging.pictures import dead_leaves
+from raytrace.imaging.training import Run
+from raytrace.maths.result import Result, plain
+from raytrace.pages import grid, machine, picture, shown
+from raytrace.settings import GAUSSIAN, MODELS, CodesignSettings
+from raytrace.shards import processes, share
 
-#: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
-PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
-
-#: Curvature radii in mm of the paper's lens (Table 3), to five digits; the plane ones and the stop left out.
-_RADII = (54.153, 152.522, 35.9506, 22.2699, -25.685, -36.9802, 196.417, -67.1476)
-
-SIMPLE = ("paraxial", "fourier")
-OURS = "gaussian"
+#: Figures of the page by file name, and their captions.
+CAPTIONS = {
+    "loss.png": "Loss in training, mean of every epoch; bands: range over seeds.",
+    "focus.png": "The sensor in training, and the object distance whose paraxial image it is.",
+    "blur.png": "RMS blur of traced rays on the axis, of the learned lenses.",
+    "distance.png": "Loss of test pictures with DRT PSFs after step 2, over object distance.",
+    "examples.png": "A patch of dead leaves as the sensor sees it and restored, with DRT PSFs after step 2.",
+    "scan.png": "Expected error behind the best linear filter, over the sensor distance: without a network, without "
+    "drawn noise.",
+}
+_COMMAND = "python docs/experiments/codesign.py"
+_PAPER_NOTE = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
+_SWEEP = " At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
 
 
 @dataclasses.dataclass(frozen=True)
-class Claim:
-    """What the paper says, when we call it true, whether it is (None: not answered), and the figures, or the reason.
+class Report(Result):
+    """The contents of the page.
 
-    pending: whether runs of this study that are not finished will answer it; without them it is not applicable.
+    missing: (row, seed) of unfinished runs; figures: file names that exist; folder: next to the page, of tables and
+    figures; measured: of the optimised lenses; is_of_paper: the page compares the results with the published study.
     """
 
-    text: str
-    criterion: str
-    holds: bool | None
-    figures: str
-    pending: bool = False
+    lens: str
+    pictures: str
+    settings: CodesignSettings
+    outcomes: tuple[StudyOutcome, ...]
+    missing: tuple[tuple[str, int], ...]
+    optima: tuple[Optimum, ...]
+    times: tuple[StepTime, ...]
+    figures: tuple[str, ...]
+    machine: Mapping[str, str | int]
+    folder: str = "codesign"
+    measured: Measurements = dataclasses.field(default_factory=Measurements)
+    is_of_paper: bool = False
 
     @property
-    def answer(self) -> str:
-        if self.holds is None:
-            return "not run yet" if self.pending else "not applicable"
-        return "yes" if self.holds else "no"
+    def claims(self) -> list[Claim]:
+        """Those of the published study."""
+        if not self.is_of_paper:
+            return []
+        return claims(self.outcomes, self.times, self.measured, pending={row for row, _ in self.missing})
+
+    def document(self) -> dict:
+        return plain(
+            {
+                "settings": dataclasses.asdict(self.settings),
+                "rows": [{column: getattr(run, column) for column in runs.COLUMNS} for run in self.outcomes],
+                "missing": [{"model": row, "seed": seed} for row, seed in self.missing],
+                "models": [dataclasses.asdict(summary) for summary in summaries(self.outcomes)],
+                "claims": [{**dataclasses.asdict(claim), "answer": claim.answer} for claim in self.claims],
+                "closed_form": [optimum.document() for optimum in self.optima],
+                "times": [dataclasses.asdict(time) for time in self.times],
+            }
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        columns = ("L1 step 1", "L1 step 2", "paraxial m", "RMS m", "sensor mm")
+        yield f"{'model':>26} {'seeds':>5} " + " ".join(f"{column:>10}" for column in columns)
+        for summary in summaries(self.outcomes):
+            mean = summary.mean
+            yield (
+                f"{NAMES[summary.model]:>26} {summary.seeds:>5} {mean['l1_joint']:>10.5f} {mean['l1_drt']:>10.5f} "
+                f"{mean['focus_paraxial_m']:>10.2f} {mean['focus_rms_m']:>10.2f} {mean['sensor_mm']:>10.4f}"
+            )
+        for claim in self.claims:
+            yield f"{claim.answer:>11}: {claim.text}; {claim.figures}"
+        if self.missing:
+            yield f"not finished: {', '.join(f'{row} {seed}' for row, seed in self.missing)}"
+
+    def parts(self) -> list[str]:
+        """The page."""
+        header = ("claim", "here", "figures", "yes if")
+        answers = [(claim.text, f"**{claim.answer}**", claim.figures, claim.criterion) for claim in self.claims]
+        missing, done = ", ".join(f"{row} {seed}" for row, seed in self.missing), len(self.outcomes)
+        all_runs = done + len(self.missing)
+        unfinished = f"**Unfinished: {done} of {all_runs} runs.** Missing, by model and seed: {missing}."
+        return [
+            "# Co-design: which PSF model chooses the better lens?",
+            _command(self),
+            _experiment(self),
+            unfinished if self.missing else "",
+            "## Loss and focus",
+            _table(self),
+            *(["## The paper's claims", grid(header, answers)] if answers else []),
+            *(picture(f"{self.folder}/{name}", CAPTIONS[name]) for name in self.figures),
+            "## The best linear filter and training",
+            _closed_form(self),
+            "## Time of a step",
+            _times(self),
+        ]
 
 
-@dataclasses.dataclass(frozen=True)
-class Seen:
-    """What the figures of a study show, by model.
-
-    distances: m, of blur: RMS diameters in mm of traced rays of the learned lenses; settled: the part of step 1 behind
-    which the paraxial focus stays within 2 m of its end, the mean over seeds.
-    """
-
-    distances: tuple[float, ...] = ()
-    blur: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
-    settled: Mapping[str, float] = dataclasses.field(default_factory=dict)
+def _command(report: Report) -> str:
+    rows = list(dict.fromkeys([run.model for run in report.outcomes] + [row for row, _ in report.missing]))
+    seeds = sorted({run.seed for run in report.outcomes} | {seed for _, seed in report.missing})
+    page = [] if report.folder == "codesign" else [f"--page {report.folder}"]
+    chosen = [f"--models {' '.join(rows)}", f"--seeds {' '.join(map(str, seeds))}", *page]
+    chosen += words(report.settings, codesign.ROWS)
+    return f"    {_COMMAND} {report.lens} --data DIR -o FOLDER --docs docs {' '.join(chosen)}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """Finished runs, their summaries by model, and the ms of PSFs by model. KeyError where a model is missing."""
-
-    runs: Sequence[Outcome]
-    of: Mapping[str, Summary]
-    ms: Mapping[str, float]
-    seen: Seen
-
-    def simple(self, column: str) -> list[float]:
-        """Means of both simple models."""
-        return [self.of[model].mean[column] for model in SIMPLE]
-
-    def gains(self) -> dict[float, float]:
-        """Relative gain of Gaussian DRT over the better of the simple models, by object distance in mm."""
-        distances, losses = losses_by_distance(self.runs)
-        means = {model: list(map(statistics.fmean, zip(*seeds, strict=True))) for model, seeds in losses.items()}
-        columns = zip(distances, means[OURS], *(means[model] for model in SIMPLE), strict=True)
-        return {distance: min(others) / ours - 1 for distance, ours, *others in columns}
-
-
-_NOTHING = Seen()
-
-
-def is_of_paper(lens: Lens) -> bool:
-    """Whether a lens is that of the paper, whatever its sensor distance and aperture: no other has its claims."""
-    bent = [1 / float(s.curvature) for s in lens.surfaces if s.curvature is not None and float(s.curvature) != 0]
-    return len(bent) == len(_RADII) and all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(bent, _RADII, strict=True))
-
-
-def claims(
-    found: Sequence[Outcome],
-    times: Sequence[StepTime],
-    seen: Seen = _NOTHING,
-    *,
-    pending: Collection[str] = (),
-) -> list[Claim]:
-    """All claims, over the finished runs of a study, the measured times of a step and what its figures show.
-
-    pending: models of the study with runs that are not finished.
-    """
-    of, ms = {one.model: one for one in summaries(found)}, {time.model: time.psf for time in times}
-    evidence = Evidence(found, of, ms, seen)
-    return [_answered(evidence, pending, *row) for row in CLAIMS]
-
-
-class _Unanswered(LookupError):
-    """Why a claim cannot be answered, in words."""
-
-
-def _answered(
-    evidence: Evidence,
-    pending: Collection[str],
-    text: str,
-    criterion: str,
-    judge: Callable[[Evidence], tuple[bool, str]],
-) -> Claim:
-    try:
-        return Claim(text, criterion, *judge(evidence))
-    except _Unanswered as why:
-        return Claim(text, criterion, None, str(why))
-    except KeyError as missing:
-        model = missing.args[0]
-        if model in pending:
-            return Claim(text, criterion, None, f"no finished run of {model}", pending=True)
-        return Claim(text, criterion, None, f"{NAMES.get(model, model)} is not among the models of this study")
-
-
-def _agree(given: Evidence) -> tuple[bool, str]:
-    places = given.simple("focus_paraxial_m")
-    return abs(places[0] - places[1]) <= 2, f"{_metres(places)}, paraxial conjugates"
-
-
-def _focus_of_simple(given: Evidence) -> tuple[bool, str]:
-    """Both in one definition of focus, whichever departs less."""
-    of = {name: given.simple(column) for column, name in _DEFINITIONS.items()}
-    departs = {name: _departure(places, _papers(2, SIMPLE)) for name, places in of.items()}
-    least = min(departs, key=departs.get)
-    figures = "; ".join(f"{_metres(places)}, {name}" for name, places in of.items())
-    return departs[least] <= _METRES, f"{figures}: {departs[least]:.1f} m off at most, {least}"
-
-
-def _papers(column: int, models: Iterable[str]) -> list[float]:
-    return [PAPER[model][column] for model in models]
-
-
-def _departure(found: Sequence[float], papers: Sequence[float]) -> float:
-    return max(abs(one - paper) for one, paper in zip(found, papers, strict=True))
-
-
-def _another_place(given: Evidence) -> tuple[bool, str]:
-    ours, places = given.of[OURS], given.simple("sensor_mm")
-    shifts, apart = [ours.mean["sensor_mm"] - place for place in places], abs(places[0] - places[1])
-    own = ours.deviation["sensor_mm"]
-    spread = max(math.hypot(own, given.of[model].deviation["sensor_mm"]) for model in SIMPLE)
-    shift = min(shifts, key=abs)
-    side = "nearer to" if shift < 0 else "further from"
-    over = f"deviation over {ours.seeds} seeds {1e3 * spread:.1f} µm"
-    figures = (
-        f"{1e3 * abs(shift):.0f} µm {side} the lens than the closer one; those are {1e3 * apart:.0f} µm apart, "
-        f"{over if ours.seeds > 1 else 'one seed, no deviation known'}"
+def _experiment(report: Report) -> str:
+    s = report.settings
+    aperture = "the file's aperture" if s.f_number is None else f"F/{s.f_number:g}"
+    start = {
+        "paraxial": f"the paraxial image of {s.focus_distance / 1e3:g} m",
+        "rms": f"the least RMS spot of an object at {s.focus_distance / 1e3:g} m",
+        "spectral": "the optimum of the closed form",
+        GAUSSIAN: "the optimum of the closed form of Gaussian DRT",
+    }.get(s.start, f"{s.start} mm")
+    where = "the axis" if s.fields == (0.0,) else f"the fields {_listed(s.fields)}"
+    weights = f" weighted {_listed(s.wavelength_weights)}" if len(s.wavelengths) > 1 else ""
+    counts = {"Gaussian DRT in step 1" if s.drt_rays else "step 1": s.rays, "DRT in both steps": s.drt_rays}
+    traced = [f"{count} rays ({s.sampling}) for {where}" for where, count in counts.items() if count is not None]
+    rays = f", traced with {' and '.join(traced)}" if traced else ""
+    rays += "" if s.ray_aiming is None else f"; ray aiming {s.ray_aiming}"
+    rays += "; rays beyond the semi-diameters are vignetted" if s.vignetting == "semi-diameters" else ""
+    spread = "" if s.spread == "uniform" else " in 1/z"
+    falling = "" if s.decay == "none" else ", falling to 0 along half a cosine"
+    light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]
+    return (
+        f"{report.lens} at {aperture}, {_listed(s.wavelengths)} µm{weights}, on {where}; objects at {s.near / 1e3:g} "
+        f"to {s.far / 1e3:g} m, drawn evenly{spread}; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, "
+        f"PSFs normalised to {light}{rays}; noise of standard deviation {s.noise:g} on pictures in [0, 1]. Learned: "
+        f"{s.vary}, from {start}. RED-Net of {s.depth} layers of {s.width} maps in {s.precision}, L¹ loss, Adam at "
+        f"{s.rate_network:g} (network) and {s.rate_optics:g} (lens){falling}, {s.epochs} epochs of each step, batches "
+        f"of {s.batch} patches of {s.patch} × {s.patch}. {report.pictures}."
     )
-    return abs(shift) > max(3 * spread, apart) and shifts[0] * shifts[1] > 0, figures
 
 
-def _nearer(given: Evidence) -> tuple[bool, str]:
-    ours = given.of[OURS].mean
-    figures = ", ".join(f"{ours[column]:.1f} m {name}" for column, name in _DEFINITIONS.items())
-    return all(ours[column] < min(given.simple(column)) for column in _DEFINITIONS), figures
+def _listed(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
-def _at_27_m(given: Evidence) -> tuple[bool, str]:
-    places = [given.of[OURS].mean[column] for column in _DEFINITIONS]
-    departure = min(abs(place - PAPER[OURS][2]) for place in places)
-    return departure <= _METRES, f"{_metres(places)}, paraxial conjugate and least RMS spot: {departure:.1f} m off"
-
-
-def _rises(*models: str, points: float) -> Callable[[Evidence], tuple[bool, str]]:
-    """Whether losses rise by as much as the paper's when the light is traced, to some points."""
-
-    def judge(given: Evidence) -> tuple[bool, str]:
-        found = [penalty(given.of[model]) for model in models]
-        departure = 100 * _departure(found, [PAPER[model][1] / PAPER[model][0] - 1 for model in models])
-        return departure <= points, f"{' and '.join(map(percent, found))}: {departure:.1f} points off at most"
-
-    return judge
-
-
-def _order_of_step_1(given: Evidence) -> tuple[bool, str]:
-    found = {model: given.of[model].mean["l1_joint"] for model in PAPER}
-    order = sorted(found, key=found.get)
-    figures = ", ".join(f"{NAMES[model]} {found[model]:.4f}" for model in order)
-    return order == sorted(PAPER, key=lambda model: PAPER[model][0]), figures
-
-
-def _as_large(given: Evidence) -> tuple[bool, str]:
-    ratios = [
-        given.of[model].mean[column] / PAPER[model][place] - 1
-        for model in PAPER
-        for place, column in enumerate(("l1_joint", "l1_drt"))
+def _table(report: Report) -> str:
+    if not report.outcomes:
+        return "No run is finished yet."
+    header = [
+        *("model", "seeds", "L¹, step 1", "L¹, step 2 (DRT)", "change", "focus, paraxial (m)", "focus, RMS (m)"),
+        *("sensor (mm)", "mean of the last two epochs (mm)"),
     ]
-    return max(map(abs, ratios)) <= 0.1, f"{percent(min(ratios))} to {percent(max(ratios))}"
-
-
-def _wins(given: Evidence) -> tuple[bool, str]:
-    ours, others = given.of[OURS].mean["l1_drt"], given.simple("l1_drt")
-    figures = [
-        f"{loss:.4f} ({NAMES[name]}, {percent(loss / ours - 1)})" for name, loss in zip(SIMPLE, others, strict=True)
+    columns = {"focus_paraxial_m": 1, "focus_rms_m": 1, "sensor_mm": 4, "sensor_last_epochs_mm": 4}
+    lines = [
+        [
+            NAMES[summary.model],
+            summary.seeds,
+            _spread(summary, "l1_joint", 4),
+            _spread(summary, "l1_drt", 4),
+            percent(loss_increase(summary)),
+            *(_spread(summary, column, digits) for column, digits in columns.items()),
+        ]
+        for summary in summaries(report.outcomes)
     ]
-    return ours < min(others), f"{ours:.4f} beside {' and '.join(figures)}"
+    if report.is_of_paper:
+        header += ["paper: L¹, step 1", "paper: step 2", "paper: focus (m)"]
+        published = {model: (f"{a:.4f}", f"{b:.4f}", f"{focus:.1f}") for model, (a, b, focus) in PAPER.items()}
+        for line, summary in zip(lines, summaries(report.outcomes), strict=True):
+            line += published.get(summary.model, ("–", "–", "–"))
+    return (
+        f"{grid(header, lines)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
+        "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
+        f"the paraxial one, or that of least RMS spot{_PAPER_NOTE if report.is_of_paper else ''}."
+        f" Rows one by one, with the range of the sensor in the last two epochs of step 1: "
+        f"[table2.csv]({report.folder}/table2.csv); by object distance: "
+        f"[distance.csv]({report.folder}/distance.csv)."
+    )
 
 
-def _wins_by_as_much(given: Evidence) -> tuple[bool, str]:
-    ours = given.of[OURS].mean["l1_drt"]
-    found = [loss / ours - 1 for loss in given.simple("l1_drt")]
-    departure = 100 * _departure(found, [loss / PAPER[OURS][1] - 1 for loss in _papers(1, SIMPLE)])
-    return departure <= _POINTS, f"{' and '.join(map(percent, found))}: {departure:.1f} points off at most"
+def _closed_form(report: Report) -> str:
+    trained = {summary.model: summary for summary in summaries(report.outcomes)}
+    header = (
+        *("model", "sensor (mm)", "trained (mm)", "focus, paraxial (m)", "focus, RMS (m)", "error, own PSFs"),
+        "error, DRT PSFs",
+    )
+    lines = [
+        (
+            NAMES[optimum.model],
+            f"{optimum.sensor_mm:.4f}" + (" (no optimum)" if optimum.no_optimum else ""),
+            _spread(trained[optimum.model], "sensor_mm", 4) if optimum.model in trained else "–",
+            shown(optimum.focus_paraxial_m, 1),
+            shown(optimum.focus_rms_m, 1),
+            f"{optimum.error:.6f}",
+            f"{optimum.error_drt:.6f}",
+        )
+        for optimum in report.optima
+    ]
+    scan_csv = f"; over the sensor distance: [scan.csv]({report.folder}/scan.csv)"
+    return (
+        f"{grid(header, lines)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
+        f"object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv)"
+        f"{scan_csv if 'scan.png' in report.figures else ''}.{_SWEEP if report.is_of_paper else ''}"
+    )
 
 
-def _wins_everywhere(given: Evidence) -> tuple[bool, str]:
-    gains = given.gains()
-    figures = ", ".join(f"{percent(gain)} at {distance / 1e3:g} m" for distance, gain in gains.items())
-    return min(gains.values()) > 0, f"loss of the better of both, over its own: {figures}"
+def _times(report: Report) -> str:
+    lines = [(NAMES[t.model], *(f"{ms:.1f}" for ms in (t.psf, t.image, t.network))) for t in report.times]
+    about = ", ".join(f"{key} {value}" for key, value in report.machine.items())
+    table = grid(("model", "PSFs (ms)", "image (ms)", "network (ms)"), lines)
+    return f"{table}\n\nA batch, forward and backward, median of several, the models in turns: {about}."
 
 
-def _most_at_20_to_30_m(given: Evidence) -> tuple[bool, str]:
-    gains = given.gains()
-    place = max(gains, key=gains.get)
-    return gains[place] > 0 and 20e3 <= place <= 30e3, f"greatest at {place / 1e3:g} m ({percent(gains[place])})"
+def _spread(summary: Summary, column: str, digits: int) -> str:
+    mean, deviation = shown(summary.mean[column], digits), shown(summary.deviation[column], digits)
+    return f"{mean} ± {deviation}" if summary.seeds > 1 and math.isfinite(summary.deviation[column]) else mean
 
 
-def _less_at_10_than_15_m(given: Evidence) -> tuple[bool, str]:
-    if not given.runs:
-        raise KeyError(OURS)
-    distances, losses = losses_by_distance(given.runs)
-    near, next_one = (distances.index(z) if z in distances else None for z in (10e3, 15e3))
-    if near is None or next_one is None:
-        raise _Unanswered("no losses at 10 and 15 m")
-    of = {model: [statistics.fmean(column) for column in zip(*losses[model], strict=True)] for model in PAPER}
-    figures = "; ".join(f"{NAMES[model]} {of[model][near]:.4f} and {of[model][next_one]:.4f}" for model in PAPER)
-    return all(of[model][near] < of[model][next_one] for model in PAPER), figures
+# -- the study
 
 
-def _settled(given: Evidence) -> tuple[bool, str]:
-    if given.runs and not given.seen.settled:
-        raise _Unanswered("answered only where the sensor alone varies")
-    found = {model: given.seen.settled[model] for model in PAPER}
-    return max(found.values()) <= 0.5, ", ".join(f"{NAMES[model]} after {part:.0%}" for model, part in found.items())
+def compare(arguments: argparse.Namespace) -> None:
+    """Train the missing runs, then write table, figures and page from the finished ones."""
+    if not arguments.folder:
+        raise CommandError("no folder to keep the runs in: give -o FOLDER")
+    study = Path(arguments.folder)
+    stored = study / "settings.json"
+    if (arguments.resume or arguments.report_only) and not stored.exists():
+        raise CommandError(f"{study}: no study was begun here")
+    settings = recorded_settings(stored) if arguments.report_only else settings_of(arguments, stored)
+    experiment = open_experiment(arguments, settings)
+    steps = experiment.steps_per_epoch  # refuses pictures that do not fill a batch
+    common = {name: value for name, value in dataclasses.asdict(settings).items() if name not in ("model", "seed")}
+    # Refuses a folder of other settings, another lens or other pictures.
+    Run(study, {**common, **experiment.about}, usual=usual(settings))
+    rows, seeds = _rows_and_seeds(arguments, study)
+    if not arguments.report_only:
+        # Seeds outside: a study that is stopped has compared as many models as possible.
+        for number, (row, seed) in enumerate([(row, seed) for seed in seeds for row in rows], 1):
+            of_run = runs.run_settings(study, row, seed, settings)
+            label = f"{number}/{len(rows) * len(seeds)} {row} {seed}"
+            train_run(experiment, of_run, runs.run_folder(study, row, seed), label)
+    if share().rank:
+        return  # the first process writes
+    docs = Path(arguments.docs or study)
+    report = _report(experiment, study, rows, seeds, docs, arguments.page or "codesign", steps)
+    present(report, arguments)
+    failed = [result for result in (*report.optima, *report.outcomes) if result.no_optimum]
+    for result in failed:
+        kind = "the closed form" if isinstance(result, Optimum) else f"seed {result.seed}"
+        say(f"warning: {result.model}, {kind}: {result.no_optimum}")
+    if failed and len(failed) == len(report.optima) + len(report.outcomes):
+        raise CommandError("no model has an optimum; see the warnings, and choose other --near, --far, --bounds")
 
 
-def _blur(given: Evidence, model: str) -> Sequence[float]:
-    return given.seen.blur[model]
+def _rows_and_seeds(arguments: argparse.Namespace, study: Path) -> tuple[list[str], list[int]]:
+    """Rows, in the order of the table, and seeds: those of the options; for a report alone those of the folder."""
+    stored, rows, seeds = runs.runs_of(study), list(MODELS), [0, 1, 2]
+    if arguments.report_only and stored:
+        rows, seeds = [row for row, _ in stored], sorted({seed for _, seed in stored})
+    rows = [row for row in NAMES if row in (arguments.models or rows)]
+    seeds = list(dict.fromkeys(arguments.seeds or seeds))
+    is_lacking = any(outcome(runs.run_folder(study, "paraxial", seed)) is None for seed in seeds)
+    if AFTER_PARAXIAL in rows and "paraxial" not in rows and is_lacking:
+        raise CommandError(f"{AFTER_PARAXIAL} starts from the paraxial run: add paraxial to --models")
+    return rows, seeds
 
 
-def _falls_with_distance(given: Evidence) -> tuple[bool, str]:
-    least = {}
-    for model in SIMPLE:
-        own = _blur(given, model)
-        least[model] = given.seen.distances[min(range(len(own)), key=own.__getitem__)]
-    return min(least.values()) >= 33.5, ", ".join(f"{NAMES[model]} least at {z:g} m" for model, z in least.items())
+def _report(
+    experiment: Experiment,
+    study: Path,
+    rows: Sequence[str],
+    seeds: Sequence[int],
+    docs: Path,
+    page: str,
+    steps_per_epoch: int,
+) -> Report:
+    """Write the page, its tables and figures."""
+    lens, settings = experiment.lens, experiment.settings
+    focus = focus_of(lens, settings)
+    results = runs.with_last_epochs(study, runs.outcomes(study, rows, seeds), settings.epochs, focus)
+    say("the closed form, and the time of a step, of every model")
+    spectrum = experiment.spectrum()
+    optima = closed_forms(lens, settings, spectrum, rows)
+    cameras = [camera(lens, dataclasses.replace(settings, model=row)) for row in rows if row in MODELS]
+    times = runs.step_times(cameras, batch(experiment.train, settings, list(range(settings.batch)), 0))
+    drawn: dict[str, figures.Figure] = {}
+    if joint := runs.courses(study, results, "loss", STEPS[0]):
+        refined = runs.courses(study, results, "loss", STEPS[1])
+        drawn["loss.png"] = figures.loss_figure(joint, refined, steps_per_epoch)
+    sensors = runs.courses(study, results, "sensor")
+    if sensors:
+        drawn["focus.png"] = figures.focus_figure(sensors, conjugates(lens, settings), steps_per_epoch)
+    distances = np.linspace(settings.near, settings.far, 41)
+    blur: dict[str, list[float]] = {}
+    if results:
+        shown_distances = [settings.near + part * (settings.far - settings.near) for part in (0, 0.25, 0.5, 1)]
+        blur, patches = _of_trained_lenses(experiment, study, results, distances, shown_distances)
+        drawn["blur.png"] = figures.blur_figure(distances.tolist(), blur, settings.pixel)
+        drawn["distance.png"] = figures.distance_figure(*runs.losses_by_distance(results))
+        drawn["examples.png"] = figures.examples_figure(patches, shown_distances)
+    ends = {summary.model: summary.mean["sensor_mm"] for summary in summaries(results)}
+    scanned = _scan(experiment, spectrum, optima, list(ends.values()))
+    if scanned:
+        drawn["scan.png"] = figures.scan_figure(*scanned, ends)
+    settled = {} if focus is None else {row: _settled(seeds, focus, steps_per_epoch) for row, seeds in sensors.items()}
+    done = {(run.model, run.seed) for run in results}
+    report = Report(
+        lens=experiment.name,
+        pictures=f"{len(experiment.train)} {experiment.kind} to train on, {len(experiment.test)} to test",
+        settings=settings,
+        outcomes=tuple(results),
+        missing=tuple((row, seed) for seed in seeds for row in rows if (row, seed) not in done),
+        optima=tuple(optima),
+        times=tuple(times),
+        figures=tuple(name for name in CAPTIONS if name in drawn),
+        machine=machine(),
+        folder=page,
+        measured=Measurements(tuple(distances / 1e3), blur, settled),
+        is_of_paper=is_of_paper(lens),
+    )
+    tables = {
+        "table2.csv": table(results, runs.COLUMNS),
+        "distance.csv": table(runs.distance_rows(results), runs.DISTANCE_COLUMNS),
+        "blur.csv": _curves(("model", "distance_m", "diameter_um"), report.measured.distances, blur, 1e3),
+        "spectral.csv": table(optima, OPTIMUM_COLUMNS),
+    }
+    if scanned:
+        tables["scan.csv"] = _curves(("model", "sensor_mm", "error"), *scanned)
+    publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
+    return report
 
 
-def _larger_far_away(given: Evidence) -> tuple[bool, str]:
-    far = {model: _blur(given, model)[-1] for model in PAPER}
-    figures = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in far.items())
-    return far[OURS] > max(far[model] for model in SIMPLE), f"at {given.seen.distances[-1]:g} m {figures}"
+def _curves(
+    columns: Sequence[str], places: Sequence[float], values: Mapping[str, Sequence[float]], scale: float = 1
+) -> str:
+    """A table of values of every model at places, a row for each."""
+    points = [(row, x, scale * y) for row, curve in values.items() for x, y in zip(places, curve, strict=True)]
+    return table([dict(zip(columns, point, strict=True)) for point in points], columns)
 
 
-def _smaller_overall(given: Evidence) -> tuple[bool, str]:
-    of = {model: statistics.fmean(_blur(given, model)) for model in PAPER}
-    figures = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in of.items())
-    return of[OURS] < min(of[model] for model in SIMPLE), f"in the mean {figures}"
+def _of_trained_lenses(
+    experiment: Experiment, study: Path, results: Sequence[StudyOutcome], distances: np.ndarray, shown: Sequence[float]
+) -> tuple[dict[str, list[float]], dict[str, dict[str, np.ndarray]]]:
+    """RMS blur diameters in mm over distances (mm), the mean over seeds, and patches restored by the first seed."""
+    diameters: dict[str, list[list[float]]] = {}
+    patches: dict[str, dict[str, np.ndarray]] = {}
+    # Of dead leaves: the page may be published, pictures of a data set often may not.
+    leaves = dead_leaves(2, size=2 * (experiment.settings.patch + experiment.settings.size))
+    for run in results:
+        settings = runs.run_settings(study, run.model, run.seed, experiment.settings)
+        trained = runs.trained(experiment.lens, settings, runs.run_folder(study, run.model, run.seed))
+        if run.model not in patches:
+            restored = runs.examples(trained, leaves, settings, shown)
+            patches[run.model] = {name: patch.float().numpy() for name, patch in restored.items()}
+        lens = trained.variables()
+        blur = runs.blur_diameters(lens, lens.wavelengths.new_tensor(distances))
+        diameters.setdefault(run.model, []).append(blur.tolist())
+    return {row: np.mean(curves, 0).tolist() for row, curves in diameters.items()}, patches
 
 
-def _varies_less(given: Evidence) -> tuple[bool, str]:
-    of = {model: max(_blur(given, model)) - min(_blur(given, model)) for model in PAPER}
-    figures = ", ".join(f"{NAMES[model]} by {1e3 * width:.1f} µm" for model, width in of.items())
-    return of[OURS] < min(of[model] for model in SIMPLE), figures
+def _settled(seeds: Sequence[Sequence[float]], focus: Callable[[float], float], steps_per_epoch: int) -> float:
+    """Fraction of step 1 after which the mean focus of an epoch stays within 2 m of its end, mean over seeds."""
+    starts = range(0, len(seeds[0]), steps_per_epoch)
+    epochs = [[focus(float(np.mean(course[i : i + steps_per_epoch]))) for i in starts] for course in seeds]
+    return float(np.mean([runs.settled(course) for course in epochs]))
 
 
-def _simple_cheaper(given: Evidence) -> tuple[bool, str]:
-    holds = max(given.ms[model] for model in SIMPLE) < 0.9 * min(given.ms[OURS], given.ms["drt"])
-    return holds, _costs(given, given.ms)
+def _scan(
+    experiment: Experiment, spectrum: Tensor, optima: Sequence[Optimum], ends: Sequence[float]
+) -> tuple[list[float], dict[str, list[float]]] | None:
+    """Sensor distances in mm, and errors of the closed form there by model; None unless the sensor alone varies.
 
-
-def _ours_cheaper(given: Evidence) -> tuple[bool, str]:
-    return given.ms[OURS] < 0.9 * given.ms["drt"], _costs(given, (OURS, "drt"))
-
-
-def _costs(given: Evidence, models: Iterable[str]) -> str:
-    return ", ".join(f"{NAMES[model]} {given.ms[model]:.1f} ms" for model in sorted(models, key=given.ms.get))
-
-
-def _metres(distances: Sequence[float]) -> str:
-    return " and ".join(f"{distance:.1f} m" for distance in distances)
-
-
-_DEFINITIONS = {"focus_paraxial_m": "paraxial conjugate", "focus_rms_m": "least RMS spot"}
-_METRES, _POINTS = 2.0, 5.0  # by which a number may depart from the paper's
-
-CLAIMS = (
-    ("Paraxial and Fourier optics agree", "focus within 2 m of each other (the paper: 1.8 m)", _agree),
-    ("… at 33.9 and 35.7 m", "both within 2 m, in one definition of focus", _focus_of_simple),
-    (
-        "Gaussian DRT chooses another sensor position",
-        "further from both than three deviations, and than they are apart",
-        _another_place,
-    ),
-    ("… focused nearer", "nearer than both, in both definitions of focus", _nearer),
-    ("… at 27.3 m", "within 2 m, in one of the definitions", _at_27_m),
-    ("The focus is near its end early (Figure 4)", "within 2 m of it after half of step 1, all three", _settled),
-    ("The simple lenses' blur falls with distance (Figure 5)", "least at 33.5 m or further", _falls_with_distance),
-    ("… that of Gaussian DRT's is larger far away", "than both, at the furthest object", _larger_far_away),
-    ("… but smaller overall", "than both, the mean over distances", _smaller_overall),
-    ("… and varies less", "greatest less least, than both", _varies_less),
-    ("Losses are the paper's, 0.041 to 0.051", "all six within 10 %", _as_large),
-    ("Fourier optics' loss of step 1 is the least, Gaussian DRT's the greatest", "in this order", _order_of_step_1),
-    (
-        "The simple models lose much to DRT (+21 %, +25 %)",
-        "both to 5 points",
-        _rises(*SIMPLE, points=_POINTS),
-    ),
-    ("Gaussian DRT loses little (+0.2 %)", "to 1 point", _rises(OURS, points=1.0)),
-    ("The lens of Gaussian DRT is best after step 2", "least mean loss with DRT PSFs", _wins),
-    ("… by 17 and 18 %", "both to 5 points", _wins_by_as_much),
-    ("… at all object distances (Figure 6)", "less loss than both at each", _wins_everywhere),
-    ("… most at 20 to 30 m", "a gain over the better of both, and the greatest there", _most_at_20_to_30_m),
-    ("All lose less at 10 m than at 15 m (Figure 6)", "each of the three", _less_at_10_than_15_m),
-    (
-        "Paraxial and Fourier optics cost less than ray tracing",
-        "PSFs and gradient of a batch: both a tenth less than Gaussian DRT and DRT, or better",
-        _simple_cheaper,
-    ),
-    ("A Gaussian DRT costs less than the DRT", "PSFs and gradient of a batch: a tenth less or better", _ours_cheaper),
-)
-
-
-def publication(lens: Lens) -> Publication | None:
-    """The publication, of its lens only."""
-    if not is_of_paper(lens):
+    ends: sensor distances at the end of training.
+    """
+    lens, settings = experiment.lens, experiment.settings
+    if settings.vary.split() != ["sensor"] or not optima:
         return None
-    return Publication(
-        command="python docs/experiments/codesign.py",
-        columns=("paper: L¹, step 1", "paper: step 2", "paper: focus (m)"),
-        numbers={model: (f"{a:.4f}", f"{b:.4f}", f"{focus:.1f}") for model, (a, b, focus) in PAPER.items()},
-        note="; “paper”: the published study of this lens and these models, which does not say which focus is its own",
-        claims=claims_of,
-        closed_form="At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md).",
+    start = float(lens_at_start(lens, settings).surfaces[-2].thickness)
+    places = [start, *(optimum.sensor_mm for optimum in optima), *ends]
+    margin = 0.15 * (max(places) - min(places)) + 0.02
+    sensors = np.linspace(min(places) - margin, max(places) + margin, 41).tolist()
+    errors = {}
+    for model in [optimum.model for optimum in optima if optimum.model in MODELS]:
+        at_start = camera(lens, dataclasses.replace(settings, model=model))
+        errors[model] = scan(at_start, spectrum, sensors, even_distances(at_start, spread=settings.spread))
+    return sensors, errors
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    codesign.experiment_options(parser)
+    group = parser.add_argument_group("study")
+    group.add_argument(
+        "--models",
+        metavar="MODEL",
+        choices=(*MODELS, AFTER_PARAXIAL),
+        nargs="+",
+        help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT started where "
+        "the paraxial run ended",
     )
-
-
-def claims_of(report: Report) -> list[Claim]:
-    seen = Seen(report.distances, report.blur, report.settled)
-    return claims(report.found, report.times, seen, pending={model for model, _ in report.missing})
+    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
+    documents(group, "the page and of codesign/ (default: FOLDER)")
+    group.add_argument(
+        "--page", metavar="NAME", type=file_name, help="write NAME.md and NAME/ there (default codesign)"
+    )
+    group.add_argument("--report-only", action="store_true", help="train nothing, write the page of the stored runs")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    codesign.options(parser)
-    parser.usage = "codesign.py LENS -o FOLDER [--docs DOCS] [options of raytrace codesign compare]"
+    options(parser)
     arguments = parser.parse_args(argv)
-    (arguments.lens,) = arguments.words
-    compare(arguments, publication)
+    with processes():
+        compare(arguments)
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ from raytrace.imaging.wave_camera import (
     depth_text,
     expected_error,
     kernels,
+    mark_depths,
     mirrored,
     periodic,
     quality,
@@ -50,9 +51,7 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, picture
-from raytrace.plotting.images import show_image
-from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
-from raytrace.plotting.wave_design import mark_depths
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import Aim, aim, baseline
 from raytrace.wave_optics.element import Element, height_range

@@ -1,8 +1,11 @@
 """Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
 
+import math
+
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import SAGITTAL, chart, drawn_at_least, finished, over_field
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import (
     NothingToShow,
@@ -15,10 +18,11 @@ from raytrace.analysis.setting import (
     shown,
     unvignetted,
 )
-from raytrace.maths.dual import divide
-from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
+from raytrace.analysis.spot_diagram import airy_radius
+from raytrace.maths.numerics import divide, dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import FAINT, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import is_at_infinity
@@ -47,7 +51,6 @@ class Distortion(OverField):
     valid: Tensor
 
     COMMAND = "distortion"
-    FIGURE = "plotting.analysis.distortion_curves"
 
     def columns(self) -> dict[str, Tensor]:
         relative = {"f_tan_percent": self.f_tan, "f_theta_percent": self.f_theta}
@@ -57,6 +60,20 @@ class Distortion(OverField):
 
     def at(self, fields: Tensor) -> "Distortion":
         return _distortion(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Distortion in percent over the field: against f tan θ, and against f θ where the object is at infinity."""
+        curves = self.drawn()
+        infinite = curves.f_theta is not None
+        ideals = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta} if infinite else {"Height": curves.f_tan}
+        figure = new_figure(3.1 * len(ideals) + 0.9, 4.2)
+        panels = figure.subplots(1, len(ideals), squeeze=False)[0]
+        for panel, (name, values) in zip(panels, ideals.items(), strict=True):
+            over_field(panel, curves, 100 * values)
+            panel.set_xlabel(f"{name} distortion (%)")
+            drawn_at_least([panel], 1e-6, "x")
+        return finished(panels[-1], curves, "distortion", len(curves.wavelengths))
 
 
 @value
@@ -73,7 +90,6 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    FIGURE = "plotting.analysis.curvature_curves"
     UNIT = "mm"
 
     def columns(self) -> dict[str, Tensor]:
@@ -82,6 +98,16 @@ class FieldCurvature(OverField):
 
     def at(self, fields: Tensor) -> "FieldCurvature":
         return _field_curvature(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Foci of close rays over the field: tangential solid, sagittal dashed."""
+        curves = self.drawn()
+        _, panel = chart(4.6, 4.4, "focus from the sensor (mm)", "")
+        over_field(panel, curves, curves.tangential, suffix=" T", dashes=("solid",))
+        over_field(panel, curves, curves.sagittal, suffix=" S", dashes=(SAGITTAL,))
+        drawn_at_least([panel], 1e-6, "x")
+        return finished(panel, curves, "field curvature", 2 if len(curves.wavelengths) < 3 else 3)
 
 
 @value
@@ -98,13 +124,24 @@ class LateralColour(OverField):
     valid: Tensor
 
     COMMAND = "lateral-colour"
-    FIGURE = "plotting.analysis.lateral_curves"
 
     def columns(self) -> dict[str, Tensor]:
         return {**self.heads(wavelength=self.wavelengths), "shift": masked(self.shift, self.valid)}
 
     def at(self, fields: Tensor) -> "LateralColour":
         return _lateral_colour(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Chief-ray heights less that of the primary wavelength over the field; its Airy radius is grey."""
+        curves = self.drawn()
+        _, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
+        if math.isfinite(airy := 1e3 * float(airy_radius(curves.lens))):
+            panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
+        over_field(panel, curves, 1e3 * curves.shift)
+        if not panel.patches:
+            drawn_at_least([panel], 1e-3, "x")
+        return finished(panel, curves, "lateral colour", 4)
 
 
 def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11) -> Distortion:

@@ -11,19 +11,19 @@ from raytrace.cli.options import (
     folder_or_lens,
     json,
     output_folder,
+    plot,
     positive,
     positive_finite,
-    seed_number,
     substitute,
 )
-from raytrace.cli.settings import SEED, add_options, defaults_of, documents, option, picture_options
-from raytrace.settings import AFTER_PARAXIAL, MODELS, CodesignSettings
+from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
+from raytrace.settings import MODELS, CodesignSettings
 
 SUMMARY = "optimise a lens together with a restoration network"
 DESCRIPTION = """\
 Train the sensor distance (or any variables) of a lens together with a network that restores its images. Step 1 trains
 both with the PSFs of one model; step 2 freezes the lens and continues to train the network on PSFs of traced rays, for
-as many epochs. `compare` trains every model and seed and writes a page of tables and figures.
+as many epochs.
 
 Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
 (Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
@@ -33,13 +33,11 @@ A run may be interrupted at any time: the same command resumes it bit-identicall
 torchrun --nproc-per-node 2 -m raytrace codesign …"""
 EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral -o learned.zmx
-  raytrace codesign double_gauss --model gaussian --data pictures -o run
+  raytrace codesign double_gauss --model gaussian --data pictures -o run --plot loss.png
   raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o from_closed_form
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
-  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
-  raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study
-  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only"""
+  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json"""
 
 #: The options by the field of `CodesignSettings`.
 ROWS = {
@@ -118,31 +116,14 @@ ROWS = {
     "crops": option("patches of a picture in an epoch"),
 }
 _PICTURES = ("patch", "crops")
-_TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "decay", "precision")
-_SCENE = tuple(name for name in ROWS if name not in ("model", *_PICTURES, *_TRAINING))
+_TRAINING = ("depth", "width", "epochs", "batch", "rate_network", "rate_optics", "decay", "precision")
+_OF_ONE_RUN = ("model", "seed")
+_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING))
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "raytrace codesign [compare] LENS [-o FOLDER] [options]"
-    parser.add_argument(
-        "words",
-        metavar="LENS",
-        type=file_name,
-        nargs="+",
-        help="lens file, or the name of a shipped lens; `compare` before it runs all models and seeds",
-    )
-    catalog(parser)
-    substitute(parser)
-    json(parser)
-    output_folder(
-        parser,
-        "folder of the run, or of all runs of compare; the optimised lens is lens.zmx in the folder of a run. A lens "
-        "file (.zmx, .csv) is written in addition to a folder of the same name without suffix",
-        type=folder_or_lens,
-    )
-    parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
-    defaults = defaults_of(CodesignSettings)
-    add_options(parser, defaults, ROWS, "model")
+    experiment_options(parser)
+    add_options(parser, defaults_of(CodesignSettings), ROWS, *_OF_ONE_RUN)
     parser.add_argument(
         "--loss",
         choices=("image", "spectral"),
@@ -150,6 +131,23 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="image: L1 of restored images, by training (default); spectral: the closed form, without a network, "
         "in seconds",
     )
+    plot(parser, "the loss over the steps of training, or over the evaluations of the closed form")
+
+
+def experiment_options(parser: argparse.ArgumentParser) -> None:
+    """All options but those of a single run: the experiment that several models and seeds can share."""
+    parser.add_argument("lens", metavar="LENS", type=file_name, help="lens file, or the name of a shipped lens")
+    catalog(parser)
+    substitute(parser)
+    json(parser)
+    output_folder(
+        parser,
+        "folder of the run; the optimised lens is lens.zmx there. A lens file (.zmx, .csv) is written in addition to a "
+        "folder of the same name without suffix",
+        type=folder_or_lens,
+    )
+    parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
+    defaults = defaults_of(CodesignSettings)
     group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
     add_options(group, defaults, ROWS, *_PICTURES)
     scene = parser.add_argument_group("lens and scene")
@@ -165,18 +163,3 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
     )
     add_options(training, defaults, ROWS, *_TRAINING)
-    group = parser.add_argument_group("compare")
-    group.add_argument(
-        "--models",
-        metavar="MODEL",
-        choices=(*MODELS, AFTER_PARAXIAL),
-        nargs="+",
-        help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT started where "
-        "the paraxial run ended",
-    )
-    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
-    documents(group, "the page and of codesign/ (default: FOLDER)")
-    group.add_argument(
-        "--page", metavar="NAME", type=file_name, help="write NAME.md and NAME/ there (default codesign)"
-    )
-    group.add_argument("--report-only", action="store_true", help="train nothing, write the page of the stored runs")

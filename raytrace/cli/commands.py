@@ -247,7 +247,7 @@ def _wave_psf(arguments: argparse.Namespace):
 
 
 def _codesign(arguments: argparse.Namespace):
-    from raytrace.cli.codesign_compare import run
+    from raytrace.cli.codesign_run import run
 
     return run(arguments)
 

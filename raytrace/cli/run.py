@@ -117,9 +117,8 @@ def options_of(arguments: argparse.Namespace) -> dict:
         options["share"] = share()
     if _takes(arguments, "execution"):
         options["execution"] = Execution(**{name: options.pop(name) for name in _EXECUTION if name in options})
-    if arguments.run.verb == "psf" and (
-        numbers := {key: options.pop(key) for key in ("rays", "rho") if key in options}
-    ):
+    numbers = {key: options.pop(key) for key in ("rays", "rho") if arguments.run.verb == "psf" and key in options}
+    if numbers:
         options["model"] = model_of(options.get("model", "auto"), **numbers)
     return options
 

@@ -38,14 +38,14 @@ from raytrace.imaging.variables import Variables, parse_bounds, parse_range
 from raytrace.io import write_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.settings import AFTER_PARAXIAL, GAUSSIAN, CodesignSettings
+from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of what a sample draws
-_TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
+TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
 STEPS = ("joint", "refine")
 LENS = "lens.zmx"  # of a run: the lens as it was learned
 #: What Adam's rates are multiplied with, by the part of the steps that are taken.
@@ -53,8 +53,6 @@ _DECAYS: dict[str, Callable[[float], float]] = {
     "none": lambda part: 1.0,
     "cosine": lambda part: 0.5 * (1 + math.cos(math.pi * part)),
 }
-#: Of an outcome; not in its file.
-_OF_STUDY = ("sensor_last_epochs_mm", "sensor_range_last_epochs_mm", "focus_last_epochs_m")
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
 
@@ -66,8 +64,7 @@ class Outcome:
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
     vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty:
     mm², violation of the thickness limits, no part of the losses; no_optimum: why the lens is none of least loss
-    ("" where nothing speaks against it). *_last_epochs: means over the end of step 1, and over what the sensor
-    moves there, which a study adds.
+    ("" where nothing speaks against it).
     """
 
     model: str
@@ -82,12 +79,9 @@ class Outcome:
     by_distance: dict[str, float]
     penalty: float = 0.0
     no_optimum: str = ""
-    sensor_last_epochs_mm: float = math.nan
-    sensor_range_last_epochs_mm: float = math.nan
-    focus_last_epochs_m: float = math.nan
 
     def document(self) -> dict:
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in _OF_STUDY}
+        return dataclasses.asdict(self)
 
 
 def lens_at_start(lens: Lens, settings: CodesignSettings) -> Lens:
@@ -201,16 +195,22 @@ def drawn_distance(random: np.random.Generator, settings: CodesignSettings) -> f
     return 1 / random.uniform(1 / settings.far, 1 / settings.near)
 
 
+def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
+    """Raises ValueError if the pictures do not fill a batch."""
+    if steps := len(pictures) * settings.crops // settings.batch:
+        return steps
+    raise ValueError(
+        f"{len(pictures)} pictures to train on, {settings.crops} crops of each, do not fill one batch of "
+        f"{settings.batch}; give more pictures, more crops or a smaller batch"
+    )
+
+
 class Batches:
     """The batches of a run by step; the next one is made while a step is taken."""
 
     def __init__(self, pictures: Pictures, settings: CodesignSettings):
         self.pictures, self.settings = pictures, settings
-        self.steps_per_epoch = len(pictures) * settings.crops // settings.batch
-        if not self.steps_per_epoch:
-            raise ValueError(
-                f"{len(pictures)} pictures of {settings.crops} crops do not fill a batch of {settings.batch}: give more"
-            )
+        self.steps_per_epoch = steps_per_epoch(pictures, settings)
         self._maker = ThreadPoolExecutor(1)
         self._coming: dict[tuple[int, Share], object] = {}
 
@@ -285,7 +285,7 @@ def held_out_error(
     """Mean |restored - picture| of all test samples, at drawn object distances or at one."""
     count, total = len(pictures) * settings.crops, 0.0
     for first in progress(range(0, count, settings.batch)):
-        found = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), _TEST_EPOCH)
+        found = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), TEST_EPOCH)
         if distance is not None:
             found = dataclasses.replace(found, distance=torch.full_like(found.distance, distance))
         total += float(absolute_error(camera, found).sum())
@@ -409,7 +409,7 @@ OPTIMUM_COLUMNS = tuple(field.name for field in dataclasses.fields(Place))
 
 @dataclasses.dataclass(frozen=True)
 class Optimum(Place):
-    """The lens of least closed-form error of one model, or of one row of a study.
+    """The lens of least closed-form error of one model.
 
     course, penalties: error and penalty at every evaluation. at_end: variables at an end of their bounds behind which
     the error still falls; lens: as it was found.
@@ -452,16 +452,3 @@ def closed_form(lens: Lens, settings: CodesignSettings, spectrum: Tensor) -> Opt
         no_optimum=course.no_optimum,
         lens=found,
     )
-
-
-def closed_forms(lens: Lens, settings: CodesignSettings, spectrum: Tensor, rows: Sequence[str]) -> list[Optimum]:
-    """The optimum of every row of a study. `AFTER_PARAXIAL`: of Gaussian DRT, begun where paraxial optics end."""
-
-    def optimum(model: str, start: str = settings.start) -> Optimum:
-        return closed_form(lens, dataclasses.replace(settings, model=model, start=start), spectrum)
-
-    found = {row: optimum(row) for row in rows if row != AFTER_PARAXIAL}
-    if AFTER_PARAXIAL in rows:
-        before = found.get("paraxial") or optimum("paraxial")
-        found[AFTER_PARAXIAL] = dataclasses.replace(optimum("gaussian", repr(before.sensor_mm)), model=AFTER_PARAXIAL)
-    return [found[row] for row in rows]

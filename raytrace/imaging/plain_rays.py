@@ -80,7 +80,7 @@ def _gaussian(light: Scene, window: Grid, disc: Tensor) -> Tensor:
     traced, weights = trace_scene(light, disc), torch.full_like(disc[0], 1 / disc.shape[1])
     valid = traced.valid.expand(*light.shape, disc.shape[1])
     hits = traced.position[:2].expand(2, *valid.shape)
-    centroid, covariance, arrived = gaussian.moments(gaussian.Light(hits, valid, weights, disc.shape[1]), "none")
+    centroid, covariance, arrived = gaussian.spot_moments(gaussian.Light(hits, valid, weights, disc.shape[1]), "none")
     if symmetry(light) != "none" and _is_mirrored(disc):
         covariance = covariance[[0, 2]]  # xy is 0 but for rounding, and costs a quadrature over every pixel
     return (arrived * beam_share(light))[..., None, None] * gaussian_pixels(window, centroid, covariance)

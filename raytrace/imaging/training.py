@@ -32,8 +32,8 @@ from raytrace.words import calling_level
 Record = dict[str, float]
 
 
-class NotFinite(ArithmeticError):
-    """A loss or a gradient that is no number; the run stops, its last checkpoint stands."""
+class NotFinite(ArithmeticError, ValueError):
+    """A loss or a gradient is not finite; the run stops, its last checkpoint remains."""
 
 
 class OtherSettings(ValueError):

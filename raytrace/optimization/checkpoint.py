@@ -227,7 +227,7 @@ def _written(course: Course) -> dict:
     }
 
 
-_ENDS = ("gradient", "step", "merit", "cycles", "seconds", "interrupted")  # of a path: `result.STOPPED`
+_ENDS = ("gradient", "step", "merit", "cycles", "seconds", "interrupted")  # of a path: `report.STOPPED`
 _NUMBERS = ("damping", "factor", "share", "price")
 _VECTOR = listed(number())
 _POSITIVE = number(0)

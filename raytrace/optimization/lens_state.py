@@ -1,7 +1,7 @@
 """LensState: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
 
-Numbers are plain, or dual (`maths.dual`) where derivatives are computed; the formulas are the same. SOLVES computes the
-numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
+Numbers are plain, or dual (`maths.numerics`) where derivatives are computed; the formulas are the same. SOLVES computes
+the numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
-from raytrace.system.surface import sag_at, vertex_curvature
+from raytrace.system.surface import sag_at, signed, vertex_curvature
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian, signed
+from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.

@@ -13,19 +13,11 @@ from raytrace.optimization.attained import Reached
 from raytrace.optimization.glass_choice import GlassStep
 from raytrace.optimization.merit import configurations_of
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.report import STOPPED, optimize_report
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
 
-#: Why a descent ends, by what is told of it.
-STOPPED = {
-    "gradient": "no variable makes the merit any less",
-    "step": "no step makes the merit any less",
-    "merit": "the merit hardly changes any more",
-    "cycles": "the limit on cycles was reached",
-    "seconds": "as much time as was asked for",
-    "interrupted": "interrupted; this is the best so far",
-}
 _SHOWN = 12  # rows of the merit function in the text, those that are left most
 
 
@@ -59,7 +51,9 @@ class Optimized(Result):
     glasses: tuple[GlassStep, ...] = ()
     conditions: tuple[Reached, ...] = ()
 
-    FIGURE = "plotting.optimize.optimize_report"
+    def draw(self):
+        """One page: lens, spots and merit function before and after."""
+        return optimize_report(self)
 
     @property
     def rows(self) -> tuple[int, ...]:

@@ -13,15 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.analysis.spot_diagram import spot
 from raytrace.files import write_table
 from raytrace.io import LensFileWarning, write_lens
-from raytrace.maths.result import Result, called, cell
-from raytrace.maths.value import value
+from raytrace.maths.result import Result, cell
+from raytrace.maths.value import detached, value
 from raytrace.optimization.journal import Ended
 from raytrace.optimization.problem import NoProblem, Problem, optimization_data_of
+from raytrace.optimization.report import drawn_fields
+from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.spot_diagram import spot
 
 _ALIKE = 0.03  # of the range of a variable: how far two minima may lie apart that are one
 _EQUAL = 2e-2  # of the merit
@@ -80,6 +83,8 @@ STOPPED = {
 }
 KEPT = 40  # minima that are told of
 
+_MOST, _COLUMNS = 9, 3  # lenses of the figure
+
 
 @value
 class Searched(Result):
@@ -105,8 +110,6 @@ class Searched(Result):
     descents: int
     seconds: float
     stopped: str
-
-    FIGURE = "plotting.search.best"
 
     @property
     def lens(self) -> Lens:
@@ -142,6 +145,25 @@ class Searched(Result):
             lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")
         return "\n".join(lines)
 
+    @style.styled
+    def draw(self):
+        """The best lenses on one scale, each with its merit, its spots and how often it was self."""
+        count = min(_MOST, len(self.lenses))
+        columns = min(_COLUMNS, count)
+        rows = -(-count // columns)
+        figure = style.new_figure(3.6 * max(columns, 2), 2.5 * rows + 0.5)
+        figure.suptitle(
+            style.fill(self.before.name or "Lens", figure.get_figwidth(), 11, bold=True), fontsize=11, fontweight="bold"
+        )
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for k, axes in enumerate(panels):
+            if k < count:
+                _draw(axes, self, k)
+            else:
+                axes.set_axis_off()
+        on_one_scale(panels[:count])
+        return figure
+
     def save(self, folder: str | PathLike) -> None:
         """Write a lens file and a thumbnail of every minimum, the table, and a figure of the best side by side."""
         folder = Path(folder)
@@ -151,7 +173,7 @@ class Searched(Result):
                 if number > 1:  # what a file cannot hold is the same of all
                     warnings.simplefilter("ignore", LensFileWarning)
                 write_lens(lens, folder / f"minimum_{number:02d}.zmx")
-            called("plotting.search.thumbnail")(lens, folder / f"minimum_{number:02d}.png")
+            thumbnail(lens, folder / f"minimum_{number:02d}.png")
         for path in folder.glob("minimum_*.*"):
             if path.stem.removeprefix("minimum_").isdigit() and int(path.stem.removeprefix("minimum_")) > number:
                 path.unlink()
@@ -218,3 +240,26 @@ def _named(lens: Lens, problem: Problem, x: np.ndarray, number: int) -> Lens:
     found = model.lens_at(x)
     optimization_data = found.optimization_data or optimization_data_of(model, problem.rows, problem.unit)
     return replace(found, name=f"{lens.name}, minimum {number}".removeprefix(", "), optimization_data=optimization_data)
+
+
+def _draw(axes, found: Searched, k: int) -> None:
+    _draw_lens(axes, found.lenses[k])
+    spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
+    times = int(found.found[k])
+    axes.set_title(
+        f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
+        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
+    )  # fmt: skip
+
+
+def _draw_lens(axes, lens: Lens) -> None:
+    lens = detached(lens)
+    draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
+
+
+@style.styled
+def thumbnail(lens: Lens, path: str | PathLike) -> None:
+    """Write the cross section alone, small."""
+    figure = style.new_figure(3.0, 1.8)
+    _draw_lens(figure.add_subplot(), lens)
+    style.save(figure, path, dpi=80)

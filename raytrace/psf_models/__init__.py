@@ -2,29 +2,30 @@
 
     psf(lens, model="gaussian", fields=…, object_distances=…, pixel=0.005, size=21, tol=1e-3) -> Psf
 
-`models.py` is the table of the models and drives them to a tolerance, `compute.py` is the call.
+`models.py` has the call, the table of the models and the choice of an order; `sharing.py` the work of several
+processes.
 
-| model    | what it knows of the lens                                                       | module         |
+| model    | data of the lens                                                                | module         |
 |----------|---------------------------------------------------------------------------------|----------------|
 | paraxial | focal length, principal planes, entrance pupil: a Gaussian of the defocus blur  | paraxial.py    |
 | fourier  | the same, with diffraction: a defocused (and aberrated) circular pupil          | fourier.py     |
 | gaussian | centroid and covariance of traced rays                                          | gaussian.py    |
-| drt      | all traced rays: geometric optics                                               | rays.py        |
-| wave     | the traced wavefront: diffraction with the true aberrations                     | diffraction.py |
+| drt      | all traced rays: geometric optics                                               | drt.py         |
+| wave     | the traced wavefront: diffraction with the true aberrations                     | wave.py        |
 """
 
 from raytrace.psf_models.closeup import CloseUp as CloseUp
 from raytrace.psf_models.closeup import close_up as close_up
-from raytrace.psf_models.compute import Execution as Execution
-from raytrace.psf_models.compute import psf as psf
 from raytrace.psf_models.models import DRT as DRT
 from raytrace.psf_models.models import MODELS as MODELS
+from raytrace.psf_models.models import Execution as Execution
 from raytrace.psf_models.models import Fourier as Fourier
 from raytrace.psf_models.models import Gaussian as Gaussian
 from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.models import Paraxial as Paraxial
 from raytrace.psf_models.models import Wave as Wave
 from raytrace.psf_models.models import model_of as model_of
+from raytrace.psf_models.models import psf as psf
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels
 from raytrace.psf_models.result import Psf as Psf

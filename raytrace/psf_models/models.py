@@ -1,12 +1,15 @@
-"""Table of the PSF models, and the drivers that choose the order of a model for a tolerance.
+"""The public call `psf`, the table of the PSF models, and the choice of the order of a model for a tolerance.
 
 Each model gives `kernels(scene, grid, order=…) -> Kernels`, a pure function: energy integrated over pixels, 1 = all
 light through the entrance pupil. Its orders form a sequence of growing accuracy. `by_tolerance` raises the order until
 the estimated error meets a tolerance; `climb` does so over models (`model="auto"`).
 """
 
+import contextlib
 import dataclasses
+import functools
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 
@@ -14,17 +17,26 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import OverBudget
+from raytrace.budget import OverBudget, within
 from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.grid import grid as make_grid
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
+from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
-from raytrace.psf_models.result import Kernels, Psf, polychromatic
+from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, polychromatic, without_dark
+from raytrace.psf_models.sharing import check_shares, plain_rays_shared, shared
+from raytrace.shards import Share
+from raytrace.system.lens import Lens, field_points, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import Scene, varies
+from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
+from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
 from raytrace.words import calling_level
+
+PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 
 
 @value
@@ -74,21 +86,39 @@ class Wave:
 
 
 @dataclasses.dataclass(frozen=True)
+class Execution:
+    """How `psf` computes, without effect on the numbers.
+
+    memo: rays of earlier calls, reused where nothing before them has changed.
+    share: of this process (`shards.share()`), if all processes call alike; each gets all kernels, without gradient.
+    max_bytes: memory limit; independent rays are traced in chunks, in any number, without gradient; progress: (count,
+        unit) -> a progress bar, see `cli.progress`.
+    empty: value of a PSF that no ray reaches: "nan", kernel 0 and moments nan, all with gradient 0, or "error".
+    """
+
+    memo: Memo | None = None
+    share: Share | None = None
+    max_bytes: float | None = None
+    progress: Callable | None = None
+    empty: str = "nan"
+
+
+@dataclasses.dataclass(frozen=True)
 class Model:
     """A PSF model and its sequence of orders.
 
     name: as `psf` takes it; title: for tables and figures.
     kernels: (scene, grid, order=…) -> Kernels; orders: from the coarsest to the finest.
-    lean: the same without the residual, where that costs time; None if it does not.
-    plain: (scene, grid, rays=…) -> Kernels of independent rays; None if the model has none.
     parameters: the class of its numbers, as `psf` takes them; those other than order and rays are keywords of
         `kernels`.
+    lean: `kernels` without the residual, where that costs time.
+    plain: (scene, grid, rays=…) -> Kernels of independent rays, where the model has such.
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
-    alone
-        and images a field without distortion.
+        alone and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
     is_rung: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
+    by_field: whether decisions are made for each field alone: processes then share out whole fields.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -97,7 +127,6 @@ class Model:
     least, most: bounds on the ratios measured after that; margin: factor on the estimate.
     unseen: share of `Kernels.residual` added to the error, which two orders may have in common.
     floor: smallest error, by rounding. The constants cover 95 % of the cases that docs/psf_error.md calls fitted.
-    by_field: whether decisions are made for each field alone: processes then share out whole fields.
     """
 
     name: str
@@ -112,6 +141,7 @@ class Model:
     is_rung: bool = False
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
+    by_field: bool = False
     by_width: bool = False
     proof: float | None = None
     first: float | None = None
@@ -120,7 +150,6 @@ class Model:
     margin: float = 1.0
     unseen: float = 0.0
     floor: float = 0.0
-    by_field: bool = False
 
 
 # fourier and wave use the same sums; torch's J₀ is accurate to 3e-7 only.
@@ -153,12 +182,13 @@ _ROWS = (
 #: The models by name, in order of growing fidelity.
 MODELS = {row.name: row for row in _ROWS}
 
-#: The models that `model="auto"` tries in turn.
-RUNGS = tuple(row.name for row in _ROWS if row.is_rung)
+
+class NotConverged(UserWarning):
+    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
 
 def model_of(name: str, **numbers) -> Paraxial | Fourier | Gaussian | DRT | Wave:
-    """A model with its numbers, by its name. Raises ValueError for a name or a number that there is not."""
+    """A model with its numbers, by its name. Raises ValueError for an unknown name or number."""
     if name == "auto" and "rays" in numbers:
         raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
     if name not in MODELS:
@@ -171,8 +201,231 @@ def model_of(name: str, **numbers) -> Paraxial | Fourier | Gaussian | DRT | Wave
     return MODELS[name].parameters(**numbers)
 
 
-class NotConverged(UserWarning):
-    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
+def psf(
+    lens: Lens,
+    model: str | Paraxial | Fourier | Gaussian | DRT | Wave = "auto",
+    *,
+    fields: Tensor | Sequence | None = None,
+    object_distances: Tensor | Sequence[float] | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    wavelength_weights: Tensor | Sequence[float] | None = None,
+    pixel: float | None = None,
+    size: int | tuple[int, int] | None = None,
+    grid: Grid | None = None,
+    center: str | None = None,
+    window: str = "follows",
+    tol: float | None = None,
+    normalise: str = "energy",
+    per_wavelength: bool = False,
+    execution: Execution | None = None,
+) -> Psf:
+    """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
+
+    Derivatives include the motion of the window. Two edges have no derivative: the rim of a beam where rays miss a
+    surface or are totally reflected, in all models; and every aperture for independent rays (`DRT(rays=…)`),
+    because a vignetted ray drops out abruptly.
+
+    model: "auto", "paraxial", "fourier", "gaussian", "drt" or "wave", or a model with its numbers, as `DRT(rays=2000)`:
+        rays: instead of a tolerance, about that many rays per kernel, the error estimated from half of them; order:
+        instead, an order of the model, as in `Psf.order` of an earlier call: for loops; nothing is estimated.
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm, inf allowed; wavelengths:
+        (W,) µm with wavelength_weights: (W,); by default those of the lens. Kernels are summed over the wavelengths;
+        per_wavelength: each wavelength has a kernel, (D, F, W, rows, columns), of energy 1 for all its light.
+    pixel, size: pitch in mm, 0.005 by default, and number, one or (rows, columns), 21 by default; grid: instead, pixels
+        whose centre is (2,) or (2, D, F).
+    center: origin of the grid's centre: "axis", "chief" (the chief ray at the primary wavelength) or "centroid" (of the
+        rays). By default "axis" if fields are specified, "chief" for the lens's fields.
+    window: "follows": a window about the chief ray or the centroid moves with it, in the derivatives too, so that a
+        shift of the whole image changes no kernel. "fixed": the window has no derivative: the pixels of a sensor that
+        does not move. The kernels are the same.
+    tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
+    normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
+    execution: memory, processes and progress, see `Execution`.
+
+    Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
+    outside of loops (without an order or a memo), UnfilledStop.
+    """
+    execution = execution or Execution()
+    center = center or ("chief" if fields is None else "axis")
+    name = model if isinstance(model, str) else next(k for k, m in MODELS.items() if isinstance(model, m.parameters))
+    for option, (word, words) in {
+        "model": (name, ("auto", *MODELS)),
+        "center": (center, ("axis", "chief", "centroid")),
+        "window": (window, ("follows", "fixed")),
+        "normalise": (normalise, ("energy", "window")),
+    }.items():
+        if word not in words:
+            raise ValueError(f"{option} {word!r} is not known; expected {', '.join(words)}")
+    parameters = MODELS[name].parameters() if isinstance(model, str) and name != "auto" else model
+    order, rays = (getattr(parameters, number, None) for number in ("order", "rays"))
+    _check(tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    like = lens.wavelengths
+    base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
+    fields = fields if isinstance(fields, Tensor) else field_points(fields, like=lens)
+    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else _row(object_distances, like)
+    weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
+    wavelengths = like if wavelengths is None else _row(wavelengths, like)
+    weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
+    _check_batch(fields, distances, wavelengths, weights)
+    if order is None and execution.memo is None:
+        warn_of_filling(with_object_distance(lens, distances.min()), fields)
+    drive = _driver(lens, name, parameters, tol or 0.01, execution)
+    shares = weights / weights.sum()
+
+    def compute(chosen: Tensor) -> Psf:
+        centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
+        batch = scene(lens, fields, distances[chosen], wavelengths, execution.memo)
+        origin = _origin(batch, lens, center, shares)
+        if origin is not None and window == "fixed":
+            origin = origin.detach()
+        if origin is not None or centre.dim() > 1:  # a single point stays a single point
+            centre = centre if centre.dim() > 1 else centre.reshape(2, 1, 1)
+            centre = centre if origin is None else centre + origin
+            centre = centre[..., None].expand(*centre.shape, len(wavelengths))
+        return drive(batch, dataclasses.replace(base, centre=centre), None if per_wavelength else shares)
+
+    infinite = torch.isinf(distances)
+    with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():
+        if bool(infinite.any()) and not bool(infinite.all()):
+            psfs = _merged(compute(~infinite), compute(infinite), infinite)
+        else:
+            psfs = compute(torch.ones_like(infinite))
+    # Only traced light can fail to arrive; light outside the window has arrived.
+    if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
+        trial = with_object_distance(lens, distances[0].detach())
+        points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+        failures = ray_failures(trial, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+        reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
+        raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
+    if normalise == "window":
+        # Over the brightest pixel first: in a nearly dark window the square of the sum would underflow in derivatives.
+        scaled = safe_divide(psfs.kernel, psfs.kernel.detach().amax((-2, -1), keepdim=True))
+        kernel = safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
+        psfs = dataclasses.replace(psfs, kernel=kernel, normalised="window")
+    psfs = without_dark(psfs, execution.empty)
+    _warn_of_dark(lens, fields, distances, wavelengths, psfs)
+    return dataclasses.replace(
+        psfs,
+        lens=lens,
+        fields=fields,
+        object_distances=distances,
+        wavelengths=wavelengths,
+        wavelength_weights=shares,
+        parameters=MODELS[psfs.model].parameters() if name == "auto" else parameters,
+        framed=(grid, pixel, size) != (None, None, None),
+    )
+
+
+def _row(numbers: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    return numbers if isinstance(numbers, Tensor) else like.new_tensor(numbers)
+
+
+def _check(*, tol, rays, order, grid, pixel, size) -> None:
+    for refused, message in (
+        (tol is not None and rays is not None, "tol and rays exclude each other: tol chooses the number of rays"),
+        (
+            order is not None and (tol, rays) != (None, None),
+            "an order fixes the amount of work: it excludes tol and rays",
+        ),
+        (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
+        (rays is not None and (rays < 1 or rays % 1), f"rays {rays}: expected a whole number above 0"),
+        (grid is not None and (pixel, size) != (None, None), "a grid has a pixel and a size: leave these out"),
+        (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
+    ):
+        if refused:
+            raise ValueError(message)
+
+
+def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights: Tensor) -> None:
+    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
+    for name, values in (("object_distances", distances), ("wavelengths", wavelengths)):
+        if values.dim() != 1 or not len(values):
+            raise ValueError(f"{name} of shape {tuple(values.shape)}; expected one axis")
+        if bool(values.isnan().any()) or bool((values == 0).any()):
+            raise ValueError(
+                f"{name} {values.tolist()}; expected numbers other than 0 and nan; give others by `{name}`"
+            )
+    if weights.shape != wavelengths.shape:
+        raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
+    if bool((weights < 0).any()) or not bool(weights.sum() > 0):
+        raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+
+
+def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution) -> Callable[..., Psf]:
+    """The function (scene, grid, weights) -> Psf that the arguments of `psf` select."""
+    share, max_bytes, progress = execution.share, execution.max_bytes, execution.progress
+    processes = share is not None and share.processes > 1
+    if processes:
+        check_shares(lens, parameters)
+
+    def configured(row: Model, numbers) -> Model:
+        keywords = {field.name: getattr(numbers, field.name) for field in dataclasses.fields(numbers)}
+        keywords = {key: number for key, number in keywords.items() if key not in ("order", "rays")}
+        row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **keywords)) if keywords else row
+        if not processes:
+            return row
+        deal = functools.partial(shared, share=share, by_field=row.by_field)
+        plain = row.plain and functools.partial(plain_rays_shared, row.plain, share)
+        return dataclasses.replace(row, kernels=deal(row.kernels), lean=row.lean and deal(row.lean), plain=plain)
+
+    def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
+        with progress(rays * math.prod(batch.shape), "ray") if progress else contextlib.nullcontext() as bar:
+            halves = drt.stream_kernels(batch, pixels, rays, max_bytes=max_bytes, progress=bar and bar.update)
+        return _of_halves(*halves, weights, MODELS[name])
+
+    if name == "auto":
+        rungs = [row for row in _ROWS if row.is_rung and (row.traces or paraxial.has_one_focus(lens))]
+        return functools.partial(climb, rungs=[configured(row, row.parameters()) for row in rungs], tol=tol)
+    model = configured(MODELS[name], parameters)
+    if parameters.order is not None:
+        return functools.partial(by_order, model=model, order=parameters.order)
+    if getattr(parameters, "rays", None) is None:
+        return functools.partial(by_tolerance, model=model, tol=tol)
+    rays = int(parameters.rays)
+    if max_bytes is not None and model.plain is not None:
+        return stream
+    return functools.partial(by_rays, model=model, count=rays)
+
+
+def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor, psfs: Psf) -> None:
+    """Warn LostRays of every field with a wavelength of which no ray reaches the sensor, with the ray status."""
+    dark = psfs.ray_centroid[0].detach().isnan()
+    if not bool(dark.any()):
+        return
+    dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    for distance, lost in zip(distances.detach(), dark, strict=True):
+        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        trial = with_object_distance(lens, distance)
+        warn_of_failures(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+
+
+def _origin(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
+    """Origin of the grids on the sensor, with its derivatives: None for the axis, else (2, D, F) mm."""
+    if center == "axis":
+        return None
+    if center == "centroid" and symmetry(batch) != "round":
+        pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
+        return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
+    return chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
+
+
+def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
+    """The PSFs of finite and of infinite object distances, in their original order."""
+    order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
+
+    def in_order(parts: Sequence[Tensor], axis: int) -> Tensor:
+        return torch.cat(parts, axis).index_select(axis, order)
+
+    merged, centre = combined([finite, infinite], in_order), finite.grid.centre
+    if centre.dim() > 1:
+        centre = in_order([centre, infinite.grid.centre], 1)
+    reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
+    return dataclasses.replace(merged, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)
+
+
+# -- orders ------------------------------------------------------------------------------------------------------------
 
 
 def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, order: int) -> Psf:
@@ -184,8 +437,8 @@ def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, o
 
 
 def _at(order: int, kernels: Callable[..., Kernels], batch: Scene, pixels: Grid, weights: Tensor | None, model: Model):
-    found = polychromatic(kernels(batch, pixels, order=order), weights, model.name)
-    return dataclasses.replace(found, order=order)
+    psfs = polychromatic(kernels(batch, pixels, order=order), weights, model.name)
+    return dataclasses.replace(psfs, order=order)
 
 
 def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, tol: float) -> Psf:
@@ -193,53 +446,51 @@ def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Mode
     with torch.no_grad():
         before, changes = None, []
         for order in model.orders:
-            found = _at(order, model.kernels, batch, pixels, weights, model)
+            psfs = _at(order, model.kernels, batch, pixels, weights, model)
             if before is not None:
-                changes.append(_change(before, found, model))
-            rounding = _rounding(batch, pixels, found, model)
+                changes.append(_change(before, psfs, model))
+            rounding = _rounding(batch, pixels, psfs, model)
             if model.proof is not None and changes:
                 error = model.proof * changes[-1] + rounding
                 if bool((error <= tol).all()):
-                    found = before
+                    psfs = before
                     break
-            error = _estimate(model, changes, found, rounding)
+            error = _estimate(model, changes, psfs, rounding)
             if model.proof is None and bool((error <= tol).all()):
                 break
-            before = found
+            before = psfs
     reason = ""
     if not bool((error <= tol).all()):
         reason = f"{model.name}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
         warnings.warn(reason, NotConverged, stacklevel=calling_level())
-    residual, order = found.residual, found.order
+    residual, order = psfs.residual, psfs.order
     # Derivatives by any number of the scene, the pixels or the model's own options.
     numbers = pytree.tree_leaves((batch, pixels, weights, getattr(model.kernels, "keywords", {})))
     if torch.is_grad_enabled() and any(varies(number) for number in numbers):
-        found = by_order(batch, pixels, weights, model, order)
-    return dataclasses.replace(found, error=error, residual=residual, reason=reason)
+        psfs = by_order(batch, pixels, weights, model, order)
+    return dataclasses.replace(psfs, error=error, residual=residual, reason=reason)
 
 
 def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, count: int) -> Psf:
     """About `count` rays per kernel; the error is the change from half as many."""
     if model.plain is not None:
         halves = (model.plain(batch, pixels, rays=n) for n in (count, max(count // 2, 1)))
-        return between(*halves, weights, model)
+        return _of_halves(*halves, weights, model)
     before, coarser = None, None
     for order in model.orders:
-        found = _at(order, model.kernels, batch, pixels, weights, model)
-        if found.rays > count:
+        psfs = _at(order, model.kernels, batch, pixels, weights, model)
+        if psfs.rays > count:
             break
-        before, coarser = found, before
+        before, coarser = psfs, before
     if before is None:
-        raise ValueError(f"{model.name} needs at least {found.rays} rays a kernel; {count} given")
-    if len(model.orders) == 1:
-        return dataclasses.replace(before, error=torch.zeros_like(before.energy))
+        raise ValueError(f"{model.name} needs at least {psfs.rays} rays a kernel; {count} given")
     return before if coarser is None else dataclasses.replace(before, error=_change(coarser, before, model).detach())
 
 
-def between(found: Kernels, half: Kernels, weights: Tensor | None, model: Model) -> Psf:
+def _of_halves(whole: Kernels, half: Kernels, weights: Tensor | None, model: Model) -> Psf:
     """The PSF of independent rays; its error is the change from half as many."""
-    found, half = (polychromatic(kernels, weights, model.name) for kernels in (found, half))
-    return dataclasses.replace(found, error=_kernel_change(half, found).detach())
+    whole, half = (polychromatic(kernels, weights, model.name) for kernels in (whole, half))
+    return dataclasses.replace(whole, error=_kernel_change(half, whole).detach())
 
 
 def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
@@ -275,26 +526,26 @@ def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
         return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
 
 
-def _estimate(model: Model, changes: list[Tensor], found: Psf, rounding: Tensor) -> Tensor:
+def _estimate(model: Model, changes: list[Tensor], psfs: Psf, rounding: Tensor) -> Tensor:
     """Estimated error (D, F) after changes δ_1 … δ_n between orders; inf while too few are known.
 
     The geometric series δ_n ρ/(1 - ρ) times a margin, ρ the largest ratio of successive changes so far, so that a
     single small change is not believed; plus the share of the residual that no change shows, and rounding.
     """
     if len(model.orders) == 1:
-        return torch.zeros_like(found.energy)
+        return torch.zeros_like(psfs.energy)
     ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
     if ratios:
         rho = torch.stack(ratios).amax(0).clamp(model.least, model.most)
     elif changes and model.first is not None:
-        rho = torch.full_like(found.energy, model.first)
+        rho = torch.full_like(psfs.energy, model.first)
     else:
-        return torch.full_like(found.energy, torch.inf)
-    unseen = model.unseen * found.residual if model.unseen else 0.0
+        return torch.full_like(psfs.energy, torch.inf)
+    unseen = model.unseen * psfs.residual if model.unseen else 0.0
     return model.margin * changes[-1] * rho / (1 - rho) + unseen + rounding
 
 
-def _rounding(batch: Scene, pixels: Grid, found: Psf, model: Model) -> Tensor:
+def _rounding(batch: Scene, pixels: Grid, psfs: Psf, model: Model) -> Tensor:
     """Error (D, F) by rounding, at least the model's floor.
 
     Of rays: the rounding of directions over a focal length, in units of σ or of a pixel; inf if σ itself is rounding.
@@ -305,14 +556,14 @@ def _rounding(batch: Scene, pixels: Grid, found: Psf, model: Model) -> Tensor:
     focal, f_number = (
         t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.paraxial_working_f_number)
     )
-    spread = torch.finfo(found.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
+    spread = torch.finfo(psfs.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
     if model.waves:
         spread = spread / (2 * torch.where(torch.isfinite(f_number), f_number, 1.0))
-    width = safe_sqrt(found.covariance[0] + found.covariance[2]) if model.by_width else pixels.pitch
+    width = safe_sqrt(psfs.covariance[0] + psfs.covariance[2]) if model.by_width else pixels.pitch
     error = safe_divide(spread, width)
     if model.by_width:
         error = torch.where(error > 0.3, torch.inf, error)
-    return error.clamp_min(model.floor).expand(found.energy.shape)
+    return error.clamp_min(model.floor).expand(psfs.energy.shape)
 
 
 def _change(before: Psf, after: Psf, model: Model) -> Tensor:

@@ -4,6 +4,7 @@ Roots of traced residuals are found by Newton's method from the paraxial rays; w
 axis to the full field. Each root is independent of the others of a batch.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
@@ -13,13 +14,13 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, safe_divide, varies, with_batch_axes
 from raytrace.maths.value import detached
 from raytrace.system.lens import Lens
 from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, is_posed, is_round
-from raytrace.tracing.trace import lens_steps, media, steps
+from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
+from raytrace.tracing.trace import lens_steps, media, trace_surfaces
 from raytrace.words import named
 
 _STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
@@ -27,7 +28,7 @@ _STEPS = 8  # Newton steps at each stage
 _TOLERANCE = 1e-7  # of the radius of the stop and of the height of the image, in float64
 _FEW = 1000  # rays that cost less to trace in copies than to differentiate more than once
 _LOST = 1e-2  # a root missed by more at one stage is abandoned
-_CLOSE = 1e-3  # of the tolerance: the last, attached step then ends at rounding
+_CLOSE = 0.1  # of the tolerance: Newton's next step then ends at rounding
 
 _length = partial(torch.linalg.vector_norm, dim=0)
 
@@ -61,7 +62,8 @@ def aim_at_stop(
         position, arrives = at_stop(lens, through(aim, fraction), wavelength)
         return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
 
-    aim, found = _root(missed, pupil, origin=lambda start: start)
+    given = lens, through(pupil.detach(), 1.0), target, radius, wavelength
+    aim, found = _root(missed, pupil, origin=lambda start: start, given=given)
     return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
 
 
@@ -77,7 +79,7 @@ def aim_at_middle(
         position, arrives = at_stop(lens, through(point), wavelength)
         return position / size, arrives
 
-    root, found = _root(missed, start, origin=lambda start: start)
+    root, found = _root(missed, start, origin=lambda start: start, given=(lens, through(start.detach()), size))
     root = root - _solve(_error_and_jacobian(missed, root.detach(), 1.0)[1], missed(root, 1.0)[0])
     return torch.where(found, root, start), found
 
@@ -102,46 +104,64 @@ def aim_at_image(
         return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
-    unknown, found = _root(missed, start, origin=torch.zeros_like)
+    given = lens, height, through(start[:2].detach(), torch.zeros_like(start[:2])), radius
+    unknown, found = _root(missed, start, origin=torch.zeros_like, given=given)
     return torch.where(found, unknown[:2], 0.0), found
 
 
 def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
     """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
-    points, arrives, last = [], rays.valid, numbers[-1]
-    indices = media(lens, wavelength)[: last + 1]
-    surfaces = lens.surfaces[1 : last + 1]
-    for number, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
-        arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
-        points += [crossing.rays.position[:2]] * numbers.count(number)
-    return points, arrives
+    indices = media(lens, wavelength)
+    unclipped = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces]
+    rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
+    for last in numbers:
+        rays = trace_surfaces(
+            unclipped[first + 1 : last + 1],
+            rays,
+            indices=indices[first : last + 1],
+            wavelength=wavelength,
+            side=side,
+            gap=gap_behind(lens.surfaces[first]) if first else None,
+        )
+        side = -side if sum(surface.is_mirror for surface in unclipped[first + 1 : last + 1]) % 2 else side
+        points.append(rays.position[:2])
+        first = last
+    return points, rays.valid
 
 
-def _root(residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def _root(
+    residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor], given: object
+) -> tuple[Tensor, Tensor]:
     """Unknowns (n, ...) where the residuals (n, ...) of the full field vanish, and whether found (...).
 
-    The last step is attached: first derivatives are exact. origin: from the initial point to the root on axis.
+    origin: from the initial point to the root on axis; given: a tree of the tensors that the residual depends on. If a
+    derivative by one of them may be requested, the last step is attached: first derivatives are exact.
     """
     with torch.no_grad():
-        batch = broadcast_shape(residual(start, 1.0)[0].shape[1:], start.shape[1:])
+        first = start[..., :1] if start.dim() > 1 else start  # one ray of the last axis shows the others
+        batch = broadcast_shape(start.shape[1:], residual(first, 1.0)[0].shape[1:])
     start = torch.stack([part.expand(batch) for part in start.detach()])
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
     # Roots not found are evaluated on the axis, where every derivative is finite.
     root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
+    last_step = torch.zeros_like(root)
     for stages in _STAGES:
-        followed = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
-        error, rows, arrives = _error_and_jacobian(residual, followed, 1.0)
-        close = (error.abs() <= tolerance).all(0) & arrives
-        root, found = torch.where(close & ~found, followed, root), found | close
+        followed, worst, step = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
+        close = (worst <= tolerance) & ~found
+        root, last_step = torch.where(close, followed, root), torch.where(close, step, last_step)
+        found = found | close
         if bool(found.all()):
             break
-    if stages != _STAGES[0]:
-        rows = _error_and_jacobian(residual, root, 1.0)[1]
-    return root - _solve(rows, residual(root, 1.0)[0]), found
+    root = root - last_step
+    if not any(map(varies, pytree.tree_leaves(given))):
+        return root, found
+    return root - _solve(_error_and_jacobian(residual, root, 1.0)[1], residual(root, 1.0)[0]), found
 
 
-def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float) -> Tensor:
-    """The roots at the full field, by continuation from the axis in `stages` steps.
+def _followed(
+    residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The roots at the full field, by continuation from the axis in `stages` steps, their errors, the next Newton step.
 
     Each stage starts from the extrapolation of the two before it or, if better, from the last root. A Newton step that
     loses the ray or increases the residual is shortened and rejected; a root within `close` is final.
@@ -150,32 +170,34 @@ def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, cl
     sought = torch.ones_like(root[0], dtype=torch.bool)
     for stage in range(1, stages + 1):
         fraction = stage / stages
-        error, rows, arrives = _error_and_jacobian(residual, root, fraction)
-        size, step = torch.where(arrives, _length(error), torch.inf), _solve(rows, error)
+        error, step = _error_and_step(residual, root, fraction)
         if stage > 1:
             ahead = 2 * root - before
-            error, rows, arrives = _error_and_jacobian(residual, ahead, fraction)
-            nearer = arrives & (_length(error) < size)
+            error_ahead, step_ahead = _error_and_step(residual, ahead, fraction)
+            nearer = _length(error_ahead) < _length(error)
             before, root = root, torch.where(nearer, ahead, root)
-            size = torch.where(nearer, _length(error), size)
-            step = torch.where(nearer, _solve(rows, error), step)
-        share = torch.ones_like(size)
+            error, step = torch.where(nearer, error_ahead, error), torch.where(nearer, step_ahead, step)
+        share = torch.ones_like(root[0])
         for _ in range(_STEPS):
-            moving = sought & (size > close)
+            moving = sought & (_length(error) > close)
             if not bool(moving.any()):
                 break
-            error, rows, arrives = _error_and_jacobian(residual, root - share * step, fraction)
-            better = moving & arrives & (_length(error) < size)
-            root = torch.where(better, root - share * step, root)
-            size, step = (
-                torch.where(better, _length(error), size),
-                torch.where(better, _solve(rows, error), step),
-            )
-            share = torch.where(better, 1.0, share / 4)
-        sought = sought & (size <= _LOST)
+            trial = root - share * step
+            trial_error, trial_step = _error_and_step(residual, trial, fraction)
+            better = moving & (_length(trial_error) < _length(error))
+            root, error = torch.where(better, trial, root), torch.where(better, trial_error, error)
+            step, share = torch.where(better, trial_step, step), torch.where(better, 1.0, share / 4)
+        sought = sought & (_length(error) <= _LOST)
         if not bool(sought.any()):
             break
-    return root
+    worst = error.abs().amax(0)
+    return root, worst if stage == stages else torch.full_like(worst, torch.inf), step
+
+
+def _error_and_step(residual: Residual, point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+    """The residuals (n, ...), inf where the ray does not arrive, and Newton's step (n, ...)."""
+    error, rows, arrives = _error_and_jacobian(residual, point, fraction)
+    return torch.where(arrives, error, torch.inf), _solve(rows, error)
 
 
 def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> tuple[Tensor, list[Tensor], Tensor]:

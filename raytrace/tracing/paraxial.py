@@ -9,11 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import quotient, select, value_of
+from raytrace.maths.numerics import quotient, select, value_of
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens
-from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
+from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu
 from raytrace.tracing.trace import media
 
 
@@ -59,28 +58,6 @@ class FirstOrder:
     petzval_radius: Tensor
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
-
-
-def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tensor]:
-    """Indices made negative where light travels towards -z; arguments and order as for `trace.steps`."""
-    side, result = 1, [indices[0]]
-    for surface, n in zip(surfaces, indices[1:], strict=True):
-        side = -side if surface.is_mirror else side
-        result.append(side * n)
-    return result
-
-
-def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
-    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
-
-    powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
-    """
-    rays = [(y, omega)]
-    for k, power in enumerate(powers):
-        omega = omega - power * y
-        y = y + gaps[k] * omega if k < len(gaps) else y
-        rays.append((y, omega))
-    return rays
 
 
 def brackets(powers: Sequence, gaps: Sequence) -> tuple:
@@ -223,12 +200,6 @@ def system_matrix(
     gaps = gaps if to_next else gaps[:-1]
     one = torch.ones_like(indices[0])
     return tuple(one * part for part in brackets(powers, gaps))
-
-
-def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor | None = None) -> Tensor:
-    """Power (...) in 1/mm of a surface between signed indices (...), by its section along y."""
-    found = vertex_curvature(surface) * (behind - before)
-    return found if surface.phase is None else found + power_of(surface.phase, wavelength)[1]
 
 
 def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:

@@ -12,12 +12,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
-from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import RAY_BYTES, afford
-from raytrace.maths.numerics import broadcast_shape
+from raytrace.maths.numerics import broadcast_shape, varies
 from raytrace.maths.value import value
 from raytrace.system.apertures import SHAPES
 from raytrace.system.lens import Lens, with_object_distance
@@ -396,15 +394,3 @@ def _beams(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
     corners = scene.fields.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     centre, x, y = vignette(scene.lens, scene.fields[:, :, None], corners).unbind(-1)
     return centre, x - centre, y - centre
-
-
-def varies(number: Tensor | float | None) -> bool:
-    """Whether a derivative by this number may be requested: backward, forward, or by a transform of torch.func.
-
-    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
-    """
-    if not isinstance(number, Tensor):
-        return False
-    if number.requires_grad or is_functorch_wrapped_tensor(number):
-        return True
-    return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None

@@ -1,13 +1,14 @@
-"""The wave camera as one call: an element, a sensor behind it, and its PSFs over depth and colour.
+"""PSFs of thin elements over depth and wavelength, integrated over the pixels of a sensor.
 
-PSFs of a wave scene: depth × wavelength, integrated over the pixels of the sensor, by the engine that fits."""
+`wave_psf` is the public call, `psf` that of a `WaveScene`, by the engine that `wave_optics.plan` chooses.
+"""
 
 import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from raytrace.maths.grid import Grid, centres, grid
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height_range
@@ -37,13 +39,11 @@ _KEPT = 8  # sums that a memo keeps
 class ElementPsf(Result):
     """PSFs of an element for points on the axis, over depth and colour.
 
-    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
-    was computed, with the predicted error, relative L2 of the worst kernel; element: its name.
+    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: the
+    sampling, with the predicted error, relative L2 of the worst kernel; element: its name.
     axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
-    None where it was not computed, or is a pixel of the window.
+    None where it is a pixel of the window.
     """
-
-    FIGURE: ClassVar[str] = "plotting.wave.element_figure"
 
     kernel: Tensor
     scene: WaveScene
@@ -82,18 +82,16 @@ class ElementPsf(Result):
 
     @property
     def peak(self) -> Tensor:
-        """(D, W): the most light in one pixel, of those of the window and one centred on the axis.
-
-        Light that is brightest on the axis has the same peak in windows of an even and of an odd number of pixels.
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis, so that windows of
+        an even and of an odd number of pixels have the same peak.
         """
         brightest = self.kernel.amax((-2, -1))
         return brightest if self.axial is None else torch.maximum(brightest, self.axial)
 
     @property
     def half_energy_radius(self) -> Tensor:
-        """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
-
-        Pixels count by the distance of their centres: good to half a pixel.
+        """(D, W) mm about the axis that holds half of all light through the aperture, to half a pixel; inf where the
+        window does not hold it.
         """
         x, y = centres(self.grid)
         distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
@@ -140,6 +138,16 @@ class ElementPsf(Result):
             ]
         )
 
+    def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
+        """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
+        if what == "heights":
+            return figures.height_figure(self.scene.elements, title=self.title)
+        if what == "caustic":
+            return figures.caustic_figure(self, *caustic(self.scene, **({"progress": progress} if progress else {})))
+        if what not in ("kernels", "encircled"):
+            raise ValueError(f"no figure {what!r}; expected one of kernels, heights, caustic, encircled")
+        return figures.psf_figure(self) if what == "kernels" else figures.encircled_figure(self)
+
     def save(self, path: str | os.PathLike) -> None:
         """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
         if Path(path).suffix.lower() != ".npz":
@@ -170,38 +178,18 @@ def _row(depth: float | None, wavelength: float, energy: float, peak: float, hal
     return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
 
 
-def psf(
-    scene: WaveScene,
-    *,
-    engine: str = "auto",
-    samples: int | None = None,
-    nodes: int | None = None,
-    tol: float = 1e-3,
-    pad: float = 2.0,
-    band_limit: bool = True,
-    plan: Plan | None = None,
-    memo: Memo | None = None,
-) -> ElementPsf:
+def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, **sampling) -> ElementPsf:
     """PSFs of a scene, differentiable in every number of it.
 
-    engine, samples, nodes, tol, pad, band_limit: as `plan.plan` takes them. plan: of an earlier call, instead of them:
-    for loops, nothing is estimated. memo: sums that do not depend on the heights, which are not made again while the
-    rest of the scene stays as it is.
-    Raises what `plan.plan` raises.
+    sampling: engine, samples, nodes, tol, pad, band_limit as `plan.plan` takes them, and its errors. plan: of an
+    earlier call, instead of them: for loops, nothing is estimated. memo: sums that do not depend on the heights, reused
+    while the rest of the scene stays as it is.
     """
-    if plan is None:
-        plan = planning.plan(
-            scene, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
-        )
-    return ElementPsf(_engine_kernels(scene, plan, memo), scene, plan)
-
-
-def _engine_kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
-    engine = planning.ENGINES[plan.engine]
-    if engine.prepare is None:
-        return engine.kernels(scene, None, plan)
-    sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
-    return engine.kernels(scene, sums, plan)
+    plan = planning.plan(scene, **sampling) if plan is None else plan
+    engine, sums = planning.ENGINES[plan.engine], None
+    if engine.prepare is not None:
+        sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
+    return ElementPsf(engine.kernels(scene, sums, plan), scene, plan)
 
 
 def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
@@ -222,11 +210,10 @@ def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
         free = element.numbers
         # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
         jumps = isinstance(profile, EvenPowers) and element.period is not None
-        held = [free.detach()] if jumps else []
-        parts = [element.radius, getattr(profile, "pitch", None), element.period]
-        leaves += [t for t in (*parts, *held) if t is not None]
-        own = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
-        structure = (structure, *own)
+        parts = [element.radius, getattr(profile, "pitch", None), element.period, free.detach() if jumps else None]
+        leaves += [t for t in parts if t is not None]
+        kind = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
+        structure = (structure, *kind)
     return leaves, structure
 
 
@@ -269,27 +256,33 @@ def wave_psf(
 ) -> ElementPsf:
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
-    element, and all up to catalog: as for `elements`; or one that was made already, in whose numbers the kernels are
-    differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around the axis.
-    engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
-    What would take too much memory at once is computed kernel by kernel.
-    Raises ValueError for what makes no sense together, budget.OverBudget where one kernel alone would take too much.
+    element, and all up to catalog: as for `elements`; or an `Element`, or several in contact, in whose numbers the
+    kernels are differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around
+    the axis. engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
+    Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
+    each other, budget.OverBudget where one kernel alone would take too much.
     """
-    made = _made(element)
-    parts = made or elements(
-        element,
-        aperture=aperture,
-        sensor=sensor,
-        focus=focus,
-        design_wavelength=design_wavelength,
-        levels=levels,
-        exact=exact,
-        glass=glass,
-        index=index,
-        wavelengths=wavelengths,
-        pitch=pitch,
-        span=span,
-        catalog=catalog,
+    is_made = not isinstance(element, str | os.PathLike)
+    parts = (
+        (element,)
+        if isinstance(element, Element)
+        else tuple(element)
+        if is_made
+        else elements(
+            element,
+            aperture=aperture,
+            sensor=sensor,
+            focus=focus,
+            design_wavelength=design_wavelength,
+            levels=levels,
+            exact=exact,
+            glass=glass,
+            index=index,
+            wavelengths=wavelengths,
+            pitch=pitch,
+            span=span,
+            catalog=catalog,
+        )
     )
     _check_colours(parts, wavelengths)
     scene = WaveScene(
@@ -301,7 +294,7 @@ def wave_psf(
         exact=exact,
     )
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
-    name = str(element) if not made else " + ".join(part.kind.words for part in parts)
+    name = " + ".join(part.kind.words for part in parts) if is_made else str(element)
     kernel, axial = _kernels(scene, chosen, progress), None
     if size % 2 == 0:  # a corner of four pixels lies on the axis
         axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
@@ -324,12 +317,12 @@ def elements(
     span: Sequence[float] | None = None,
     catalog: Sequence[str | os.PathLike] = (),
 ) -> tuple[Element, ...]:
-    """The elements in contact that have a name, one of `wave_optics.designs.BASELINES`, or that of a file of heights.
+    """The elements in contact of a name, one of `wave_optics.designs.BASELINES`, or of a file of heights.
 
-    aperture: diameter, mm. Of a named one sensor, focus: mm, the distances that it is made for; design_wavelength: µm,
-    0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file what `read_element` takes; index:
+    aperture: diameter, mm. Of a named element sensor, focus: mm, the distances of its design; design_wavelength: µm,
+    0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file as for `read_element`; index:
     its refractive indices at `wavelengths` instead of a glass.
-    Raises ValueError for options that do not belong together, and what `read_element` raises.
+    Raises ValueError for options that do not belong together, and the errors of `read_element`.
     """
     name = str(element)
     of_files = {"glass": glass, "index": index, "pitch": pitch, "span": span}
@@ -360,15 +353,8 @@ def elements(
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
 
 
-def _made(element) -> tuple[Element, ...]:
-    """Elements that were made already; none of a name."""
-    if isinstance(element, Element):
-        return (element,)
-    return () if isinstance(element, str | os.PathLike) else tuple(element)
-
-
 def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
-    """Raises ValueError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
+    """Raise ValueError for a wavelength (µm) outside the range of a material's data: thin elements depend on n - 1."""
     for glass in {id(element.glass.coefficients): element.glass for element in parts}.values():
         check_unit(torch.tensor(wavelengths), [glass])
         if glass.formula == "constant":
@@ -415,7 +401,7 @@ def caustic(
     """The caustic of a scene: light per mm² (D, W, Z, columns), 1 = all through the aperture, on y = 0 from -half to
     half mm; its distances (Z,) mm; and half.
 
-    distances: from element to plane, by default from four fifths of the sensor distance to six fifths; half: by default
+    distances: from element to plane, by default from four fifths to six fifths of the sensor distance; half: by default
     a tenth of the radius. Pixels and sensor do not count. Light is the mean over squares 2·half/columns wide.
     """
     z = scene.sensor_distance

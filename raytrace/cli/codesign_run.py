@@ -1,0 +1,380 @@
+"""`raytrace codesign`: settings and pictures of an experiment, one run with its progress, and its results."""
+
+import argparse
+import dataclasses
+import hashlib
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, distributed
+
+from raytrace.cli.pictures import pictures_of
+from raytrace.cli.progress import progress
+from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
+from raytrace.files import write_json
+from raytrace.imaging.closed_form import power_spectrum
+from raytrace.imaging.codesign import (
+    LENS,
+    STEPS,
+    Optimum,
+    Outcome,
+    camera,
+    closed_form,
+    lens_at_start,
+    outcome,
+    run_model,
+    steps_per_epoch,
+    variables,
+)
+from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
+from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
+from raytrace.imaging.training import read_json, read_log
+from raytrace.io import FORMATS, read_lens, write_lens
+from raytrace.maths.result import Result, plain
+from raytrace.plotting.style import FIELD_COLOURS, new_figure, styled
+from raytrace.settings import CodesignSettings
+from raytrace.settings import read as read_settings
+from raytrace.shards import processes, share
+from raytrace.system.lens import Lens, check, field_points
+from raytrace.tracing.focus import NoImage
+from raytrace.tracing.paraxial import paraxial_image_distance
+
+_LEAVES = 100  # dead-leaves images, without --data
+_DISTANCES = 9  # at which a finished run is tested
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A lens, settings and pictures; about: hashes of the lens file and the pictures, for the folders of the runs;
+    kind: of the pictures; catalogs: of glass, with which the lens was read."""
+
+    lens: Lens
+    name: str
+    settings: CodesignSettings
+    train: Pictures
+    test: Pictures
+    about: dict[str, str]
+    kind: str
+    catalogs: tuple[Path, ...] = ()
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Raises ValueError if the pictures do not fill a batch."""
+        return steps_per_epoch(self.train, self.settings)
+
+    def spectrum(self) -> Tensor:
+        """Power spectrum of the training pictures, at the size of a patch with its margin."""
+        size = self.settings.patch + self.settings.size - 1
+        return power_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
+
+
+def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:
+    """Open the lens, refuse what cannot be simulated, then read the pictures."""
+    path, lens = find_lens(arguments.lens), _file_lens(arguments)
+    if settings.near >= settings.far:
+        raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
+    field_points(settings.fields, like=lens)  # refuses angles of 90 degrees
+    try:
+        camera(lens, settings)  # refuses bad variables, starts and networks
+    except NoImage as error:
+        message = "give --near, --far and --focus-distance beyond the focal length"
+        raise CommandError(f"{arguments.lens}: {error}; {message}") from error
+    initial = lens_at_start(lens, settings)
+    try:
+        check(initial)
+    except ValueError as error:
+        raise CommandError(f"{path}: {error}") from error
+    FORMATS[".zmx"].write(initial, str(path), catalogs=catalogs(arguments))  # refuses what the file cannot hold
+    least = settings.patch + settings.size - 1
+    samples, kind = pictures_of(arguments, least, lambda: _leaves(arguments.limit or _LEAVES, max(256, least)))
+    about = {
+        "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
+        "pictures": digest(samples.samples),
+    }
+    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments))
+
+
+def _leaves(count: int, size: int) -> Pictures:
+    say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
+    leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in progress(range(count), "dead leaf")]
+    return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
+
+
+def _file_lens(arguments: argparse.Namespace) -> Lens:
+    """The lens of the file, unchanged: conditions of the options are settings of the experiment."""
+    names = ("lens", "catalog", "substitute")
+    return open_lens(argparse.Namespace(**{name: getattr(arguments, name, None) for name in names}))
+
+
+def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> CodesignSettings:
+    """Settings from the options. stored: `settings.json` of a run, whose choice for precision "auto" is kept; None
+    without training of a network."""
+    preset = PRESETS[arguments.preset]
+    options = {name: value for name, value in vars(arguments).items() if value is not None}
+    options = {"depth": preset.depth, "width": preset.width} | options | _wavelengths(arguments)
+    options |= {name: " ".join(options[name]) for name in ("vary", "bounds", "hold") if name in options}
+    if "fields" in options:
+        if any(x for x, _ in options["fields"]):
+            raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
+        options["fields"] = [y for _, y in options["fields"]]
+    if stored is None:
+        options["precision"] = "float32"
+    elif options.get("precision", "auto") == "auto":
+        # The choice of the first process, for all.
+        chosen = [""]
+        if share().rank == 0:
+            before = read_json(stored) if stored.exists() else {}
+            chosen = [before.get("precision") or faster_precision(RedNetShape(options["depth"], options["width"]))]
+        if share().processes > 1:
+            distributed.broadcast_object_list(chosen)
+        options["precision"] = chosen[0]
+    return CodesignSettings.of(options)
+
+
+def _wavelengths(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
+    """Wavelengths and weights of the options, or those of the file, its primary one first."""
+    wavelengths, weights = arguments.wavelengths, arguments.wavelength_weights
+    if not arguments.file_wavelengths:
+        wavelengths = wavelengths or CodesignSettings.wavelengths
+        return {"wavelengths": wavelengths, "wavelength_weights": weights or [1.0] * len(wavelengths)}
+    if wavelengths or weights:
+        raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
+    lens = _file_lens(arguments)
+    order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength - 1)
+    return {
+        "wavelengths": lens.wavelengths[order].tolist(),
+        "wavelength_weights": lens.wavelength_weights[order].tolist(),
+    }
+
+
+def recorded_settings(path: Path) -> CodesignSettings:
+    """The settings in a `settings.json`, with defaults for missing ones."""
+    known = {field.name for field in dataclasses.fields(CodesignSettings)}
+    return read_settings(CodesignSettings, {name: value for name, value in read_json(path).items() if name in known})
+
+
+def faster_precision(shape: RedNetShape, *, size: int = 64, count: int = 4) -> str:
+    """The precision in which this machine's processor trains the network faster, "bfloat16" or "float32", measured.
+
+    Processors without instructions for bfloat16 emulate it, ten times slower.
+    """
+    network = RedNet(shape).to(memory_format=torch.channels_last)
+    picture = torch.rand(count, 1, size, size)
+    seconds = {}
+    for name, enabled in (("float32", False), ("bfloat16", True)):
+        for _ in range(2):  # the first call prepares
+            start = time.perf_counter()
+            with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+                restored = network(picture)
+            restored.float().abs().mean().backward()
+            seconds[name] = time.perf_counter() - start
+    return min(seconds, key=seconds.get)
+
+
+def conjugates(lens: Lens, settings: CodesignSettings) -> tuple[list[float], list[float]]:
+    """Sensor distances in mm, ascending, and the object distances in m whose paraxial images are there."""
+    distances = np.geomspace(settings.near / 10, settings.far * 200, 2000)
+    lens = lens_at_start(lens, settings)
+    with torch.no_grad():
+        images = paraxial_image_distance(lens, lens.wavelengths.new_tensor(distances)).numpy()
+    order = np.argsort(images)
+    return images[order].tolist(), (distances[order] / 1e3).tolist()
+
+
+def focus_of(lens: Lens, settings: CodesignSettings) -> Callable[[float], float] | None:
+    """Object distance in m in paraxial focus, of a sensor distance in mm; None if more than the sensor varies."""
+    if settings.vary.split() != ["sensor"]:
+        return None
+    sensors, distances = conjugates(lens, settings)
+    return lambda sensor: float(np.interp(sensor, sensors, distances))
+
+
+def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, label: str) -> Outcome:
+    """Train both steps of a run, or what is left of them, with a bar and a line for every epoch."""
+    per_epoch, focus = experiment.steps_per_epoch, focus_of(experiment.lens, settings)
+    length, losses, bar = settings.epochs * per_epoch, [], None
+
+    def testing(batches: Sequence[int]) -> Iterator[int]:
+        for number, first in enumerate(batches, 1):
+            if bar is not None:
+                bar.set_postfix_str(f"testing, batch {number} of {len(batches)}")
+            yield first
+
+    distances = np.linspace(settings.near, settings.far, _DISTANCES).tolist()
+    data = (experiment.train, experiment.test, settings, folder)
+    more = {"about": experiment.about, "distances": tuple(distances), "catalogs": experiment.catalogs}
+    try:
+        for name, step, record in run_model(experiment.lens, *data, **more, progress=testing):
+            if bar is None:
+                done = STEPS.index(name) * length + step
+                if done:
+                    say(f"{label}: resumes after step {done} of {2 * length}")
+                bar = progress(2 * length, what=label, initial=done)
+            losses.append(record["loss"])
+            words = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
+            if "sensor" in record:
+                words += f", sensor {record['sensor']:.4f} mm"
+                words += f", focus {focus(record['sensor']):.1f} m" if focus else ""
+            bar.set_postfix_str(f"{name}, loss {record['loss']:.4f}{words}", refresh=False)
+            bar.update()
+            if (step + 1) % per_epoch == 0:
+                epoch = f"epoch {(step + 1) // per_epoch} of {settings.epochs}"
+                bar.write(f"raytrace: {label}, {name}, {epoch}: loss {sum(losses) / len(losses):.4f}{words}")
+                losses.clear()
+    finally:
+        if bar is not None:
+            bar.close()
+    if bar is None:
+        say(f"{label}: finished before, nothing to train")
+    return outcome(folder)
+
+
+# -- results
+
+
+@dataclasses.dataclass(frozen=True)
+class CodesignResult(Result):
+    """The outcome of a run, or the optimum of the closed form. curves: losses by their name, for the figure."""
+
+    experiment: Experiment
+    lens: Outcome | Optimum
+    curves: dict[str, Sequence[float]]
+
+    @styled
+    def draw(self):
+        """Every curve one after the other; noisy ones faint, with their running mean over a fiftieth of the curve."""
+        figure = new_figure(5.6, 3.2)
+        panel, start = figure.subplots(), 0
+        for number, (name, losses) in enumerate(self.curves.items()):
+            steps = np.arange(start, start + len(losses))
+            width = max(1, len(losses) // 50)
+            panel.plot(steps, losses, color=FIELD_COLOURS[number], linewidth=0.6, alpha=1.0 if width == 1 else 0.3)
+            means = np.convolve(losses, np.full(width, 1 / width), "valid")
+            panel.plot(steps[width - 1 :], means, color=FIELD_COLOURS[number], label=name)
+            start += len(losses)
+        is_training = len(self.curves) > 1
+        panel.set(xlabel="step" if is_training else "evaluation")
+        panel.set_ylabel("training loss (mean L¹)" if is_training else "mean square error, best linear filter")
+        if is_training:
+            panel.legend()
+        return figure
+
+    def document(self) -> dict:
+        limits = variables(self.experiment.lens, self.experiment.settings).limits
+        settings, limits = (dataclasses.asdict(values) for values in (self.experiment.settings, limits))
+        return plain({"settings": settings, **self.experiment.about, "limits": limits, **self.lens.document()})
+
+    def __str__(self) -> str:
+        result = self.lens
+        if isinstance(result, Outcome):
+            lines = [
+                f"{result.model} PSFs, seed {result.seed}",
+                *self._lens_lines(),
+                "L1 loss of test pictures:",
+                f"  after step 1, with its own PSFs  {result.l1_joint:.5f}",
+                f"  the same network with DRT PSFs   {result.l1_before:.5f}",
+                f"  after step 2, with DRT PSFs      {result.l1_drt:.5f}",
+                f"{'object at':>12} {'L1 with DRT PSFs':>18}",
+                *(f"{float(z) / 1e3:>10g} m {loss:>18.5f}" for z, loss in result.by_distance.items()),
+            ]
+        else:
+            evaluations = enumerate(zip(result.course, result.penalties, strict=True), 1)
+            lines = [
+                f"{result.model} PSFs, mean square error of a pixel behind the best linear filter",
+                f"{'evaluation':>12} {'error':>12} {'penalty, mm²':>13}",
+                *(f"{number:>12} {error:>12.8f} {penalty:>13.6g}" for number, (error, penalty) in evaluations),
+                *self._lens_lines(),
+                f"error of this lens: {result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs",
+            ]
+        return "\n".join(lines)
+
+    def _lens_lines(self) -> Iterator[str]:
+        result = self.lens
+        yield f"sensor at {result.sensor_mm:.4f} mm"
+        for name, value in result.variables.items():
+            if name != "sensor":
+                yield f"{name} = {value:.7g} {'1/mm' if name.startswith('curvature') else ''}".rstrip()
+        paraxial, rms = (
+            f"{distance:.2f} m" if math.isfinite(distance) else "infinity"
+            for distance in (result.focus_paraxial_m, result.focus_rms_m)
+        )
+        yield f"in focus: {paraxial} (paraxial), {rms} (least RMS spot)"
+        limits = variables(self.experiment.lens, self.experiment.settings).limits
+        glass, air = (
+            f"{low:.4g}" + (f" to {high:.4g}" if math.isfinite(high) else " at least")
+            for low, high in (limits.glass, limits.air)
+        )
+        thicknesses = f"glass {glass}, its edge {limits.edge:.4g} at least, air {air} (mm)"
+        yield f"penalty {result.penalty:.6g} mm², not part of the loss; thicknesses: {thicknesses}"
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train one model, or bring it to the optimum of the closed form."""
+    with processes():
+        if arguments.loss == "spectral":
+            _spectral(arguments)
+        else:
+            _train(arguments)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    folder, lens_file = _outputs(arguments)
+    if folder is None:
+        raise CommandError("no folder to keep the run in: give -o FOLDER")
+    stored = folder / STEPS[0] / "settings.json"
+    if arguments.resume and not stored.exists():
+        raise CommandError(f"{folder}: no run was begun here; leave out --resume to begin one")
+    experiment = open_experiment(arguments, settings_of(arguments, stored))
+    settings = experiment.settings
+    result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")
+    if lens_file and not share().rank:
+        write_lens(read_lens(folder / LENS, catalogs=experiment.catalogs), lens_file, catalogs=experiment.catalogs)
+    curves = {
+        f"step {k}": [row["loss"] for row in read_log(folder / name / "log.csv")] for k, name in enumerate(STEPS, 1)
+    }
+    _present(
+        CodesignResult(experiment, result, curves),
+        arguments,
+        f"{folder / 'outcome.json'}, {lens_file or folder / LENS}",
+    )
+
+
+def _spectral(arguments: argparse.Namespace) -> None:
+    if arguments.resume:
+        raise CommandError("--resume belongs to training; leave out --resume or --loss spectral")
+    experiment = open_experiment(arguments, settings_of(arguments))
+    optimum = closed_form(experiment.lens, experiment.settings, experiment.spectrum())
+    for name in optimum.at_end:
+        say(f"warning: {name} ends at a bound, and the loss still falls beyond it")
+    result = CodesignResult(experiment, optimum, {"closed form": optimum.course})
+    folder, lens_file = _outputs(arguments)
+    written = lens_file
+    if lens_file:
+        write_lens(optimum.lens, lens_file, catalogs=experiment.catalogs)
+    elif folder:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_lens(optimum.lens, folder / LENS, catalogs=experiment.catalogs)
+        write_json(folder / "spectral.json", result.document())
+        written = f"{folder / 'spectral.json'}, {folder / LENS}"
+    _present(result, arguments, written)
+
+
+def _outputs(arguments: argparse.Namespace) -> tuple[Path | None, Path | None]:
+    """The folder of -o, and the lens file if it names one."""
+    if not arguments.folder:
+        return None, None
+    path = Path(arguments.folder)
+    return (path.with_suffix(""), path) if path.suffix.lower() in FORMATS else (path, None)
+
+
+def _present(result: CodesignResult, arguments: argparse.Namespace, written: object) -> None:
+    """Print the result; raise afterwards if it is no optimum."""
+    present(result, arguments)
+    if written:
+        say(f"written: {written}")
+    if result.lens.no_optimum:
+        raise CommandError(result.lens.no_optimum)
