@@ -19,7 +19,8 @@ from raytrace.analysis.setting import (
     unvignetted,
 )
 from raytrace.analysis.spot_diagram import airy_radius
-from raytrace.maths.numerics import divide, dot_2, safe_divide, safe_sqrt
+from raytrace.maths.dual import divide
+from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, new_figure, styled

@@ -11,7 +11,8 @@ import torch
 
 from raytrace.analysis.chief import NEAR_AXIS, NEAR_CHIEF, focus_of_close_rays, relative_error
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
-from raytrace.maths.numerics import dot_2, value_of
+from raytrace.maths.dual import value_of
+from raytrace.maths.numerics import dot_2
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.paraxial import (

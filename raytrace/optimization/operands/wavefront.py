@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
+from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.optimization.operands.paraxial import image_index, per_row
