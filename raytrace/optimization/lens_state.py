@@ -1,6 +1,6 @@
 """LensState: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
 
-Numbers are plain ones, or dual ones (`maths.numerics`) where derivatives are asked for; the formulas are the same.
+Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
 
 Solves: numbers of a lens that follow from others, a row for every kind.
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from raytrace.maths.numerics import Dual, Vector, slope_of, value_of
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
 from raytrace.maths.numerics import dot
 from raytrace.optimization.lens_model import GLASS, unbent
 from raytrace.optimization.lens_state import LensState

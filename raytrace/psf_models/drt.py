@@ -79,7 +79,7 @@ def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -
 
 
 def histogram(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
-    """Energy of the points in each pixel, without derivative in their positions; arguments and result as for `splat`."""
+    """Energy of the points in each pixel, without derivative in their positions; as `splat`."""
     column, row = (torch.floor(_in_pixels(grid, points, axis)) for axis in (0, 1))
     # -1 or `count`, outside the window, for all points further out and for NaN.
     column, row = (

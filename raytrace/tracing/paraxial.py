@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import quotient, select, value_of
+from raytrace.maths.dual import quotient, select, value_of
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu

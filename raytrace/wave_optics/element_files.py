@@ -15,8 +15,7 @@ import torch
 
 from raytrace.files import read_bytes, write_json
 from raytrace.materials.catalogs import find_glass
-from raytrace.materials.glass import FORMULAS
-from raytrace.materials.glass import Glass
+from raytrace.materials.glass import FORMULAS, Glass
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights

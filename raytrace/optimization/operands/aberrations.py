@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
-from raytrace.maths.numerics import value_of
+from raytrace.maths.dual import value_of
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.paraxial import along, chief_ray_of, field_of, listed, paraxial_image_distance

@@ -9,7 +9,7 @@ from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.dual import Dual, value_of
 from raytrace.optimization.context import SETTINGS, BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.system.optimization_data import Row

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.dual import Dual, value_of
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import ENDS, LensState
 from raytrace.optimization.ray_bundle import Bundle, Marks

@@ -18,7 +18,7 @@ from torch import Tensor
 from raytrace.analysis.mtf import clear_circle, cutoff, modulation, otf_along
 from raytrace.analysis.pupil_autocorrelation import Fit, exit_pupil, layout_of, otf
 from raytrace.analysis.setting import scene_of
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.custom import OrLost
 from raytrace.optimization.operands.paraxial import listed

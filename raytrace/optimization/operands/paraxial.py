@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, quotient, slope_of, value_of
+from raytrace.maths.dual import Dual, quotient, slope_of, value_of
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.arguments import need

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.dual import Dual, value_of
 from raytrace.maths.numerics import dot, safe_sqrt
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.ray_bundle import Hits

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, Vector, slope_of, value_of
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
 from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
