@@ -30,8 +30,9 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, Zernike, as_rings
+from raytrace.wave_optics.element import Element, Zernike
 from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.fabrication import as_rings
 from raytrace.wave_optics.plan import plan
 
 edof, noise = script("wave_edof"), script("wave_noise")

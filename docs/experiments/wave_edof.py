@@ -54,7 +54,8 @@ from raytrace.pages import grid, picture
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import Aim, aim, baseline
-from raytrace.wave_optics.element import Element, height_range
+from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.fabrication import height_range
 from raytrace.words import did_you_mean
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")

@@ -66,8 +66,9 @@ from raytrace.plotting.style import INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, Rings, fabricated, is_flat
+from raytrace.wave_optics.element import Element, Rings, is_flat
 from raytrace.wave_optics.element_files import SMOOTH, read_element, write_element
+from raytrace.wave_optics.fabrication import fabricated
 from raytrace.words import did_you_mean
 
 

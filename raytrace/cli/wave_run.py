@@ -29,8 +29,9 @@ from raytrace.io.pictures import read_channels, write_picture
 from raytrace.maths.result import Result, plain
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import elements
-from raytrace.wave_optics.element import Element, as_pixels, fabricated
+from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.fabrication import as_pixels, fabricated
 
 WIDE = 512  # pixels of a period of the restored pictures
 LEAF_COUNT = 40  # dead-leaves images

@@ -30,8 +30,8 @@ from raytrace.maths.value import detached
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, as_rings
-from raytrace.wave_optics.etching import Process, matched
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike
+from raytrace.wave_optics.fabrication import Process, as_rings, matched
 
 _NETWORK = RedNetShape(6, 16)  # behind the depth-invariant filter, the same for every colour
 _NETWORK_RATE = 1e-3
