@@ -15,7 +15,7 @@
 | wave_design     | design of the phase element                                                             |
 | descent         | L-BFGS-B with exact gradients                                                           |
 
-The only `nn.Module`s of the package are here. Tests: tests/test_MODULE.py, test_held (thickness limits), test_deconvolve
+The only `nn.Module`s are here. Tests: tests/test_MODULE.py, test_held (thickness limits), test_deconvolve
 (restoration), test_study (co-design), test_edof* (phase elements).
 """
 
