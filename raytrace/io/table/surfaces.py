@@ -15,8 +15,17 @@ from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.environment import Environment
-from raytrace.materials.glass import MODEL_LINES
-from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
+from raytrace.materials.glass import (
+    AIR,
+    LINES,
+    MIRROR,
+    MODEL_LINES,
+    Glass,
+    constant,
+    mil_glass,
+    model_glass,
+    refractive_index,
+)
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
