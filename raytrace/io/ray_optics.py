@@ -27,8 +27,17 @@ from typing import NamedTuple
 import torch
 
 from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, listed_glass
-from raytrace.io.report import IGNORED, READ, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, UnsupportedSurface, double, shown
+from raytrace.io.source import (
+    IGNORED,
+    MAX_SURFACES,
+    READ,
+    Draft,
+    LensFileError,
+    Place,
+    UnsupportedSurface,
+    double,
+    shown,
+)
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.lens import Lens

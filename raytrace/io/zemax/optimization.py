@@ -29,8 +29,20 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.io.report import IGNORED, READ, Draft
-from raytrace.io.source import Block, LensFileError, Place, Record, double, is_number, one_line, plain, read_text
+from raytrace.io.source import (
+    IGNORED,
+    READ,
+    Block,
+    Draft,
+    LensFileError,
+    Place,
+    Record,
+    double,
+    is_number,
+    one_line,
+    plain,
+    read_text,
+)
 from raytrace.io.zemax.configurations import cell_of
 from raytrace.io.zemax.surfaces import (
     BLANK,

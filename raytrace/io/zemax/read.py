@@ -18,10 +18,10 @@ from functools import partial
 from pathlib import Path
 
 from raytrace.io.assembly import MOST_POINTS, AtHand, LensDraft, assemble, catalogs_of_lens
-from raytrace.io.report import Draft
 from raytrace.io.source import (
     MILLIMETRES,
     Block,
+    Draft,
     LensFileError,
     Record,
     UnsupportedSurface,

@@ -21,9 +21,12 @@ from typing import NamedTuple
 from torch import Tensor
 
 from raytrace.io.assembly import by_figures, clear_aperture, is_code, listed_glass, pose_of
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import (
+    IGNORED,
+    READ,
+    UNKNOWN,
     Block,
+    Draft,
     LensFileError,
     Place,
     Record,

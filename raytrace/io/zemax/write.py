@@ -16,9 +16,9 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.io.assembly import catalogs_needed, is_code, is_left_out, listed_name
-from raytrace.io.report import Draft
 from raytrace.io.source import (
     MILLIMETRES,
+    Draft,
     LensFileError,
     Place,
     Record,
