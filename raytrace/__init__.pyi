@@ -122,11 +122,11 @@ from raytrace.tracing.spot import Spot as Spot
 from raytrace.tracing.streaming import mean_square_gradient as mean_square_gradient
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf
-from raytrace.wave_optics.element import as_pixels as as_pixels
-from raytrace.wave_optics.element import as_rings as as_rings
-from raytrace.wave_optics.element import fabricated as fabricated
 from raytrace.wave_optics.element_files import read_element as read_element
 from raytrace.wave_optics.element_files import write_element as write_element
+from raytrace.wave_optics.fabrication import as_pixels as as_pixels
+from raytrace.wave_optics.fabrication import as_rings as as_rings
+from raytrace.wave_optics.fabrication import fabricated as fabricated
 from raytrace.wave_optics.hybrid import element_lens as element_lens
 from raytrace.wave_optics.hybrid import hybrid_psf as hybrid_psf
 

@@ -16,7 +16,7 @@ from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.files import write_json
-from raytrace.imaging.closed_form import power_spectrum
+from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.codesign import (
     LENS,
     STEPS,
@@ -69,7 +69,7 @@ class Experiment:
     def spectrum(self) -> Tensor:
         """Power spectrum of the training pictures, at the size of a patch with its margin."""
         size = self.settings.patch + self.settings.size - 1
-        return power_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
+        return patch_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
 
 
 def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:

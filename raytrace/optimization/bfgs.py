@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.lens_model import Model
 from raytrace.system.lens import Lens

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.optimization.constraints import Condition as Condition
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.least_squares import Sides, State

@@ -1,4 +1,4 @@
-"""Close-ups: the light of a model on samples far finer than the pixels of a sensor, in windows that its kernels fill."""
+"""Close-ups: the light of a model on samples far finer than the pixels of a sensor, in windows that it fills."""
 
 import dataclasses
 import math

@@ -79,7 +79,7 @@ def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -
 
 
 def histogram(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
-    """Energy of the points in each pixel, without derivative in their positions; arguments and result as for `splat`."""
+    """Energy of the points in each pixel, without derivative in their positions; arguments as for `splat`."""
     column, row = (torch.floor(_in_pixels(grid, points, axis)) for axis in (0, 1))
     # -1 or `count`, outside the window, for all points further out and for NaN.
     column, row = (
@@ -538,34 +538,25 @@ class RayMap:
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 3) -> Kernels:
-    """PSFs through the ray map, or of traced rays where it fails; see `kernels_and_reason`."""
-    return kernels_and_reason(scene, grid, order=order)[0]
-
-
-def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Kernels, str]:
-    """PSFs through the ray map, and one line on the method used.
+    """PSFs through the ray map; of traced rays where no polynomial fits, or a ray misses a surface or is totally
+    reflected.
 
     order: 0 … 10; each has twice the cells of the one before, half its error, and a map of higher degree.
     `Kernels.residual` bounds the effect of the map's error on the kernel (relative L1); it is 0 for traced rays.
     """
-    limit = max(_PIXELS * 0.5**order, _CLOSE)
-    pitch = grid.pitch.detach()
-    why, first = "", _DEGREES[min(order, len(_DEGREES) - 1)]
+    limit, pitch = max(_PIXELS * 0.5**order, _CLOSE), grid.pitch.detach()
+    first = _DEGREES[min(order, len(_DEGREES) - 1)]
     for degree in [first, *(degree for degree in _HIGHER_DEGREES if degree > first)]:
         ray_map = fit(scene, degree)
         error = float(scene.largest((ray_map.residual / pitch).amax()))
         edge_error = float(scene.largest(ray_map.edge_residual.amax()))
         if error <= limit and edge_error <= limit:
-            return _kernels_of_map(scene, grid, ray_map, order), (
-                f"map of degree {degree} through {ray_map.rays} rays, within {error:.1e} pixels"
-            )
-        if error == float("inf"):
-            why = "a ray misses a surface or is totally reflected"
+            return _kernels_of_map(scene, grid, ray_map, order)
+        if math.isinf(error):
             break
-        why = f"a map of degree {degree} errs by {error:.1e} pixels (edges {edge_error:.1e}), above {limit:.1e}"
     finer = min(order + 2, 10)
     traced = kernels_of_fans(scene, grid, trace_fans(scene, finer), width=cell_width(finer))
-    return _with_residual(traced, torch.zeros_like(traced.centroid[0])), f"{traced.rays} rays traced: {why}"
+    return _with_residual(traced, torch.zeros_like(traced.centroid[0]))
 
 
 def fit(scene: Scene, degree: int) -> RayMap:

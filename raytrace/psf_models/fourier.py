@@ -47,7 +47,7 @@ _MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refus
 
 
 @value
-class Paraxial:
+class DefocusedPupil:
     """First-order data of a lens; every entry (D, F, W).
 
     defocus: ψ at the edge of the pupil, radians; frequency: a, cycles per mm at the edge of the pupil;
@@ -93,7 +93,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
 
 
 def _kernels(
-    scene: Scene, lens: Paraxial, window: Grid, waves: Tensor | None, order: int
+    scene: Scene, lens: DefocusedPupil, window: Grid, waves: Tensor | None, order: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Kernels (D, F, W, rows, columns), one after the other, for each has its coefficients phases; centroid and
     covariance.
@@ -118,7 +118,7 @@ def _kernels(
     return torch.stack(pixels).unflatten(0, shape), centroid, covariance
 
 
-def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
+def _round_kernels(scene: Scene, lens: DefocusedPupil, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
     """The same on the axis, along one radius; Bessel functions are shared by all object distances.
 
     Sensor and pupil decide the frequency a, an object distance only the defocus.
@@ -142,7 +142,7 @@ def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tu
     return light_of_radii(window, 2 * steepest, order, intensity)
 
 
-def paraxial(scene: Scene) -> Paraxial:
+def paraxial(scene: Scene) -> DefocusedPupil:
     """Defocus, edge frequency and chief ray of the paraxial lens, with the index of every wavelength."""
     lens, wavelengths, shape = scene.lens, scene.wavelengths, scene.shape
     primary, coloured = first_order(lens), first_order(lens, wavelengths)
@@ -155,7 +155,7 @@ def paraxial(scene: Scene) -> Paraxial:
     waves = 1e3 * radius / wavelengths  # R/λ
     defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
     chief = chief_ray_height(scene)
-    return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
+    return DefocusedPupil(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
 
 
 def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:
@@ -182,7 +182,7 @@ def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: 
     return math.pi * frequency**2 * (U.real**2 + U.imag**2)
 
 
-def _moments(lens: Paraxial, waves: Tensor | None) -> tuple[Tensor, Tensor]:
+def _moments(lens: DefocusedPupil, waves: Tensor | None) -> tuple[Tensor, Tensor]:
     """Centroid (2, D, F, W) from the chief ray and covariance (3, D, F, W), mm and mm², of the geometric limit.
 
     Light of path W(p) waves lands at x = ∇W/a: a disc of radius |ψ|/(π a), variance radius²/4 on each axis.

@@ -34,7 +34,8 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, select, unit
+from raytrace.maths.dual import select
+from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import detached, value
 from raytrace.system.lens import (

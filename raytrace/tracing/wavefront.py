@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import dot, root, safe_divide, safe_sqrt, unit
+from raytrace.maths.dual import root
+from raytrace.maths.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.maths.value import value
 from raytrace.system.rays import Rays
 from raytrace.tracing.aiming import is_bent

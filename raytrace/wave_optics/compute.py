@@ -25,8 +25,9 @@ from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, height_range
+from raytrace.wave_optics.element import Element, EvenPowers
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
+from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture
@@ -37,7 +38,7 @@ _KEPT = 8  # sums that a memo keeps
 
 @value
 class ElementPsf(Result):
-    """PSFs of an element for points on the axis, over depth and colour.
+    """PSFs of an element for points on the axis, over depth and wavelength.
 
     kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: the
     sampling, with the predicted error, relative L2 of the worst kernel; element: its name.
@@ -126,17 +127,23 @@ class ElementPsf(Result):
         return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
 
     def __str__(self) -> str:
-        return "\n".join(
-            [
-                self.title,
-                *map(_heights, self.scene.elements),
-                f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
-                f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
-                f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
-                f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
-                *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
-            ]
-        )
+        lines = [self.title]
+        for element in self.scene.elements:
+            low, high = height_range(element)
+            material = element.glass.name or "constant index"
+            lines.append(f"{element.kind.words} of {material}, heights over {1e3 * (high - low):.4g} µm")
+        lines += [
+            f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
+            f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
+            f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
+            f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
+        ]
+        for row in rows(self.columns()):
+            depth, wavelength, energy, peak, radius = map(number, row.values())
+            half = "–" if radius is None else f"{1e3 * radius:.2f}"
+            place = object_text(math.inf if depth is None else depth)
+            lines.append(f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}")
+        return "\n".join(lines)
 
     def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
         """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
@@ -149,33 +156,15 @@ class ElementPsf(Result):
         return figures.psf_figure(self) if what == "kernels" else figures.encircled_figure(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
+        """Write the arrays, psf[depth, wavelength, y, x] and its axes, as .npz."""
         if Path(path).suffix.lower() != ".npz":
             raise ValueError(f"{path}: expected a name that ends in .npz")
-        arrays = {
-            "psf": self.kernel.detach().numpy(),
-            "pixel_pitch": float(self.pitch),
-            "centre": self.grid.centre.detach().numpy(),
-            "energy": self.energy.detach().numpy(),
-            "depths": self.depths.detach().numpy(),
-            "wavelengths": self.wavelengths.detach().numpy(),
-            "engine": self.plan.engine,
-            "samples": self.plan.samples,
-            "error": self.plan.error,
-            "element": self.element,
-        }
+        tensors = {"psf": self.kernel, "centre": self.grid.centre, "energy": self.energy}
+        tensors |= {"depths": self.depths, "wavelengths": self.wavelengths}
+        arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
+        arrays |= {"pixel_pitch": float(self.pitch), "element": self.element}
+        arrays |= {name: getattr(self.plan, name) for name in ("engine", "samples", "error")}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
-
-
-def _heights(element: Element) -> str:
-    low, high = height_range(element)
-    return f"{element.kind.words} of {element.glass.name or 'constant index'}, heights over {1e3 * (high - low):.4g} µm"
-
-
-def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:
-    half = "–" if half_energy_radius is None else f"{1e3 * half_energy_radius:.2f}"
-    place = object_text(math.inf if depth is None else depth)
-    return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
 
 
 def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, **sampling) -> ElementPsf:
@@ -219,11 +208,11 @@ def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
 
 COLOURS = (0.46, 0.55, 0.64)
 _DESIGN = 0.55  # µm
-_PIECE = 1e9  # bytes: what would take more is computed kernel by kernel
+_CHUNK = 1e9  # bytes: beyond, kernels are computed one by one
 _RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
 _PLANES, _RANGE, _ACROSS = 121, (0.8, 1.2), 0.05  # of a caustic: over the sensor distance, and of the aperture
 
-#: Shows how far a loop has come: (what is gone through, its unit) -> the same.
+#: Shows the progress of a loop: (its items, their unit) -> the items.
 Progress = Callable[[Sequence, str], Iterable]
 
 
@@ -325,11 +314,10 @@ def elements(
     Raises ValueError for options that do not belong together, and the errors of `read_element`.
     """
     name = str(element)
-    of_files = {"glass": glass, "index": index, "pitch": pitch, "span": span}
     if name in BASELINES:
-        for option, given in of_files.items():
-            if given is not None:
-                raise ValueError(f"`{option}` belongs to a height map; the element {name} has its own")
+        for option, number in {"glass": glass, "index": index, "pitch": pitch, "span": span}.items():
+            if number is not None:
+                raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
             raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
         made_for = aim(
@@ -343,7 +331,7 @@ def elements(
         )
     if index is not None:
         if glass:
-            raise ValueError("`glass` and `index` both name the material: give one of them")
+            raise ValueError("`glass` and `index` exclude each other: both specify the material")
         try:
             glass = from_table(wavelengths, index)
         except ValueError as error:
@@ -363,29 +351,26 @@ def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> No
         outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
         if outside:
             listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
-            raise ValueError(f"{glass.name or 'the material'} is known from {low:g} to {high:g} µm, not at {listed} µm")
+            name = glass.name or "the material"
+            raise ValueError(f"{name} has indices from {low:g} to {high:g} µm, none at {listed} µm")
         check_wavelengths(glass, wavelengths)
 
 
 def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
     """All kernels at once, or one after the other where that would take too much memory."""
     D, W = len(scene.depths), len(scene.wavelengths)
-    whole = chosen.memory < min(_PIECE, allowed_bytes())
+    whole = chosen.memory < min(_CHUNK, allowed_bytes())
     helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
     if whole:
         return psf(scene, plan=chosen).kernel
-    parts = [(d, w) for d in range(D) for w in range(W)]
-    found = [
-        psf(
-            dataclasses.replace(scene, depths=scene.depths[d : d + 1], wavelengths=scene.wavelengths[w : w + 1]),
-            plan=chosen,
-        ).kernel
-        for d, w in progress(parts, "kernel")
-    ]
-    return torch.cat(found).reshape(D, W, *scene.grid.shape)
+    kernels = []
+    for d, w in progress([(d, w) for d in range(D) for w in range(W)], "kernel"):
+        point = {"depths": scene.depths[d : d + 1], "wavelengths": scene.wavelengths[w : w + 1]}
+        kernels.append(psf(dataclasses.replace(scene, **point), plan=chosen).kernel)
+    return torch.cat(kernels).reshape(D, W, *scene.grid.shape)
 
 
 @torch.no_grad()

@@ -72,12 +72,12 @@ def element_lens(
     zero = torch.zeros_like(front.thickness)
     before, image = (Surface(torch.as_tensor(t, dtype=zero.dtype)) for t in (object_distance, zero))
     wavelengths = torch.as_tensor(wavelengths, dtype=zero.dtype)
-    nothing = wavelengths.new_zeros(1)
+    axis = wavelengths.new_zeros(1)
     return Lens(
         surfaces=(before, front, back, image),
         stop=2,
         aperture=SystemAperture("float_by_stop", element.radius),
-        fields=Fields("angle", nothing, nothing, torch.ones_like(nothing)),
+        fields=Fields("angle", axis, axis, torch.ones_like(axis)),
         wavelengths=wavelengths,
         wavelength_weights=torch.ones_like(wavelengths),
     )
@@ -207,17 +207,17 @@ def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:
     front = light.wavefront
     L, M, N = front.direction
     if light.symmetry == "mirror":
-        turned = [torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in ((L, M), stop)]
+        rotated = [torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in ((L, M), stop)]
         copies = 2
     else:
         angle = (torch.arange(arms, dtype=L.dtype, device=L.device) + 0.5) * (2 * math.pi / arms)
         c, s = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
         pairs = ((a[..., None, :], b[..., None, :]) for a, b in ((L, M), stop))
-        turned = [torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs]
+        rotated = [torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs]
         copies = arms
     repeated = [torch.cat([t] * copies, -1) for t in (front.opd, N, light.amplitude / copies)]
-    front = dataclasses.replace(front, opd=repeated[0], direction=torch.cat([turned[0], repeated[1][None]]))
-    return Waves(repeated[2], front, "none"), turned[1]
+    front = dataclasses.replace(front, opd=repeated[0], direction=torch.cat([rotated[0], repeated[1][None]]))
+    return Waves(repeated[2], front, "none"), rotated[1]
 
 
 # -- sampling ----------------------------------------------------------------------------------------------------------

@@ -254,11 +254,11 @@ class Setting:
     width: float  # radius of an even disc as wide as the light
     core: float  # of one as large in area, beyond a core in focus
     sharpest: float  # the least of it over kernels
-    scatter: float  # √(2 A S/12)/(λz), mm^-1.5: what steps S/mm scatter
+    scatter: float  # √(2 A S/12)/(λz), mm^-1.5: light scattered by steps S/mm
     features: tuple[float, ...]  # pitches of rings and pixels, mm
     speckle: bool  # whether there are features that no period wraps
     lattice: bool  # cells can share the edges of all steps: those of one map of pixels
-    edge: float  # √(2 A λz (1 + S R/2)/(2π³ R)), mm^1.5: what edges and steps send far away
+    edge: float  # √(2 A λz (1 + S R/2)/(2π³ R)), mm^1.5: light sent far away by edges and steps
 
     @property
     def airy(self) -> float:
@@ -314,14 +314,14 @@ def edge_error(s: Setting, samples: int, width: float | None = None) -> float:
 
 
 def step_error(s: Setting, samples: float) -> float:
-    """Of N cells over a profile with steps; where cells lie in flat pixels, the smooth rest bends across them."""
-    bent = 0.25 * ((s.blur + 0.5 * s.reach) / s.period(samples)) ** 2
-    return min(1.0, _area_error(s, samples) + (bent if s.lattice else _scattered(s, samples)))
+    """Of N cells over a profile with steps; where cells lie in flat pixels, the smooth rest varies across them."""
+    curved = 0.25 * ((s.blur + 0.5 * s.reach) / s.period(samples)) ** 2
+    return min(1.0, _area_error(s, samples) + (curved if s.lattice else _scattered(s, samples)))
 
 
 def _scattered(s: Setting, samples: float) -> float:
     """A cell cut by an edge into f and 1 - f holds the field of one side: in the mean over a cell |jump|²/12 of light,
-    scattered evenly over a period. What repeats with the cells adds up: up to four times as much.
+    scattered evenly over a period. Steps that repeat with the cells add up: up to four times as much.
     """
     shares = [pitch * samples / s.diameter for pitch in s.features]
     whole = [min(abs(n - round(n)) / n for n in (share, 1 / share) if n > 0.5) < 0.01 for share in shares]
@@ -352,7 +352,7 @@ def node_error(s: Setting, nodes: int) -> float:
 
 
 def radius_error(half: float, samples: int) -> float:
-    """Of n Gauss radii between steps that the phase turns by 2·half."""
+    """Of n Gauss radii between steps with a phase of 2·half."""
     if half < 20:
         return min(1.0, bessel(half, samples))
     enough = rings_and_arms(2 * half, 0)[0]
@@ -372,7 +372,9 @@ def _area_error(s: Setting, samples: float) -> float:
 
 
 def cut_error(s: Setting, samples: int, bare: float) -> float:
-    """Of cells of flat pixels cut by the rim: across them turns the bare sphere, with a blur of `bare` mm."""
+    """Of cells of flat pixels cut by the rim, across which the phase of the bare sphere varies, with a blur of `bare`
+    mm.
+    """
     return min(1.0, 0.8 * (s.core + 0.1 * s.airy) * bare / s.period(samples) ** 2 + _tail(s, samples))
 
 
@@ -387,16 +389,17 @@ def gauss_count(a: float, tol: float) -> int:
 
 
 def half_phases(scene: WaveScene, s: Setting) -> tuple[float, float]:
-    """Largest half of the phase, radians, that the integrand of the radial engine turns between two steps: a bound,
-    the slope at the farther one times their distance, and what it turns."""
+    """Two estimates of the largest half of the phase, radians, of the integrand of the radial engine between two steps:
+    a bound, the slope at the farther one times their distance, and the accumulated phase.
+    """
     edges = propagation.edges(scene).detach()
     r = torch.linspace(0, 1, 513, dtype=edges.dtype, device=edges.device) * edges[-1]
-    bent = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
-    turned = torch.cumsum(bent, 0) * (edges[-1] / 512)
+    angle = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
+    phase = torch.cumsum(angle, 0) * (edges[-1] / 512)
     place = edges / edges[-1] * 512
     low = place.long().clamp(max=511)
-    across = torch.lerp(turned[low], turned[low + 1], place - low).diff()
-    bound = across if len(edges) == 2 else edges.diff() * bent[place[1:].long()]
+    across = torch.lerp(phase[low], phase[low + 1], place - low).diff()
+    bound = across if len(edges) == 2 else edges.diff() * angle[place[1:].long()]
     return tuple(float(math.pi / s.shortest * half.max()) for half in (bound, across))
 
 
@@ -531,9 +534,9 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
     extent = extent_of(scene, band)
     period = band[1] + deflection(scene, extent) + beyond + s.reach
     samples = _even(extent * s.diameter * period / (s.shortest * s.distance))
-    half, turned = half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
+    half, phase = half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
     inner = gauss_count(half, 0.1 * tol)
-    error = node_error(s, nodes) + radius_error(turned, inner) + 3e-4
+    error = node_error(s, nodes) + radius_error(phase, inner) + 3e-4
     D, W = s.kernels
     K, J, n = s.size * nodes, inner * (len(propagation.edges(round_part(scene))) - 1), radii_of_band(scene, band)
     T = 20 * n
@@ -543,13 +546,13 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
 
 
 def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
-    half, turned = half_phases(scene, s)
+    half, phase = half_phases(scene, s)
     if samples is None:
         samples = gauss_count(half, 0.1 * tol) if half < 20 else rings_and_arms(2 * half, 0 if tol > 1e-6 else 1)[0]
     # Nodes of the rule of pixels from order -2 on (`radii_of_waves`).
     base = math.ceil(0.5 * s.band) + 4
     nodes = max(base - 2, gauss_count(s.band, 0.5 * tol / 0.15)) if nodes is None else max(nodes, base - 2)
-    error = node_error(s, nodes) + radius_error(turned, samples)
+    error = node_error(s, nodes) + radius_error(phase, samples)
     D, W = s.kernels
     J = samples * (len(propagation.edges(scene)) - 1)
     K = math.ceil(s.band * reach(scene.grid) + 1.5 * (4 + (2 * s.band * reach(scene.grid)) ** (1 / 3)))
