@@ -353,12 +353,6 @@ class Parameter(NamedTuple):
     followers: Mapping[ParameterPath, float] = {}
 
 
-def _parameter(path: str, power: int | None = 0, is_integer: bool = False, **followers: float) -> Parameter:
-    return Parameter(
-        _place(path), power, is_integer, {_place(name.replace("__", ".")): f for name, f in followers.items()}
-    )
-
-
 class Named(NamedTuple):
     """A number of the lens by its name in `parameter_paths`; it is factor times the number of the file in mm."""
 
@@ -500,9 +494,19 @@ class SurfaceType:
         return tuple(Named(names[place], factor) for place, factor in factors.items() if place in names), like
 
 
+def _parameters(first: int, *rows: tuple) -> dict[int, Parameter]:
+    """PARM from `first` on, a row each: its place, then as the fields of `Parameter`, followers by their places."""
+    parameters = {}
+    for j, (path, *more) in enumerate(rows, first):
+        power, followers = more[0] if more else 0, more[1] if len(more) > 1 else {}
+        places = {_place(follower): factor for follower, factor in followers.items()}
+        parameters[j] = Parameter(_place(path), power if power != "switch" else 0, power == "switch", places)
+    return parameters
+
+
 def _coefficients(first: int, powers: Sequence[int | None]) -> dict[int, Parameter]:
     """PARM that are coefficients, from `first` on, by the power of length of each."""
-    return {j: _parameter(f"coefficients.{k}", power) for k, (j, power) in enumerate(enumerate(powers, first))}
+    return _parameters(first, *((f"coefficients.{k}", power) for k, power in enumerate(powers)))
 
 
 _ROUND = ("curvature", "conic", "coefficients")
@@ -549,7 +553,7 @@ def _round(name: str) -> SurfaceType:
 
 def _diffractive(name: str, phase: type, most: int) -> SurfaceType:
     """A phase of coefficients, radius and order (PARM 0), with even terms."""
-    parameters = {0: _parameter("phase.order"), **_EVEN}
+    parameters = _parameters(0, ("phase.order",)) | _EVEN
     return SurfaceType(name, (*_ROUND, "phase"), parameters, part=phase, terms=0, most=most, objection=_no_order)
 
 
@@ -560,7 +564,7 @@ _TYPES = {
     "TILTSURF": SurfaceType(
         "tilted",
         ("sag_terms",),
-        {1: _parameter("sag_terms.tan_x"), 2: _parameter("sag_terms.tan_y")},
+        _parameters(1, ("sag_terms.tan_x",), ("sag_terms.tan_y",)),
         part=TiltSag,
         amplitudes=(1, 2),
     ),
@@ -581,7 +585,7 @@ _TYPES = {
     "FZERNSAG": SurfaceType(
         "Zernike fringe sag",
         (*_ROUND, "sag_terms"),
-        {**_EVEN, 9: _parameter("sag_terms.centre_x", 1), 10: _parameter("sag_terms.centre_y", 1)},
+        _EVEN | _parameters(9, ("sag_terms.centre_x", 1), ("sag_terms.centre_y", 1)),
         unused={0: "whether the sag ends with its terms' disc; it continues"},
         part=FringeSag,
         terms=1,
@@ -590,16 +594,14 @@ _TYPES = {
     "IRREGULA": SurfaceType(
         "irregular",
         ("curvature", "conic", "sag_terms"),
-        {
-            1: _parameter("before.x", 1, after__x=-1.0),
-            2: _parameter("before.y", 1, after__y=-1.0),
-            3: _parameter("before.tilt_x", 0, after__tilt_x=-1.0),
-            4: _parameter("before.tilt_y", 0, after__tilt_y=-1.0),
-            5: _parameter("sag_terms.spherical", 1),
-            6: _parameter("sag_terms.astigmatism", 1),
-            7: _parameter("sag_terms.coma", 1),
-            8: _parameter("sag_terms.angle"),
-        },
+        _parameters(
+            1,
+            ("before.x", 1, {"after.x": -1.0}),
+            ("before.y", 1, {"after.y": -1.0}),
+            ("before.tilt_x", 0, {"after.tilt_x": -1.0}),
+            ("before.tilt_y", 0, {"after.tilt_y": -1.0}),
+            *(("sag_terms.spherical", 1), ("sag_terms.astigmatism", 1), ("sag_terms.coma", 1), ("sag_terms.angle",)),
+        ),
         part=IrregularSag,
         amplitudes=(5, 6, 7),
         objection=_unsized,
@@ -607,41 +609,31 @@ _TYPES = {
     "COORDBRK": SurfaceType(
         "coordinate break",
         (),
-        {
-            1: _parameter("before.x", 1),
-            2: _parameter("before.y", 1),
-            3: _parameter("before.tilt_x"),
-            4: _parameter("before.tilt_y"),
-            5: _parameter("before.tilt_z"),
-            6: _parameter("before.tilts_first", is_integer=True),
-        },
+        _parameters(
+            1,
+            *(("before.x", 1), ("before.y", 1), ("before.tilt_x",), ("before.tilt_y",), ("before.tilt_z",)),
+            ("before.tilts_first", "switch"),
+        ),
         beyond=lambda n: "" if n.at(6) in (0, 1) else f"of order {n.at(6):g} (PARM 6; 0 and 1 are known)",
         is_break=True,
     ),
     "DGRATING": SurfaceType(
         "diffraction grating",
         ("curvature", "conic", "phase"),
-        {1: _parameter("phase.frequency"), 2: _parameter("phase.order")},
+        _parameters(1, ("phase.frequency",), ("phase.order",)),
         part=Grating,
     ),
     "PARAXIAL": SurfaceType(
         "paraxial lens",
         ("phase",),
-        {
-            1: _parameter("phase.power_x", INVERSE, phase__power_y=1.0),
-            2: _parameter("phase.opd_mode", is_integer=True),
-        },
+        _parameters(1, ("phase.power_x", INVERSE, {"phase.power_y": 1.0}), ("phase.opd_mode", "switch")),
         part=IdealLens,
         objection=_no_focal_length,
     ),
     "PARAX_XY": SurfaceType(
         "paraxial XY",
         ("phase",),
-        {
-            1: _parameter("phase.power_x", -1),
-            2: _parameter("phase.power_y", -1),
-            3: _parameter("phase.opd_mode", is_integer=True),
-        },
+        _parameters(1, ("phase.power_x", -1), ("phase.power_y", -1), ("phase.opd_mode", "switch")),
         part=IdealLens,
         objection=lambda numbers: _unknown_mode(numbers.at(3)),
     ),
@@ -651,12 +643,11 @@ _TYPES = {
     "HOLOGRM2": SurfaceType(
         "hologram 2",
         ("phase",),
-        {
-            **{1 + k: _parameter(f"phase.first.{k}", 1) for k in range(3)},
-            **{4 + k: _parameter(f"phase.second.{k}", 1) for k in range(3)},
-            7: _parameter("phase.wavelength"),
-            8: _parameter("phase.order"),
-        },
+        _parameters(
+            1,
+            *((f"phase.{beam}.{k}", 1) for beam in ("first", "second") for k in range(3)),
+            *(("phase.wavelength",), ("phase.order",)),
+        ),
         part=Hologram,
         objection=_no_construction,
         flat=True,
