@@ -13,11 +13,10 @@ from torch import Tensor
 
 from raytrace.bench.measure import name_of, shape_of
 from raytrace.maths.value import to
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
 from raytrace.tracing.compiler import NoCompiler, compiler, private_folder, run_compiler
-from raytrace.tracing.trace import media
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
 #: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.

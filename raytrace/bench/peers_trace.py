@@ -23,12 +23,11 @@ from torch import Tensor
 
 from raytrace.bench.measure import name_of, shape_of, squared_radius, variables
 from raytrace.maths.value import to
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.phases import Grating
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import Frame, frames
-from raytrace.tracing.trace import media
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 # mm, where Optiland's search for a toroid ends: what float32 does not reach it would try in vain a hundred times
