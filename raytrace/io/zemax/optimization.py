@@ -255,18 +255,18 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
 def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
     numbers = _solve_numbers(record, 1)
     source = _source(numbers, typed.number)
-    own, _ = typed.names("PARM", j)
+    named, _ = typed.names("PARM", j)
     there, _ = surfaces[source].names("PARM", j) if source is not None else ((), None)
     power = typed.row.parameters[j].power if j in typed.row.parameters else 0
-    is_linear = own and there and power is not INVERSE and own[0].factor == there[0].factor == 1
+    is_linear = named and there and power is not INVERSE and named[0].factor == there[0].factor == 1
     if not is_linear or any(numbers[3:]) or len(numbers) < 2:
         yield typed.solve(f"PARM {j}", "PPAR", _with_offset(numbers, power or 0, typed.millimetres))
         return
     offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power, typed.millimetres)
-    other = there[0].name if there[0].name != own[0].name else ""
+    other = there[0].name if there[0].name != named[0].name else ""
     pickup = {"source": source, "scale": numbers[1], "offset": offset, "quantity_of_source": other}
-    yield Solve(typed.number, own[0].name, "pickup", **pickup)
-    yield from _followers(typed, own)
+    yield Solve(typed.number, named[0].name, "pickup", **pickup)
+    yield from _followers(typed, named)
 
 
 def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> Iterator[Solve]:
@@ -487,12 +487,12 @@ def _is_row(record: Record) -> bool:
 
 def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
     """The lines of tolerances unchanged; none where the file only says that there are none."""
-    own = [record for record in lines if record.keyword in _TOLERANCES]
-    for record in own:
+    tolerances = [record for record in lines if record.keyword in _TOLERANCES]
+    for record in tolerances:
         report.met(record.keyword, READ, record.place)
-    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in own):
+    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in tolerances):
         return ()
-    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in own)
+    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in tolerances)
 
 
 def read_merit(path: str | PathLike) -> tuple[Row, ...]:
@@ -554,15 +554,15 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     data = lens.optimization_data
     if data is None:
         return lines
-    own = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
-    sizes = [rule for rule in own if rule.quantity == "semi_diameter"]
+    rules = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
+    sizes = [rule for rule in rules if rule.quantity == "semi_diameter"]
     code, source = (_FIXED if number in data.semi_diameters else 0), 0
     if not code and sizes:
         code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
     lines = _changed(lines, "DIAM", {2: str(code), 3: str(source)})
-    own = [rule for rule in own if rule.operand is None and rule.quantity != "semi_diameter"]
-    parameters = _parameters(lens.surfaces[number]) if own else {}
-    for rule in own:
+    rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
+    parameters = _parameters(lens.surfaces[number]) if rules else {}
+    for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
         if rule.quantity == "thickness":

@@ -96,8 +96,8 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        own = with_rules(_surface(lens, number, surface, place), lens, number, place)
-        lines += _with_pickups(own, lens, number, place)
+        ruled = with_rules(_surface(lens, number, surface, place), lens, number, place)
+        lines += _with_pickups(ruled, lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -167,7 +167,7 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
     kind = _type(surface, place)
-    curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
+    curvature = exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":
         semi_diameter = float(lens.aperture.value)
@@ -250,8 +250,8 @@ def _pose(pose: Pose, place: Place) -> str:
     if pose.z is not None:
         message = "a decentre along z; add it to the thickness before; a .zmx file cannot hold it"
         raise LensFileError(message, place)
-    values = (getattr(pose, name) for name in ("x", "y", "tilt_x", "tilt_y", "tilt_z"))
-    numbers = (exact(0.0 if value is None else value, "tilt or decentre", place) for value in values)
+    values = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
+    numbers = (exact(value, "tilt or decentre", place) for value in values)
     return " ".join([str(int(pose.tilts_first)), "0", *numbers])
 
 
