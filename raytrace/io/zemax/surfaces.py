@@ -727,13 +727,10 @@ def numbers_of(block: Block, row: SurfaceType, millimetres: float) -> Numbers:
             continue
         power = row.parameters[j].power
         try:
-            parameters[j] = (
-                in_millimetres(value, power, millimetres)
-                if power is not INVERSE
-                else inverse(record.words[1], millimetres)
-                if value
-                else 0.0
-            )
+            if power is INVERSE:
+                parameters[j] = inverse(record.words[1], millimetres) if value else 0.0
+            else:
+                parameters[j] = in_millimetres(value, power, millimetres)
         except OverflowError as error:
             message = f"PARM {record.words[0]} is {shown(record.words[1])}, too small a length"
             raise LensFileError(message, record.place) from error

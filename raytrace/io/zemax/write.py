@@ -40,6 +40,7 @@ from raytrace.io.zemax.configurations import (
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
+    changed,
     margin_line,
     statuses,
     tail_lines,
@@ -437,23 +438,17 @@ def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> li
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
             if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
                 raise LensFileError(f"follows {operand} by a rule that is not written", place)
+            start = {"PRAM": f"PPAR {operand.parameter}", "THIC": "PZUP", "CRVT": "CURV", "GLSS": "GLAS"}[name]
+            line = next((line.split() for line in lines if f"{line} ".startswith(f"  {start} ")), [])
             if name in ("PRAM", "THIC"):
-                start = f"  PPAR {operand.parameter} " if name == "PRAM" else "  PZUP "
-                if not any(
-                    line.startswith(start) for line in lines
-                ):  # a solve of the surface itself is written already
-                    lines = [*lines, f"{start}{operand.number} {factor!r} {offset!r} 0"]
+                if not line:  # else a solve of the surface itself is written already
+                    lines = [*lines, f"  {start} {operand.number} {factor!r} {offset!r} 0"]
+            elif line[2:3] not in (["0"], ["1"], []):
                 continue
-            keyword = {"CRVT": "CURV", "GLSS": "GLAS"}[name]
-            if any(line.split()[0] == keyword and line.split()[2] not in ("0", "1") for line in lines):
-                continue
-            if name == "CRVT" and offset:
+            elif name == "GLSS":
+                lines = changed(with_glass_line(lines), "GLAS", {2: "2", 3: str(operand.number)})
+            elif offset:
                 raise LensFileError(f"follows {operand} with an offset, which is not written", place)
-            lines = with_glass_line(lines) if name == "GLSS" else lines
-            at = next(k for k, line in enumerate(lines) if line.split()[0] == keyword)
-            words = lines[at].split()
-            if name == "CRVT":
-                lines[at] = f'  CURV {words[1]} 4 {operand.number} {factor!r} 0 ""'
             else:
-                lines[at] = "  " + " ".join([*words[:2], "2", str(operand.number), *words[4:]])
+                lines = changed(lines, "CURV", {2: "4", 3: str(operand.number), 4: repr(factor), 5: "0"})
     return lines
