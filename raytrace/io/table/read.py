@@ -5,7 +5,7 @@ glass, and if wanted nd and Vd, conic, semi-diameter or diameter, aspheric terms
 apertures, type, comment. Header lines '# key: value' hold the system (`table.system`). Without them the lens is read
 with assumptions that are stated in warnings: on axis, the d line, F/10 unless the stop row has a semi-diameter.
 
-- An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' says otherwise.
+- An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' states another unit.
 - A column of numbers whose heading is not known, or may mean two things, is an error; '# ignore: NAME' leaves it out.
 - Glass: empty or `air`; a catalog name; `MIRROR`; a number, the constant index; `1.5168/64.17` (nd/Vd) or
   `1.5168/64.17/0.0008` (nd/Vd/ΔPgF), a model glass; six digits, a MIL code; `NAME=1.33` or `NAME=1.5168/64.17`, the

@@ -487,7 +487,7 @@ def _is_row(record: Record) -> bool:
 
 
 def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
-    """The lines of tolerances unchanged; none where the file only says that there are none."""
+    """The lines of tolerances unchanged; none where the file states that there are none."""
     tolerances = [record for record in lines if record.keyword in _TOLERANCES]
     for record in tolerances:
         report.met(record.keyword, READ, record.place)
