@@ -1,6 +1,7 @@
 """Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -90,7 +91,7 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    UNIT = "mm"
+    UNITS: ClassVar = {"tangential": "mm", "sagittal": "mm"}
 
     def columns(self) -> dict[str, Tensor]:
         tangential, sagittal = masked(self.tangential, self.valid), masked(self.sagittal, self.valid)

@@ -27,7 +27,6 @@ from raytrace.maths.result import Result, number, numbers, object_text
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
@@ -125,9 +124,6 @@ class Focus(Result):
     def words(self) -> dict:
         return {"place": [words for words, _ in self._sensors()]}
 
-    def units(self) -> dict[str, str]:
-        return {"sensor_distance": "mm", "rms_radius": "mm"}
-
     def document(self) -> dict:
         alone = len(self.object_distances) == 1
         before = self.before.surfaces[-2].thickness
@@ -143,7 +139,7 @@ class Focus(Result):
         }
 
     def __str__(self) -> str:
-        data, kind = first_order(self.before), self.before.fields.kind
+        data = first_order(self.before)
         diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
         focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
         objects = ", ".join(_words(d) for d in self.object_distances.tolist())
@@ -153,7 +149,8 @@ class Focus(Result):
             self.before.name,
             f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
             f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
-            f"  object at {objects}; field {fields} {FIELD_UNITS[kind]}; {colours} µm; criterion {self.criterion}\n",
+            f"  object at {objects}; field {fields} {self.before.fields.unit}; {colours} µm; "
+            f"criterion {self.criterion}\n",
             f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
         ]
         for words, sensor in self._sensors():

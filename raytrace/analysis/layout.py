@@ -18,7 +18,6 @@ from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
@@ -66,7 +65,7 @@ class Layout(Result):
 
     def __str__(self) -> str:
         points = ", ".join(map(name_of_field, self.fields.unbind(1)))
-        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
+        return f"{self.lens.name or 'Lens'}: field {points} {self.lens.fields.unit}"
 
     @style.styled
     def draw(self):

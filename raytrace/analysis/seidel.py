@@ -62,6 +62,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
+    UNITS = property(lambda self: dict.fromkeys(self.names, self.unit))
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)

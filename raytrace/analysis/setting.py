@@ -11,7 +11,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_field_kind, with_wavelengths
+from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.ray_failures import check_reach, ray_failures
@@ -93,7 +93,7 @@ def field_line(fields: Tensor) -> Tensor:
 
 def field_words(lens: Lens, field: Tensor) -> str:
     """A field (2,) with its unit."""
-    return f"{name_of_field(field)} {FIELD_UNITS[lens.fields.kind]}"
+    return f"{name_of_field(field)} {lens.fields.unit}"
 
 
 def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, what: str) -> None:

@@ -17,7 +17,6 @@ from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
@@ -81,14 +80,9 @@ class Spots(Result):
             **{name: getattr(self.each, name) for name in names},
         }  # fmt: skip
 
-    def units(self) -> dict[str, str]:
-        field = FIELD_UNITS[self.lens.fields.kind]
-        lengths = ("centroid_x", "centroid_y", "rms_radius", "geometric_radius")
-        return {"field_x": field, "field_y": field, "wavelength": "µm", **dict.fromkeys(lengths, "mm")}
-
     def document(self) -> dict:
         places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
-        unit = {"field_type": self.lens.fields.kind, "field_unit": FIELD_UNITS[self.lens.fields.kind]}
+        unit = {"field_type": self.lens.fields.kind, "field_unit": self.lens.fields.unit}
         about = {} if self.arrivals is None else {"reference": self.reference, "weights": self.weights}
         return {**unit, "results": [self._entry(*place) for place in places], **about}
 
@@ -109,7 +103,7 @@ class Spots(Result):
         return {**found, "launched": self.launched}
 
     def __str__(self) -> str:
-        unit, width = FIELD_UNITS[self.lens.fields.kind], 7 if self.arrivals is not None else 11
+        unit, width = self.lens.fields.unit, 7 if self.arrivals is not None else 11
         heads = ("centroid x", "centroid y", "RMS", "GEO"), ("mm", "mm", "µm", "µm")
         lines = [f"{'field':>10} {'wavelength':>11} {_row(heads[0])} {'rays':>{width}}"]
         lines += [f"{unit:>10} {'µm':>11} {_row(heads[1])} {'lost':>{width}}"]

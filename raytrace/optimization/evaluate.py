@@ -50,6 +50,8 @@ class MeritResult(Result):
     skipped: tuple[int, ...]
     each: bool = False
 
+    UNITS = property(lambda self: dict.fromkeys(("target", "value"), f"of the operand, lengths in {self.unit:g} mm"))
+
     def columns(self) -> dict[str, Tensor]:
         kinds, said = self.words()["operand"], self.words()["arguments"]
         rows = self.valued()
