@@ -244,7 +244,7 @@ def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
 
 
 def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
-    """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they tell the scale of the image."""
+    """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they give the scale of the image."""
     largest = field_range(lens, 2)[:, 1:]
     if not is_bent(lens):
         return largest * _NEAR_AXIS

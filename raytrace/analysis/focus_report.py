@@ -308,7 +308,7 @@ def _words(distance: float) -> str:
 
 
 def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
-    """What tells the curves apart, object distance outermost."""
+    """Labels of the curves, object distance outermost."""
     points = [field_label(lens, point) for point in style.array(fields).T]
     if len(distances) == 1:
         return points
@@ -461,7 +461,7 @@ def focus_rays(
 
 
 def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[float, float]:
-    """First and last sensor distance in mm: all minima and marks, and room for the curves to rise beside them.
+    """First and last sensor distance in mm: all minima and marks, and room for the curves to rise around them.
 
     A perfect cone moved by s has the RMS radius s/(√8 N); the room makes that twice the least RMS radius, or five
     times the classical depth of focus 2 λ N² where the spot is smaller than the Airy disc.

@@ -60,7 +60,7 @@ class RmsOverField(OverField):
         return table if self.strehl is None else {**table, "strehl": self.strehl}
 
     def __str__(self) -> str:
-        """A row for each field, the wavelengths beside one another."""
+        """A row for each field, a column for each wavelength."""
         unit, factor = ("waves", 1.0) if self.strehl is not None else ("µm", 1e3)
         heads = ["all, weighted", *(f"{wavelength:g} µm" for wavelength in self.wavelengths.tolist())]
         table = factor * torch.cat([self.polychromatic[:, None], self.rms], 1)
@@ -81,8 +81,8 @@ class RmsOverField(OverField):
         """RMS over the field: all wavelengths together in black, each in its colour; Maréchal's limit dotted."""
         curves = self.drawn()
         waves = curves.quantity == "wavefront"
-        what = "RMS wavefront error" if waves else "RMS spot radius"
-        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{what} ({'waves' if waves else 'µm'})")
+        quantity = "RMS wavefront error" if waves else "RMS spot radius"
+        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{quantity} ({'waves' if waves else 'µm'})")
         order = np.argsort(field_axis(curves))
         field, scale = field_axis(curves)[order], 1.0 if waves else 1e3
         by_wavelength(panel, curves, field, scale * array(curves.rms)[order], linewidth=1.2)
@@ -94,7 +94,7 @@ class RmsOverField(OverField):
         panel.set_ylim(bottom=0)
         if field.max() > field.min():
             panel.set_xlim(field.min(), field.max())
-        return finished(panel, curves, what, 5)
+        return finished(panel, curves, quantity, 5)
 
 
 def rms_over_field(

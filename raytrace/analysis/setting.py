@@ -1,4 +1,4 @@
-"""What an analysis looks at: fields, wavelengths and their weights, as a scene of one object distance."""
+"""The scene of an analysis: fields, wavelengths and their weights, as a scene of one object distance."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
 
-#: What verbs take for fields, y or pairs (x, y), and for other numbers; None stands for the lens's own.
+#: Fields, y or pairs (x, y), and other numbers as analyses take them; None: those of the lens.
 Points = Tensor | Sequence | float | None
 Numbers = Tensor | Sequence[float] | float | None
 
@@ -32,7 +32,7 @@ class NothingToShow(ValueError):
 
 
 class Incomplete(UserWarning):
-    """A field lacks something of what an analysis tells."""
+    """A field lacks a part of the results of an analysis."""
 
 
 def setting(
@@ -41,7 +41,7 @@ def setting(
     """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
-    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func that cannot be told.
+    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func this is not checked.
     Warns UnfilledStop.
     """
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
@@ -117,7 +117,7 @@ def shown(found):
     if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
         raise NothingToShow(
             f"nothing to show: no number of {found.COMMAND.replace('-', ' ')} exists for this lens; `raytrace info` "
-            "tells whether it has a focal length and an image"
+            "shows whether it has a focal length and an image"
         )
     return found
 

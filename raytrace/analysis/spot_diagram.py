@@ -31,7 +31,7 @@ from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, ima
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
-_TRIED = 4096  # rays that tell where all are lost
+_TRIED = 4096  # rays from which the cause is found where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
 _INSET = 0.395  # of a panel's width
@@ -45,11 +45,11 @@ def _of_each(name: str) -> property:
 
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, mm: what Spot says of them, this says, too.
+    """Spots (F, W) of every field and wavelength on the sensor, mm, with the properties of `Spot`.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
-    lens, fields: (2, F), what was looked at. The table has a row a spot; `save` writes the rays.
+    lens, fields: (2, F). The table has a row a spot; `save` writes the rays.
     """
 
     lens: Lens
@@ -211,8 +211,8 @@ def spot(
     each = iter if progress is None else lambda work: progress(work, "field")
     found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
-        told = f"{unaimed} of {found.status.numel()} rays found no way to their point of the stop"
-        warnings.warn(told, LostRays, stacklevel=calling_level())
+        message = f"{unaimed} of {found.status.numel()} rays could not be aimed at their point of the stop"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
     warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)

@@ -1,4 +1,4 @@
-"""Results: what a verb gives, as numbers, as a table, as text, as a document for JSON and as a figure."""
+"""Results of public functions: numbers, a table, a text, a document for JSON and a figure."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -78,7 +78,7 @@ class Result:
         write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
 
     def document(self) -> dict:
-        """The result for JSON: plain numbers, null for what is undefined."""
+        """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}
 
     def draw(self, **options):
@@ -119,7 +119,7 @@ def rows(columns: dict[str, Tensor]) -> list[dict]:
 
 
 def number(value) -> float | None:
-    """A number for JSON; null for what is undefined, infinite or not there."""
+    """A number for JSON; null for undefined, infinite and missing ones."""
     if value is None:
         return None
     value = float(value)
@@ -132,7 +132,7 @@ def numbers(values: Tensor) -> list:
 
 
 def plain(document):
-    """A document for JSON: null for what is no finite number."""
+    """A document for JSON: null for numbers that are not finite."""
     if isinstance(document, dict):
         return {name: plain(entry) for name, entry in document.items()}
     if isinstance(document, list | tuple):
