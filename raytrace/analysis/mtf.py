@@ -200,16 +200,17 @@ def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Te
     if geometric:
         return *_geometric(lens, field, frequencies), True
     scene = dataclasses.replace(scene_of(lens, field), memo=Memo(1))  # the beam is aimed and traced once
+    shares = wavelength_shares(lens)
     sheared = _sheared(scene, frequencies)
     if sheared is not None:
         return *sheared, False
     try:
-        return *_gridded(scene, frequencies, None if geometric is False else _SECONDS), False
+        return *mtf_on_grid(scene, frequencies, shares, seconds=None if geometric is False else _SECONDS), False
     except TooManyPoints:
         if geometric is False:
             raise
     both = _where_diffraction_is_no_matter(scene, frequencies)
-    return (*_gridded(scene, frequencies, None), False) if both is None else (*both, True)
+    return (*mtf_on_grid(scene, frequencies, shares), False) if both is None else (*both, True)
 
 
 def _where_diffraction_is_no_matter(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -283,10 +284,13 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * axial_f_number(lens))
 
 
-def _gridded(scene: Scene, frequencies: Tensor, seconds: float | None) -> tuple[Tensor, Tensor]:
-    """MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs; seconds: see `exit_pupil`."""
-    pupil = exit_pupil(scene, seconds=seconds)
-    shift, weights = _from_primary(scene.lens, pupil.centre), wavelength_shares(scene.lens) * pupil.light
+def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tuple[Tensor, Tensor]:
+    """Tangential and sagittal MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs.
+
+    shares: (W,) of the wavelengths of the scene; grid: options of `exit_pupil`.
+    """
+    pupil = exit_pupil(scene, **grid)
+    shift, weights = pupil.centre - pupil.centre[..., :1], shares * pupil.light
     sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
     otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
     tangential, sagittal = (modulation(otf, frequencies, place, weights) for otf, place in otfs)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt
 
 
 class Dual:
@@ -120,6 +120,11 @@ def slope_of(number, variables: int) -> np.ndarray:
 def quotient(a, b):
     """a/b of tensors or numbers; infinite where a number b is 0."""
     return a / b if isinstance(b, Tensor) or value_of(b) != 0 else np.inf
+
+
+def divide(a, b):
+    """a/b of tensors, 0 where b is 0; of arrays or dual numbers as numpy divides."""
+    return safe_divide(a, b) if isinstance(b, Tensor) else a / b
 
 
 def select(condition, a, b):

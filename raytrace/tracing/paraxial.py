@@ -202,6 +202,15 @@ def system_matrix(
     return tuple(one * part for part in brackets(powers, gaps))
 
 
+def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
+    """The system matrices of a lens; n: signed indices (...) from the object's to that before the image."""
+    surfaces, stop = lens.surfaces[1:-1], lens.stop - 1
+    # The stop seen from the front (transfer to its vertex) and from the back.
+    A1, B1, _, _ = system_matrix(surfaces[:stop], n[: stop + 1], wavelength, to_next=True)
+    _, B2, _, D2 = system_matrix(surfaces[stop:], n[stop:], wavelength)
+    return Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n[0], n[-1])
+
+
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     """First-order data; wavelength: (...) µm, the primary one by default. Source: Welford, Aberrations, ch. 3.
 
@@ -210,12 +219,8 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
-    n_object, n_image = n[0], n[-1]
-    # The stop seen from the front (transfer to its vertex) and from the back.
-    before, behind = surfaces[: lens.stop - 1], surfaces[lens.stop - 1 :]
-    A1, B1, _, _ = system_matrix(before, n[: lens.stop], wavelength, to_next=True)
-    _, B2, _, D2 = system_matrix(behind, n[lens.stop - 1 :], wavelength)
-    data = Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n_object, n_image)
+    data = gaussian(lens, n, wavelength)
+    n_object, n_image = data.n_object, data.n_image
     A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
     vergence = n_object / object_distance_of(lens)  # 0 for an object at infinity
     kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
@@ -233,7 +238,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         entrance_pupil_diameter=diameter,
         exit_pupil_position=data.exit_pupil_distance - surfaces[-1].thickness,
         exit_pupil_diameter=diameter * data.pupil_magnification,
-        stop_height=0.5 * diameter * A1,
+        stop_height=0.5 * diameter * data.front[0],
         f_number=focal_length.abs() / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=data.image_distance(vergence),
@@ -299,7 +304,7 @@ def _tan_cone(lens: Lens, n_object: Tensor) -> Tensor | None:
 
 
 def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
-    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, as the largest field is told."""
+    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, by the kind of field."""
     largest = torch.hypot(*largest_field(lens))[0]
     if lens.fields.kind == "angle":
         return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()
