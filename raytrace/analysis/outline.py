@@ -45,7 +45,7 @@ class RayPath(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A surface in a view: how its own z and heights across it lie in the picture.
+    """A surface in a view: how its z and heights across it lie in the picture.
 
     origin: (2,) mm of its vertex, to the right and upward; along, across: (2,) what one of z and one of height move;
     direction: cosines (2,) along x and y of the surface in which heights are taken.
@@ -116,7 +116,7 @@ def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
 
 
 def is_bent(lens: Lens) -> bool:
-    """Whether surfaces stand elsewhere than upright on the z axis."""
+    """Whether a surface is tilted or off the z axis."""
     for frame in frames(lens):
         axes, origin = array(frame.axes), array(frame.origin)
         if not np.allclose(axes, np.eye(3), atol=1e-12) or np.abs(origin[:2]).max() > 1e-12:

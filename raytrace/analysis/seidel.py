@@ -41,7 +41,7 @@ _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
 class Seidel(Analysis):
     """Contributions (J, F, K) of surfaces 1 … K to J aberrations of F fields; their sums over K are the lens's.
 
-    names: of the aberrations; kind: a key of KINDS, which says what they are; unit: "mm" or "waves".
+    names: of the aberrations; kind: a key of KINDS; unit: "mm" or "waves".
     marginal_yni, chief_yni: (F, K) mm, y n i and ȳ n ī at every surface.
     marginal_height, chief_height: (F, K) mm, y and ȳ there.
     invariant: (F,) mm, H; fields: (2, F); wavelength: () µm, of the rays.
@@ -61,6 +61,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
+    UNITS = property(lambda self: dict.fromkeys(self.names, self.unit))
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
@@ -285,7 +286,7 @@ def _longitudinal(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Te
     return -_transverse(S, omega, n, wavelength)[[0, 3, 4, 5, 6, 8]] * n / torch.where(omega == 0, torch.nan, omega)
 
 
-#: What the contributions may be told as: names, conversion of S1 … C2 by n′u′, n′ and the wavelength in mm, and unit.
+#: Kinds of contributions: names, conversion of S1 … C2 by n′u′, n′ and the wavelength in mm, and unit.
 KINDS: dict[str, tuple[tuple[str, ...], Callable, str]] = {
     "coefficients": (("S1", "S2", "S3", "S4", "S5", "C1", "C2"), lambda S, *_: S, "mm"),
     "waves": (("W040", "W131", "W222", "W220P", "W311", "W020", "W111"), _waves, "waves"),

@@ -76,6 +76,11 @@ class Fields:
     vignetting: Tensor | None = None
     telecentric: bool = False
 
+    @property
+    def unit(self) -> str:
+        """The unit of field points."""
+        return FIELD_UNITS[self.kind]
+
 
 @value
 class Lens:

@@ -101,7 +101,9 @@ def aim_at_image(
         rays = through(unknown[:2], pupil)
         (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
         off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
-        return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
+        if radius is not None:  # at the stop, chief rays of all heights may share one point
+            off = torch.broadcast_tensors(*off, *(at / radius for at in stop))
+        return torch.stack(off), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
     given = lens, height, through(start[:2].detach(), torch.zeros_like(start[:2])), radius
