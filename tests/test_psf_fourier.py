@@ -5,12 +5,11 @@ import math
 import problems
 import pytest
 import torch
-from differences import gradcheck, gradgradcheck
+from differences import gradcheck
 from problems import vector
 
 from raytrace.maths.grid import grid
 from raytrace.psf_models import fourier
-from raytrace.psf_models.dft import bessel_j0
 from raytrace.system.lens import with_sensor_distance
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.tracing.scene import scene
@@ -170,12 +169,6 @@ def test_mirror():
 def test_a_window_far_from_the_light_is_refused():
     with pytest.raises(ValueError, match="Centre the window"):
         fourier.kernels(scene_of(57.88, 10.0), grid(0.005, 3), zernike=zernike(4, 0.1))
-
-
-def test_bessel_has_derivatives():
-    x = torch.tensor([0.0, 0.3, 2.4, 30.0], dtype=torch.float64, requires_grad=True)
-    assert gradcheck(bessel_j0, x)
-    assert gradgradcheck(bessel_j0, x)
 
 
 @pytest.mark.parametrize("with_zernike", [False, True])
