@@ -14,7 +14,7 @@ from raytrace.imaging.training import Run
 from raytrace.imaging.variables import BadVariables, Variables, parse_bounds
 from raytrace.io import read_lens
 from raytrace.settings import CodesignSettings
-from raytrace.tracing.trace import media
+from raytrace.system.lens import media
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"

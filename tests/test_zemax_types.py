@@ -19,8 +19,9 @@ from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
 from raytrace.io.source import Place, decode
 from raytrace.io.zemax import write as zemax_write
 from raytrace.io.zemax.surfaces import inverse, spelled_inverse, types
+from raytrace.system.lens import media
 from raytrace.system.rays import start
-from raytrace.tracing.trace import media, steps
+from raytrace.tracing.trace import steps
 
 MILLIMETRES = {"MM": 1.0, "IN": 25.4, "METER": 1000.0}
 

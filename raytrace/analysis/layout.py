@@ -22,6 +22,7 @@ from raytrace.system.lens import (
     field_label,
     field_points,
     field_title,
+    media,
     name_of_field,
     wavelengths_of,
 )
@@ -30,7 +31,7 @@ from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import edge_radius, warn_of_defects
 from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
 from raytrace.tracing.lens_report import Info, text
-from raytrace.tracing.trace import media, trace_lens
+from raytrace.tracing.trace import trace_lens
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn

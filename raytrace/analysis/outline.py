@@ -15,11 +15,11 @@ from raytrace.maths.pupil import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
-from raytrace.tracing.trace import lens_steps, media
+from raytrace.tracing.trace import lens_steps
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
 

@@ -10,10 +10,9 @@ from raytrace.analysis import outline
 from raytrace.maths.pupil import fan
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, frames
-from raytrace.tracing.trace import media
 
 _RINGS, _ARMS = 6, 48  # of the mesh of a surface
 _LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start

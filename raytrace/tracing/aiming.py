@@ -16,11 +16,11 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, safe_divide, varies, with_batch_axes
 from raytrace.maths.value import detached
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
-from raytrace.tracing.trace import lens_steps, media, trace_surfaces
+from raytrace.tracing.trace import lens_steps, trace_surfaces
 from raytrace.words import named
 
 _STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
