@@ -5,16 +5,23 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace import seidel
 from raytrace.io import read_lens
 from raytrace.materials.glass import MIRROR, model_glass
-from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.lens import (
+    Lens,
+    SystemAperture,
+    media,
+    with_object_distance,
+    with_sensor_distance,
+    with_wavelengths,
+)
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_matrix
 from raytrace.tracing.spot import image_rays
-from raytrace.tracing.trace import media
 
 INF = math.inf
 FIELD = fields("angle", (8.0,))
@@ -141,7 +148,7 @@ def test_a_curvature_carries_its_derivatives():
         return seidel(system, kind="waves").contributions
 
     curvature, conic = (scalar(x).requires_grad_() for x in (0.02, -0.5))
-    assert torch.autograd.gradcheck(sums, (curvature, conic))
+    assert gradcheck(sums, (curvature, conic))
 
 
 def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():

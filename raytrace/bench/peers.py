@@ -39,11 +39,10 @@ from raytrace.bench.psf_cases import Case, Method
 from raytrace.maths.grid import Grid
 from raytrace.maths.value import to
 from raytrace.psf_models.result import Kernels
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
-from raytrace.tracing.trace import media
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 _RANDOM = (10_000, 100_000, 1_000_000)

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from raytrace.io import as_lens
 from raytrace.materials.glass import Glass, is_air
 from raytrace.system.identity import digest, identity, other_lens
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.parameter_paths import BadLimits as BadLimits
 from raytrace.system.parameter_paths import (
     BadVariables,
@@ -44,7 +44,6 @@ from raytrace.system.parameter_paths import parse_bounds as parse_bounds
 from raytrace.system.parameter_paths import parse_range as parse_range
 from raytrace.system.surface import Surface, sag, sag_at
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media
 from raytrace.wave_optics.element import Element
 
 #: Least thickness over the largest diameter of the lens, where none is given: of glass at its centre (a 50 mm lens:

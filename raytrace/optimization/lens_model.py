@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.materials.glass import is_air
 from raytrace.optimization.lens_state import LensState
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths, with_number
 from raytrace.system.phases import power_of
@@ -22,7 +22,7 @@ from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
-from raytrace.tracing.trace import media, sequence_of
+from raytrace.tracing.trace import sequence_of
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
