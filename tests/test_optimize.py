@@ -12,11 +12,11 @@ from scipy.optimize import minimize
 
 import raytrace as rt
 from raytrace.bench import optimise as bench
-from raytrace.optimization import checkpoint as paths
+from raytrace.optimization import solver as paths
 from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.least_squares import Linear, Manner, NoStep, Sides, State, least_squares
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
+from raytrace.optimization.solver import Linear, NoStep, Sides, SolverOptions, State, least_squares
 from raytrace.optimization.variables import freedom, name_of
 from raytrace.plotting.optimize import optimize_report
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
@@ -99,7 +99,7 @@ def by_rosenbrock(x):
 def test_a_curved_valley_is_followed_to_its_end(bends):
     end = least_squares(
         squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), lower=np.full(2, -FAR), upper=np.full(2, FAR),
-        manner=Manner(bends=bends),
+        options=SolverOptions(bends=bends),
     )  # fmt: skip
     assert end.state.x == pytest.approx([1, 1], abs=1e-9)
     assert end.evaluations < 100
@@ -455,7 +455,7 @@ def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
 
 def test_cycles_are_limited_where_neither_they_nor_the_time_are(monkeypatch):
     """Along a narrow valley a merit may fall for ever; who gives a time has all of it."""
-    monkeypatch.setattr(paths, "LIMIT", 3)
+    monkeypatch.setattr(paths, "_UNLIMITED", 3)
     state, start, ends = squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), np.full(2, FAR)
     found = paths.best_of_paths(state, start, lower=-ends, upper=ends)
     assert (found.cycles, found.stopped) == (3, "cycles")

@@ -14,7 +14,6 @@ from raytrace.cli import main
 from raytrace.materials.catalogs import shipped_catalog
 from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.constraints import conditions_of
 from raytrace.optimization.glass_choice import (
     STATUSES,
     Choice,
@@ -26,9 +25,9 @@ from raytrace.optimization.glass_choice import (
     pool_of,
     without_glass,
 )
-from raytrace.optimization.least_squares import Sides, State, least_squares
 from raytrace.optimization.merit import merit_for
-from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.problem import NoProblem, conditions_of
+from raytrace.optimization.solver import Sides, State, least_squares
 from raytrace.optimization.variables import freedom
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.tracing.compiled import prepare

@@ -522,7 +522,7 @@ def merit(parser: argparse.ArgumentParser) -> None:
 
 def freedom(parser: argparse.ArgumentParser) -> None:
     """--vary, --bounds and --hold: `optimization.variables.freedom`, `optimization.variables.bounds_of`,
-    `optimization.constraints.conditions_of`."""
+    `optimization.problem.conditions_of`."""
     group = parser.add_argument_group(
         "what varies, where it is not the file's, and what holds",
         "Words in quotes: 'curvature thickness' (all surfaces that bend light, all gaps), curvature:1-4,7 conic:3 a4:3 "

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from raytrace.optimization.result import STOPPED, Optimized
+from raytrace.optimization.optimize import STOPPED, Optimized
 from raytrace.plotting import style
 from raytrace.plotting.layout import draw_layout, on_one_scale
 from raytrace.plotting.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles

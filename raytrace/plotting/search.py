@@ -5,7 +5,7 @@ from os import PathLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytrace.optimization.search_result import Searched
+from raytrace.optimization.search import Searched
 from raytrace.plotting import style
 from raytrace.plotting.layout import draw_layout, on_one_scale
 from raytrace.plotting.optimize import drawn_fields
