@@ -331,7 +331,7 @@ def test_log_checkpoint_and_resume(command_line, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--merit", "spot"], "the file tells no variables: --vary names them"),
+        (["--merit", "spot"], "the file has no variables: --vary names them"),
         (["--vary", "curvature"], "no merit function of its own: choose one by --merit spot"),
         (["--merit", "spot", "--vary", "curvature", "--bounds", "curvature:3,2"], "3 is not less than 2"),
         (["--merit", "spot", "--vary", "curvature", "-o", "lens.foo"], "expected a name that ends in .zmx"),

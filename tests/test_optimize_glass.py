@@ -23,12 +23,11 @@ from raytrace.optimization.glass_choice import (
     expansion,
     hull,
     pool_of,
-    without_glass,
 )
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.solver import Sides, State, least_squares
-from raytrace.optimization.variables import freedom
+from raytrace.optimization.variables import freedom, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.tracing.compiled import prepare
 
@@ -130,7 +129,7 @@ def test_what_is_foretold_ranks_what_is_reached(triplet):
     own = {k: triplet.surfaces[k].glass for k in choice.surfaces}
     design = Design(start.state.x, own, start.state)
     for surface in choice.surfaces:
-        merits = choice.foretold(design, [surface], ())[surface]
+        merits = choice.predicted(design, [surface], ())[surface]
         some = np.argsort(merits)[:60:5]
         glasses = [choice.candidates[surface][0][i] for i in some]
         reached = [choice.descend(Design(design.x, own | {surface: g}, None), (), 15).merit for g in glasses]
@@ -218,11 +217,11 @@ def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypa
     whole = rt.optimize(triplet, **how)
     swap = Choice._swap
 
-    def ended(self, surface, foretold):
+    def ended(self, surface, merits):
         if len(done) == 1:
             raise RuntimeError("the machine stops")
         done.append(surface)
-        return swap(self, surface, foretold)
+        return swap(self, surface, merits)
 
     monkeypatch.setattr(Choice, "_swap", ended)
     with pytest.raises(RuntimeError, match="the machine stops"):

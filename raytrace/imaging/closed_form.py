@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.descent import Descent, minimise
 from raytrace.imaging.pictures import Pictures, crop
 from raytrace.imaging.restoration import kernel_error
 from raytrace.imaging.restoration import power_spectrum as periodogram
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optimization.solver import TensorDescent, minimise_tensors
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance
@@ -90,14 +90,14 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
         parts.append((float(error.detach()), float(penalty.detach())))
         return error + penalty
 
-    def descend() -> Descent:
+    def descend() -> TensorDescent:
         # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
         bounds = [_parameter_bounds(variables, variable) for variable in variables.variables]
-        return minimise(list(variables.parameters()), whole, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
+        return minimise_tensors(list(variables.parameters()), whole, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
 
     found = descend()
     # A penalty on what is solved for has a kink where it begins, at which the search stops too soon: it begins anew.
-    while variables.held is not None and found.course[0] - found.course[-1] > _SETTLED * found.course[-1]:
+    while variables.held is not None and found.values[0] - found.values[-1] > _SETTLED * found.values[-1]:
         found = descend()
     names = tuple(one.name for one, at_end in zip(variables.variables, found.at_end, strict=True) if at_end)
     names += (variables.held.by.name,) if variables.beyond() else ()
@@ -169,7 +169,7 @@ def put_sensor(camera: Camera, sensor: float) -> None:
     camera.variables.get_parameter(variable.name).fill_((sensor - variable.start) / variable.unit)
 
 
-def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
+def _no_optimum(camera: Camera, found: TensorDescent, at_end: tuple[str, ...]) -> str:
     """Why a descent ended at no optimum; "" where it is one, if only within some of the bounds."""
     variables = camera.variables
     if found.is_flat:

@@ -16,13 +16,13 @@ import scipy.optimize
 import torch
 from torch import Tensor, nn
 
-from raytrace.imaging.descent import NoOptimum, minimise
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, draws
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
+from raytrace.optimization.solver import NoOptimum, minimise_tensors
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf
 from raytrace.wave_optics.element import Element, Rings
@@ -292,7 +292,7 @@ def best_of_starts(
         def error(own=own, expected=expected) -> Tensor:
             return expected(own())
 
-        found = min(minimise(list(own.parameters()), error, steps=steps).course)
+        found = min(minimise_tensors(list(own.parameters()), error, steps=steps).values)
         if found < least:
             best, least = own, found
     return best

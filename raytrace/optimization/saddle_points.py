@@ -51,7 +51,7 @@ _NEAR = 0.01  # of the residuals: by how much a step along a variable changes th
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
-# -- surfaces for a meniscus --------------------------------------------------------------------------------------------
+# -- surfaces for a meniscus -------------------------------------------------------------------------------------------
 
 
 def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:

@@ -185,11 +185,11 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     """The numbers that one word names, by surface and configuration. Raises BadVariables."""
     named, _, configurations = word.partition("@")
     kind, colon, numbers = named.partition(":")
-    if (kind == "sensor" and colon) or kind in _INSTEAD:
-        meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
-        raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
     of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
     known = dict.fromkeys(["thickness", "sensor", *MEDIA, *GROUPS, *of_surfaces])
+    if (kind == "sensor" and colon) or (kind in _INSTEAD and kind not in known):
+        meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
+        raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
     if kind not in known:
         raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
     if kind == "sensor":
