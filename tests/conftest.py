@@ -14,8 +14,8 @@ from hypothesis import settings
 
 from raytrace.cli import main
 from raytrace.io import read_lens
-from raytrace.tracing.compiled import NoCompiler, prepare, trace_engine
-from raytrace.tracing.compiled.library import library
+from raytrace.tracing.compiled import prepare, trace_engine
+from raytrace.tracing.compiler import NoCompiler, library
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
-from raytrace.io.zemax.keywords import AIMINGS
+from raytrace.io.zemax.surfaces import AIMINGS
 from raytrace.materials import glass
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.environment import Environment
@@ -66,17 +66,17 @@ def description(name: str) -> dict:
 @functools.cache
 def system(name: str) -> Lens:
     """The lens of a name."""
-    told = description(name)
-    surfaces = [_surface(k, row, told) for k, row in enumerate(told["surfaces"])]
+    system = description(name)
+    surfaces = [_surface(k, row, system) for k, row in enumerate(system["surfaces"])]
     for k, pressure in PRESSURES.get(name, {}).items():
         surfaces[k] = dataclasses.replace(surfaces[k], environment=Environment(tensor(20.0), tensor(pressure)))
-    kind, size = told["aperture"][:2]
-    stop = told["stop"]
+    kind, size = system["aperture"][:2]
+    stop = system["stop"]
     if kind == "FLOA":
         aperture = SystemAperture("float_by_stop", tensor(surfaces[stop].semi_diameter))
     else:
         aperture = SystemAperture(APERTURES[kind], tensor(float(size)))
-    fields, waves = told["fields"], told["wavelengths"]
+    fields, waves = system["fields"], system["wavelengths"]
     x, y = (tensor([float(v) for v in fields[axis]]) for axis in "xy")
     factors = tensor(fields["vignetting"]) if "vignetting" in fields else None
     return Lens(
@@ -86,23 +86,23 @@ def system(name: str) -> Lens:
         fields=Fields(list(FIELD_UNITS)[fields["type"]], x, y, torch.ones_like(x), factors),
         wavelengths=tensor([wavelength for wavelength, _ in waves]),
         wavelength_weights=tensor([weight for _, weight in waves]),
-        primary_wavelength=told["primary"],
-        catalogs=tuple(told.get("catalogs", ())),
-        ray_aiming=AIMINGS[told["ray_aiming"]],
+        primary_wavelength=system["primary"],
+        catalogs=tuple(system.get("catalogs", ())),
+        ray_aiming=AIMINGS[system["ray_aiming"]],
     )
 
 
-def _surface(number: int, row: list, told: dict) -> Surface:
+def _surface(number: int, row: list, system: dict) -> Surface:
     """[curvature, thickness, glass, conic, coefficients of r², r⁴, …, semi-diameter, apertures]."""
     curvature, thickness, medium, conic, coefficients, semi_diameter, *apertures = row
-    thickness = told.get("thickness", {}).get(str(number), thickness)
-    curvature = told.get("curvature", {}).get(str(number), curvature)
+    thickness = system.get("thickness", {}).get(str(number), thickness)
+    curvature = system.get("curvature", {}).get(str(number), curvature)
     return Surface(
         thickness=tensor(float(thickness)),
         curvature=tensor(float(curvature)) if curvature else None,
         conic=tensor(float(conic)) if conic else None,
         coefficients=tensor(coefficients) if coefficients else None,
-        glass=_medium(medium, told),
+        glass=_medium(medium, system),
         semi_diameter=semi_diameter,
         apertures=tuple(_aperture(*one) for one in apertures if one),
     )
@@ -112,24 +112,24 @@ def _aperture(shape: str, extent: list, obscures: bool = False, centre=(0.0, 0.0
     return Aperture(shape, tuple(extent), obscures, tuple(centre))
 
 
-def _medium(told, lens: dict) -> glass.Glass:
+def _medium(medium, lens: dict) -> glass.Glass:
     """Air (null), MIRROR, an index, [nd, Vd, ΔPgF], or a name: by the indices of the system, else of a catalog."""
-    if told is None:
+    if medium is None:
         return glass.AIR
-    if isinstance(told, int | float):
-        return glass.constant(float(told))
-    if isinstance(told, list):
-        return glass.model_glass(*told)
-    if told == "MIRROR":
+    if isinstance(medium, int | float):
+        return glass.constant(float(medium))
+    if isinstance(medium, list):
+        return glass.model_glass(*medium)
+    if medium == "MIRROR":
         return glass.MIRROR
-    if told not in lens.get("indices", {}):
-        return find_glass(told, catalogs=lens.get("catalogs", ()))
+    if medium not in lens.get("indices", {}):
+        return find_glass(medium, catalogs=lens.get("catalogs", ()))
     # The printed indices of at most three wavelengths, by n² = a + b λ² + c/λ², which passes through them.
-    listed = lens["indices"][told]
+    listed = lens["indices"][medium]
     waves, indices = tensor([float(w) for w in listed]), tensor(list(listed.values()))
     powers = torch.stack([waves ** (2 * k) for k in (0, 1, -1)][: len(waves)], 1)
     found = torch.linalg.solve(powers, indices * indices)
-    return glass.Glass(told, "schott", torch.cat([found, found.new_zeros(6 - len(found))]))
+    return glass.Glass(medium, "schott", torch.cat([found, found.new_zeros(6 - len(found))]))
 
 
 # ---------------------------------------------------------------- conditions of a case
@@ -163,18 +163,18 @@ def of_waves(case: dict, values: torch.Tensor) -> torch.Tensor:
 
 def points_of(case: dict) -> tuple[torch.Tensor, torch.Tensor]:
     """Pupil points (2, P) and weights of `sampling`: ["grid", N], ["points", list] or ["gq", rings, arms]."""
-    kind, *told = case.get("sampling", ["gq", 14, 56])
+    kind, *numbers = case.get("sampling", ["gq", 14, 56])
     if kind == "gq":
-        points, weights = pupil.gauss_rings(*told, dtype=torch.float64)
+        points, weights = pupil.gauss_rings(*numbers, dtype=torch.float64)
         if "sampling" in case:  # OpticStudio's arms begin at +x
             first = torch.atan2(points[1, 0], points[0, 0])
             c, s = torch.cos(first), torch.sin(first)
             points = torch.stack([c * points[0] + s * points[1], c * points[1] - s * points[0]])
         return points, weights
     if kind == "points":
-        points = tensor(told[0]).T
+        points = tensor(numbers[0]).T
     else:
-        half = told[0] // 2 - 1
+        half = numbers[0] // 2 - 1
         line = torch.arange(-half, half + 1, dtype=torch.float64) / half
         y, x = torch.meshgrid(line, line, indexing="ij")
         inside = x * x + y * y <= 1 + 1e-12

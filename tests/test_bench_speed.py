@@ -32,7 +32,8 @@ from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.value import to
 from raytrace.system.rays import Rays
-from raytrace.tracing.compiled import NoCompiler, trace_engine
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiler import NoCompiler
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens, trace_surfaces

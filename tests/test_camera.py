@@ -19,7 +19,7 @@ from raytrace.imaging.closed_form import (
     even_distances,
     optimise_closed_form,
     out_of_focus,
-    power_spectrum,
+    patch_spectrum,
     sensor_range,
 )
 from raytrace.imaging.codesign import (
@@ -169,7 +169,7 @@ def test_samples_are_keyed_by_their_number():
     assert 10e3 <= float(whole.distance.min()) <= float(whole.distance.max()) <= 50e3
     batches = Batches(pictures, SMALL)
     assert torch.equal(batches(1, Share()).distance, batch(pictures, SMALL, [0, 1, 2, 3], epoch=1).distance)
-    with pytest.raises(ValueError, match="do not fill a batch of 64"):
+    with pytest.raises(ValueError, match="do not fill one batch of 64"):
         Batches(pictures, dataclasses.replace(SMALL, batch=64))
 
 
@@ -253,7 +253,7 @@ def test_a_run_begins_at_the_optimum_of_the_closed_form(tmp_path, vary, bounds):
     pictures = split(dead_leaves(10, size=32))
     own = camera(read_lens(LENS), settings)
     begun = own.variables.numbers()
-    course = optimise_closed_form(own, power_spectrum(pictures[0], 22, crops=settings.crops))
+    course = optimise_closed_form(own, patch_spectrum(pictures[0], 22, crops=settings.crops))
     assert course.errors[-1] < 0.999 * course.errors[0]
     assert all(value != begun[name] for name, value in own.variables.numbers().items())
     _, step, record = next(run_model(read_lens(LENS), *pictures, settings, tmp_path, about={}, distances=()))
@@ -306,7 +306,7 @@ def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     assert beyond[-1][1]["sensor"] < 57.8793
     assert steps[-1][1]["sensor"] == pytest.approx(57.88, abs=1e-9)
     own = camera(read_lens(LENS), settings)
-    optimise_closed_form(own, power_spectrum(pictures, 22))
+    optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert own.variables.numbers()["sensor"] == pytest.approx(57.88, abs=1e-9)
     with pytest.raises(BadVariables, match="bounds for thickness_5, not among the variables: sensor"):
         camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
@@ -331,7 +331,7 @@ def test_a_lens_that_cannot_be_built_has_a_penalty_beside_its_loss_and_is_pushed
     assert all(after > before for before, after in itertools.pairwise(places))
     # In the closed form too: buildable again, but for what a gain of image is worth against the square.
     own = camera(squeezed, settings)
-    course = optimise_closed_form(own, power_spectrum(pictures, 22))
+    course = optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert course.penalties[0] == lacking
     assert course.penalties[-1] == float(own.variables.violation().detach()) < 1e-3
     assert max(course.errors) < 0.1  # without the penalty
@@ -339,7 +339,7 @@ def test_a_lens_that_cannot_be_built_has_a_penalty_beside_its_loss_and_is_pushed
 
 def test_an_optimum_at_the_end_of_its_range_is_none():
     """The least error lies near 57.79 mm: bounds that leave it out, on either side, hold no optimum."""
-    S = power_spectrum(dead_leaves(4, size=64), 22)
+    S = patch_spectrum(dead_leaves(4, size=64), 22)
     for bounds, end in (("sensor:57.85,58", 57.85), ("sensor:57.6,57.7", 57.7)):
         own = camera(read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", bounds=bounds, start="57.86"))
         own.variables.project()
@@ -352,7 +352,7 @@ def test_an_optimum_at_the_end_of_its_range_is_none():
 
 def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
     """20 mm behind all images windows hold but the middle of any blur, and the slope leads nowhere."""
-    S = power_spectrum(dead_leaves(4, size=64), 22)
+    S = patch_spectrum(dead_leaves(4, size=64), 22)
     own = camera(read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", start="80"))
     assert re.match(r"no optimum inside 57\.3\d* to 58\.5\d* mm of sensor distance", out_of_focus(own))
     course = optimise_closed_form(own, S, distances=even_distances(own, 5))
@@ -430,7 +430,7 @@ def test_training_moves_the_sensor_towards_less_loss(tmp_path):
 
 def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
     """Optima over 10 to 50 m with a 1/f² spectrum: both near 34 m paraxial, Gaussian DRT closer to the lens."""
-    S = power_spectrum(dead_leaves(8, size=64), 48)
+    S = patch_spectrum(dead_leaves(8, size=64), 48)
     places = {}
     for model in ("paraxial", "fourier", "gaussian"):
         own = camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, size=21))

@@ -32,8 +32,7 @@ from raytrace.materials.catalogs import (
     shipped_folder,
     write_agf,
 )
-from raytrace.materials.formulas import BY_NUMBER
-from raytrace.materials.glass import constant, index, listing_error, refractive_index
+from raytrace.materials.glass import BY_NUMBER, constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from raytrace.imaging.closed_form import power_spectrum
+from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, errors_knowing
@@ -67,7 +67,7 @@ def test_transfer_function_of_a_symmetric_kernel_is_real_and_one_at_zero():
 
 def test_spectrum_of_pictures_adds_up_to_their_mean_square():
     pictures = dead_leaves(12, size=48)
-    S = power_spectrum(pictures, 32, crops=8)
+    S = patch_spectrum(pictures, 32, crops=8)
     mean_square = sum(float((sample / 255.0).__pow__(2).mean()) for sample in pictures.samples) / len(pictures)
     assert float(S.mean()) == pytest.approx(mean_square, rel=0.1)
     assert float(S[0, 0]) > 100 * float(S[8, 8]) > 0

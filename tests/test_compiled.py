@@ -21,10 +21,15 @@ from raytrace.maths.value import to
 from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Aperture
-from raytrace.tracing.compiled import engine, prepare, trace_engine
-from raytrace.tracing.compiled.library import uses_compiled
-from raytrace.tracing.compiled.run import task_of, trace_compiled
-from raytrace.tracing.compiled.structure import with_numbers
+from raytrace.tracing.compiled import (
+    engine,
+    prepare,
+    task_of,
+    trace_compiled,
+    trace_engine,
+    uses_compiled,
+    with_numbers,
+)
 from raytrace.tracing.jacobian import hit_jacobian, pushed
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import media, trace_lens, trace_surfaces
@@ -242,8 +247,8 @@ def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
 PROBE = """
 import raytrace, torch
 from raytrace.tracing.trace import trace_lens
-from raytrace.tracing.compiled import library
-from raytrace.tracing.compiled.library import uses_compiled
+from raytrace.tracing import compiler as library
+from raytrace.tracing.compiled import uses_compiled
 from raytrace.system.rays import Rays, start
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})
@@ -304,7 +309,7 @@ def test_rays_that_change_before_the_first_surface_are_pushed_on(with_path):
     indices, surfaces = media(system, wavelengths[:, None]), system.surfaces[1:]
     rays = launch(system, sobol(9)[0], wavelengths=wavelengths)
     task = task_of(surfaces, rays if with_path else dataclasses.replace(rays, opl=None), indices=indices)
-    position, direction, _, table = task.given
+    position, direction, _, table = task.inputs
     generator = torch.Generator().manual_seed(1)
 
     def drawn(*shape):

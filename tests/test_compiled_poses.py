@@ -18,9 +18,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
-from raytrace.tracing.compiled import trace_engine
-from raytrace.tracing.compiled.run import push, push_everywhere, task_of, trace_compiled
-from raytrace.tracing.compiled.structure import rows_of
+from raytrace.tracing.compiled import push, rows_of, task_of, trace_compiled, trace_engine
 from raytrace.tracing.jacobian import hit_jacobian
 from raytrace.tracing.trace import media, trace_surfaces
 
@@ -179,7 +177,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
     with trace_engine("compiled"):
         hits = hit_jacobian(own, rays, leaves, indices=indices, wavelength=WAVELENGTHS)
         task = task_of(own, rays, indices=indices, wavelength=WAVELENGTHS)
-        table = task.given[3]
+        table = task.inputs[3]
         change = torch.zeros_like(table).requires_grad_()
         towards = torch.autograd.grad(table, leaves, change, create_graph=True, allow_unused=True)
         steps = [drawn(*leaf.shape, size=0.1, seed=seed) for seed, leaf in enumerate(leaves)]
@@ -208,10 +206,10 @@ def test_rays_behind_all_surfaces_at_once_are_those_behind_each(name):
     surfaces, rays, how = given(name, count=40)
     indices, wavelength = how["indices"], WAVELENGTHS
     task = task_of(surfaces, rays, indices=indices, wavelength=wavelength)
-    change = drawn(2, *task.given[3].shape, size=0.01, seed=3) * task.given[3].abs()
+    change = drawn(2, *task.inputs[3].shape, size=0.01, seed=3) * task.inputs[3].abs()
     with trace_engine("compiled"):
-        found = push_everywhere(task, change)
-        bare = push_everywhere(task, change[:0])
+        found = push(task, change, everywhere=True)
+        bare = push(task, change[:0], everywhere=True)
         for number, row in enumerate(rows_of(task.structure, surfaces), 1):
             part = task_of(surfaces[:number], rays, indices=indices[: number + 1], wavelength=wavelength)
             columns = _columns_of(part, task)
@@ -233,7 +231,7 @@ def _columns_of(part, whole) -> list[int]:
         found |= {own[9] + j: other[9] + j for j in range(own[3])}
         found |= {own[15] + j: other[15] + j for j in range(own[14])}
         found |= {own[17] + j: other[17] + j for j in range(own[16] + 4 if own[16] else 0)}
-    return [found[k] for k in range(part.given[3].shape[-1])]
+    return [found[k] for k in range(part.inputs[3].shape[-1])]
 
 
 @pytest.mark.parametrize("glass", [1.0, 1.5, MIRROR])

@@ -15,8 +15,7 @@ from raytrace.system.rays import Rays
 from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
 from raytrace.system.shapes import SAG_TERMS
 from raytrace.system.surface import Surface
-from raytrace.tracing.compiled import trace_engine
-from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.jacobian import hit_jacobian
 from raytrace.tracing.trace import trace_surfaces
 

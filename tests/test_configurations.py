@@ -13,7 +13,6 @@ from test_zemax import file, read
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.io import LensFileError, LensFileWarning, read_lens, write_lens
-from raytrace.plotting.layout import layout as layout_figure
 from raytrace.system.configurations import differences, part
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -404,13 +403,13 @@ def test_layout_draws_all_configurations_in_one_figure(tmp_path, monkeypatch, ca
     assert main(["layout", "scan.zmx", "--configuration", "all", "--plot", "scan.png"]) == 0, capsys.readouterr().err
     assert Path("scan.png").stat().st_size > 10_000
     lens = read_lens("scan.zmx")
-    figure = layout_figure(rt.layout(lens, configuration="all", rays=3))
+    figure = rt.layout(lens, configuration="all", rays=3).plot()
     drawn = [line for line in figure.axes[0].lines if line.get_gid() == "ray"]
     assert len(drawn) == 5 * 3
     assert len({line.get_color() for line in drawn}) == 5
     heights = sorted({round(float(line.get_xdata()[-1]) + float(line.get_ydata()[-1]), 6) for line in drawn})
     assert len(heights) > 5
-    one = layout_figure(rt.layout(lens, configuration=2, rays=3))
+    one = rt.layout(lens, configuration=2, rays=3).plot()
     assert len([line for line in one.axes[0].lines if line.get_gid() == "ray"]) == 3
     with pytest.raises(ValueError, match="shows one configuration"):
         rt.layout(lens, configuration="all", view="3d")

@@ -9,7 +9,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import PolynomialSag
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.compiled.library import trace_engine
+from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.trace import trace_surfaces
 
 ROUNDING = 1e-12  # mm, of the coordinates of a hit; on a slope it moves the sag by slope × rounding

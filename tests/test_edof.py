@@ -8,8 +8,7 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.cli.run import CommandError
-from raytrace.cli.wave_design_run import learn
+from raytrace.cli.wave_run import learn
 from raytrace.imaging.pictures import dead_leaves, digest
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener
 from raytrace.imaging.training import OtherSettings
@@ -17,7 +16,6 @@ from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import (
     WaveCameraConfig,
     best_gamma,
-    best_of_starts,
     expected_error,
     mirrored,
     periodic,
@@ -27,7 +25,7 @@ from raytrace.imaging.wave_camera import (
     spectrum,
     transfer,
 )
-from raytrace.imaging.wave_design import begin, learn_element, radial_powers, scheduled
+from raytrace.imaging.wave_design import begin, best_of_starts, learn_element, radial_powers, scheduled
 from raytrace.materials.glass import index
 from raytrace.maths.zernike import polynomials
 from raytrace.settings import DesignSettings
@@ -142,7 +140,7 @@ def test_a_run_is_that_of_its_pictures(tmp_path):
     settings, others = dataclasses.replace(QUICK, steps=1), dead_leaves(8, size=64, seed=6, smallest=2.5)
     learn(settings, SMALL, LEAVES, tmp_path, "finished")
     for _ in range(2):
-        with pytest.raises(CommandError, match=f"pictures was '8, blake2 .*, now '{digest(others.samples)}'"):
+        with pytest.raises(OtherSettings, match=f"pictures was '8, blake2 .*, now '{digest(others.samples)}'"):
             learn(settings, SMALL, others, tmp_path, "others")
         (tmp_path / "checkpoint.pt").unlink(missing_ok=True)
     learn(settings, SMALL, LEAVES, tmp_path, "begun")
@@ -275,18 +273,18 @@ def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
 @pytest.mark.slow
 def test_the_order_that_was_published(tmp_path):
     """Fresnel < multifocal < cubic < hybrid, achromat < learned, in three colours (facts: only those two may swap)."""
-    world = WaveCameraConfig(size=127, pixel=0.00738)
+    config = WaveCameraConfig(size=127, pixel=0.00738)
     pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)
     content = Content("leaves", pictures[:8], pictures[8:])
     spectrum_ = spectrum(content.train)
     settings = DesignSettings(steps=60, starts=2)
-    camera, run = begin(settings, world, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
+    camera, run = begin(settings, config, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
     for _ in learn_element(camera, LEAVES, settings, run):
         pass
     with torch.no_grad():
         learned = {"learned": camera.variables()}
     names = ["fresnel", "multifocal", "cubic", "hybrid", "achromat", "learned"]
-    found = table_of([content], elements_of(names, world, spectrum_, learned=learned), world)["leaves"]
+    found = table_of([content], elements_of(names, config, spectrum_, learned=learned), config)["leaves"]
     blind = {name: found[name].mean["blind"] for name in names}
     assert blind["fresnel"] < blind["multifocal"] < blind["cubic"] < min(blind["hybrid"], blind["achromat"])
     assert max(blind["hybrid"], blind["achromat"]) + 2 < blind["learned"]

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scripts import script
 
-from raytrace.cli import main, wave_design_run
+from raytrace.cli import main, wave_run
 from raytrace.cli.commands import WAVE_COMMANDS as SUBCOMMANDS
 from raytrace.cli.run import CommandError
 from raytrace.imaging.pictures import dead_leaves
@@ -23,7 +23,7 @@ def run(capsys, *words):
 
 
 def test_one_row_as_json(capsys, monkeypatch):
-    monkeypatch.setattr(wave_design_run, "LEAF_COUNT", 6)
+    monkeypatch.setattr(wave_run, "LEAF_COUNT", 6)
     assert not table.main(["--rows", "singlet", "fresnel", "--json"])
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {(row["content"], row["row"]) for row in rows} == {

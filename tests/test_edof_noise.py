@@ -10,7 +10,7 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.cli import wave_design_run
+from raytrace.cli import wave_run
 from raytrace.cli.run import CommandError
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, dead_leaves
@@ -30,8 +30,9 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, Zernike, as_rings
+from raytrace.wave_optics.element import Element, Zernike
 from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.fabrication import as_rings
 from raytrace.wave_optics.plan import plan
 
 edof, noise = script("wave_edof"), script("wave_noise")
@@ -277,7 +278,7 @@ def test_strengths_fall_with_the_noise():
 @pytest.mark.slow
 def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     """One row, one noise, two starts; the second time everything is kept, and the figures are the same."""
-    monkeypatch.setattr(wave_design_run, "LEAF_COUNT", 4)
+    monkeypatch.setattr(wave_run, "LEAF_COUNT", 4)
     words = ["--rows", "learned-smooth", "--noises", "0.01", "--starts", "2", "--steps", "1"]
     words += ["-o", str(tmp_path / "run"), "--docs", str(tmp_path / "docs"), "--json"]
     assert not noise.main(words)
@@ -299,7 +300,7 @@ def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_a_file_of_heights_is_judged_as_the_element_it_was_written_from(capsys, monkeypatch, tmp_path):
     """Few leaves, two steps: the same figures by the file and by the run, behind both filters."""
-    monkeypatch.setattr(wave_design_run, "LEAF_COUNT", 4)
+    monkeypatch.setattr(wave_run, "LEAF_COUNT", 4)
     words = ["--noises", "0.01", "--starts", "1", "--steps", "2", "--json", "--rows"]
     assert not noise.main([*words, "learned", "-o", str(tmp_path / "run"), "--docs", str(tmp_path)])
     run = json.loads(capsys.readouterr().out)["rows"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scripts import script
 
-from raytrace.cli.wave_design_run import LEAVES
+from raytrace.cli.wave_run import LEAVES
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.wave_camera import WaveCameraConfig, periodic
 from raytrace.wave_optics.element_files import read_element, read_label

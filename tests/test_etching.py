@@ -7,7 +7,7 @@ import torch
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, period
-from raytrace.wave_optics.etching import Process, matched, relief
+from raytrace.wave_optics.fabrication import Process, matched
 
 COLOURS = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
 SILICA = find_glass("F_SILICA")
@@ -61,9 +61,7 @@ def test_matched_is_nearer_than_wrapped():
     assert near > float(total) + 0.02
 
 
-def test_relief_is_that_of_the_levels():
-    assert float(relief(thick(), Process(waves=1, levels=16))) == pytest.approx(1.196e-3 * 15 / 16, rel=1e-3)
-    assert float(relief(thick(), Process(waves=2))) == pytest.approx(2 * 1.196e-3, rel=1e-3)
+def test_a_smooth_element_is_not_etched():
     smooth = Element(EvenPowers(torch.zeros(1).double()), torch.tensor(0.5).double(), SILICA)
-    with pytest.raises(ValueError, match="no features to be etched"):
+    with pytest.raises(ValueError, match="no features to fabricate"):
         matched(smooth, Process(), COLOURS)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.analysis import outline
 from raytrace.maths.pupil import fan
-from raytrace.plotting import outline
 from raytrace.system.surface import sag_at
 from raytrace.tracing.geometry import frames
 

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.materials.formulas import BY_NUMBER, FORMULAS
 from raytrace.materials.glass import (
     AIR,
+    BY_NUMBER,
+    FORMULAS,
     LINES,
     MIRROR,
     Glass,

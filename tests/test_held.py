@@ -6,7 +6,7 @@ import pytest
 import torch
 from problems import focal_length
 
-from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
+from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, patch_spectrum
 from raytrace.imaging.codesign import camera, closed_form, optimise
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
@@ -65,7 +65,7 @@ def test_derivatives_through_what_is_solved_for(lens):
     given = [torch.full_like(one, 0.05).requires_grad_() for one in free.values()]
     assert torch.autograd.gradcheck(numbers, given, eps=1e-5, rtol=1e-6)
     own = camera(lens, dataclasses.replace(SMALL, model="gaussian"))
-    spectrum, distances = power_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
+    spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
     own.plan()
     slope = torch.autograd.grad(camera_error(own, spectrum, distances), own.variables.thickness_2)[0]
     either_side = []
@@ -133,7 +133,7 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
     """With so little room for the spaces about the stop that the one that is solved for stands at an end."""
     bounds = "thickness_2:0.1,1.5 thickness_9:0.1,1.5 thickness_5:14.2,14.3 thickness_6:12.4,12.5"
     settings = dataclasses.replace(SMALL, model="gaussian", size=21, bounds=bounds)
-    found = closed_form(lens, settings, power_spectrum(dead_leaves(4, size=64), 36))
+    found = closed_form(lens, settings, patch_spectrum(dead_leaves(4, size=64), 36))
     assert focal_length(found.lens) == pytest.approx(focal_length(lens), abs=MICROMETRE)
     for name, (low, high) in parse_bounds(bounds).items():
         assert low - MICROMETRE <= found.variables[name] <= high + MICROMETRE
@@ -145,7 +145,7 @@ def test_a_held_space_below_nothing_is_told_with_the_end_of_the_sensor(lens):
     """It has no bounds of its own, while the sensor stands at an end of its bounds."""
     bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
     own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
-    spectrum, distances = power_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
+    spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
     found = optimise_closed_form(own, spectrum, distances=distances)
     assert {"sensor", "thickness_6"} <= set(found.at_end)
     assert "no optimum inside sensor from 57 to 57.1, " in found.no_optimum

@@ -64,9 +64,9 @@ def test_variables_and_rows_are_those_of_an_independent_reader():
         if path is None:
             continue
         original, report = read_lens_with_report(path)
-        told = [one.split(":") for one in case["variables"]]
-        surfaces = [original.surfaces[int(number.split("/")[0])] for _, number in told]
-        expected = [of_oracle(*one, surface) for one, surface in zip(told, surfaces, strict=True)]
+        variables = [one.split(":") for one in case["variables"]]
+        surfaces = [original.surfaces[int(number.split("/")[0])] for _, number in variables]
+        expected = [of_oracle(*one, surface) for one, surface in zip(variables, surfaces, strict=True)]
         assert [(one.surface, one.quantity) for one in original.optimization_data.variables] == expected
         in_mm = not any("converted to mm" in note for note in report.notes)
         for value, (surface, quantity) in zip(case.get("x_stored", ()) if in_mm else (), expected, strict=False):
@@ -153,8 +153,8 @@ def test_a_number_of_a_file_is_written_in_its_unit_such_that_it_comes_back(unit,
     random = torch.Generator().manual_seed(3)
     for one in torch.randn(500, dtype=torch.float64, generator=random).tolist():
         in_mm = one * unit**power if power >= 0 else one / unit**-power
-        told = float(in_file(repr(in_mm), power, unit))
-        assert (told * unit**power if power >= 0 else told / unit**-power) == in_mm
+        stored = float(in_file(repr(in_mm), power, unit))
+        assert (stored * unit**power if power >= 0 else stored / unit**-power) == in_mm
         other = float(in_file(repr(one), power, unit))
         assert (other * unit**power if power >= 0 else other / unit**-power) == pytest.approx(one, rel=5e-16, abs=0)
 
@@ -290,12 +290,12 @@ def test_bounds_on_one_side_are_kept_and_those_of_other_numbers_are_said_to_be_l
     curvature, thickness, *others, last = original.optimization_data.variables
     inf = float("inf")
     bound = (dataclasses.replace(thickness, bounds=(1.5, inf)), *others, dataclasses.replace(last, bounds=(-inf, 30.0)))
-    told = dataclasses.replace(original.optimization_data, variables=(curvature, *bound))
-    assert again(dataclasses.replace(original, optimization_data=told), tmp_path).optimization_data == told
-    steep = dataclasses.replace(told, variables=(dataclasses.replace(curvature, bounds=(0.0, 0.1)), *bound))
+    data = dataclasses.replace(original.optimization_data, variables=(curvature, *bound))
+    assert again(dataclasses.replace(original, optimization_data=data), tmp_path).optimization_data == data
+    steep = dataclasses.replace(data, variables=(dataclasses.replace(curvature, bounds=(0.0, 0.1)), *bound))
     with pytest.warns(LensFileWarning, match=r"other than thicknesses \('curvature of surface 1'\)"):
         write_lens(dataclasses.replace(original, optimization_data=steep), tmp_path / "again.zmx")
-    assert read_lens_with_report(tmp_path / "again.zmx")[0].optimization_data == told
+    assert read_lens_with_report(tmp_path / "again.zmx")[0].optimization_data == data
 
 
 def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):

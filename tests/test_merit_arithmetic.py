@@ -112,18 +112,18 @@ def in_an_order(names):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_order_of_rows_does_not_matter(seed):
     names, model = list(tangled()), model_of("near")
-    told = []
+    results = []
     for order in (names, list(np.random.default_rng(seed).permutation(names)), names[::-1]):
         rows, places = in_an_order(order)
         rows[0] = Row("BLNK")
         found = Evaluation(model, rows)(model.start, derivatives=True)
         slopes = {rows[k].operand: found.jacobian[found.of_row == k] for k in found.of_row}
-        told.append(({name: found.values[place - 1] for name, place in places.items()}, slopes, found.merit))
-    for values, slopes, merit in told[1:]:
-        assert values == told[0][0]
-        assert merit == pytest.approx(told[0][2], rel=1e-15)
-        assert all(np.array_equal(slopes[name], told[0][1][name]) for name in slopes)
-    values = told[0][0]
+        results.append(({name: found.values[place - 1] for name, place in places.items()}, slopes, found.merit))
+    for values, slopes, merit in results[1:]:
+        assert values == results[0][0]
+        assert merit == pytest.approx(results[0][2], rel=1e-15)
+        assert all(np.array_equal(slopes[name], results[0][1][name]) for name in slopes)
+    values = results[0][0]
     less = values["focal length"] * values["aperture"] / values["height"] - FOCUS
     assert values["angle"] == pytest.approx(math.atan(math.sqrt(abs(less))), rel=1e-14)
 

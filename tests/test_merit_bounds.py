@@ -17,7 +17,7 @@ from problems import both_engines, fields, lens, scalar, surface, vector
 import raytrace as rt
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
-from raytrace.optimization.context import EvaluationContext, planner_of
+from raytrace.optimization.context import EvaluationContext, Planner
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import LOST, Evaluation
@@ -233,8 +233,8 @@ def case(request):
 def test_every_row_is_what_its_definition_says(case):
     model, rows, evaluation = case
     found = evaluation(model.start)
-    for row, told in zip(rows, found.values, strict=True):
-        assert told == pytest.approx(expected(model.lens, row), rel=1e-9, abs=1e-10), row
+    for row, computed in zip(rows, found.values, strict=True):
+        assert computed == pytest.approx(expected(model.lens, row), rel=1e-9, abs=1e-10), row
     assert {row.operand for row in rows} == set(BOUNDARIES)
 
 
@@ -249,8 +249,8 @@ def test_derivatives_of_every_row_are_those_of_finite_differences(case):
         ahead, back = evaluation(model.start + step), evaluation(model.start - step)
         by = (ahead.residuals - back.residuals) / (2 * step[number])
         scale = 1e-6 * np.abs(by).max() + 1e-7
-        for of, told, one in zip(found.of_row, found.jacobian[:, number], by, strict=True):
-            assert told == pytest.approx(one, rel=2e-5, abs=scale), (rows[of], model.variables[number])
+        for of, computed, one in zip(found.of_row, found.jacobian[:, number], by, strict=True):
+            assert computed == pytest.approx(one, rel=2e-5, abs=scale), (rows[of], model.variables[number])
     assert np.abs(found.jacobian).max() > 0
 
 
@@ -260,13 +260,13 @@ def test_semi_diameters_are_the_same_by_either_engine(name, engine):
     found = LENSES[name]()
     model = Model(found, VARY[name])
     row = Row("MNSD", (1, 20), target=1e3, weight=1.0)
-    told = Evaluation(model, [row])(model.start, derivatives=True)
+    computed = Evaluation(model, [row])(model.start, derivatives=True)
     sizes = [s for s, own in list(zip(semi_diameters(found), found.surfaces, strict=True))[1:-1] if not own.is_break]
-    assert told.values[0] == pytest.approx(1e3 - sum(1e3 - s for s in sizes), rel=1e-11)
+    assert computed.values[0] == pytest.approx(1e3 - sum(1e3 - s for s in sizes), rel=1e-11)
     step = np.zeros(len(model.start))
     step[1] = 1e-6
     by = [Evaluation(model, [row])(model.start + s * step).residuals[0] for s in (1, -1)]
-    assert told.jacobian[0, 1] == pytest.approx((by[0] - by[1]) / 2e-6, rel=1e-5)
+    assert computed.jacobian[0, 1] == pytest.approx((by[0] - by[1]) / 2e-6, rel=1e-5)
 
 
 # -- what other programs have ------------------------------------------------------------------------------------------
@@ -283,12 +283,12 @@ def test_rows_of_real_files_are_those_of_an_independent_program(name):
     oracle = {one["row"]: one for one in next(one for one in files if one["file"] == path.name)["values"]}
     found = rt.read_lens(path)
     rows = found.optimization_data.merit
-    told = Evaluation(Model(found), rows, skip_unknown=True)(np.zeros(0)).values
+    computed = Evaluation(Model(found), rows, skip_unknown=True)(np.zeros(0)).values
     mine = [number for number, row in enumerate(rows, 1) if row.operand in BOUNDARIES and number in oracle]
     assert len(mine) >= 2
     for number in mine:
         assert oracle[number]["op"] == rows[number - 1].operand
-        assert told[number - 1] == pytest.approx(oracle[number]["value"], rel=1e-8, abs=1e-9), rows[number - 1]
+        assert computed[number - 1] == pytest.approx(oracle[number]["value"], rel=1e-8, abs=1e-9), rows[number - 1]
 
 
 def stored(path: Path) -> dict[int, tuple[float, int]]:
@@ -331,14 +331,14 @@ def test_semi_diameters_are_those_that_opticstudio_stored():
         except UnknownGlass:
             continue
         model, current = Model(found), found.current_configuration
-        planner = planner_of(model, current, found.primary_wavelength - 1, Conventions())
+        planner = Planner(model.views[current - 1], found.primary_wavelength - 1, Conventions())
         own = planner.shared(SemiDiameters)
         own.ask(range(1, len(found.surfaces)))
-        told = own.at(EvaluationContext(planner, model.views[current - 1].state(model.start), {}))
+        computed = own.at(EvaluationContext(planner, model.views[current - 1].state(model.start), {}))
         follow = [
             k for k, (size, given) in sizes.items() if k and size and not given and not found.surfaces[k].is_break
         ]
-        close = [bool(abs(told[k] - sizes[k][0]) <= max(1e-6 * sizes[k][0], 1e-9)) for k in follow]
+        close = [bool(abs(computed[k] - sizes[k][0]) <= max(1e-6 * sizes[k][0], 1e-9)) for k in follow]
         assert close.count(False) == UNLIKE.get(name, 0), name
         met, count, files = met + sum(close), count + len(close), files + 1
     assert (met, count, files) == (136, 143, 41)
@@ -354,24 +354,24 @@ def plate(thickness: float):
 def test_a_row_switches_without_a_jump_and_stands_still_where_it_complies():
     model = Model(plate(3.0), (Vary(1, "thickness"),))
     evaluation = Evaluation(model, [Row("MNCG", (1, 2), target=4.0, weight=1.0)])
-    told = [evaluation(np.array([t]), derivatives=True) for t in (3.0, 4.0 - 1e-9, 4.0, 4.0 + 1e-9, 7.0)]
-    assert [one.residuals[0] for one in told] == pytest.approx([-1.0, -1e-9, 0.0, 0.0, 0.0], abs=1e-15)
-    assert [one.jacobian[0, 0] for one in told] == [1.0, 1.0, 0.0, 0.0, 0.0]
+    computed = [evaluation(np.array([t]), derivatives=True) for t in (3.0, 4.0 - 1e-9, 4.0, 4.0 + 1e-9, 7.0)]
+    assert [one.residuals[0] for one in computed] == pytest.approx([-1.0, -1e-9, 0.0, 0.0, 0.0], abs=1e-15)
+    assert [one.jacobian[0, 0] for one in computed] == [1.0, 1.0, 0.0, 0.0, 0.0]
 
 
 def test_other_readings_take_the_largest_lack_and_signed_thicknesses():
     thick = automatic(lens([surface(None, 3.0, 1.5), surface(None, 1.0, 1.6), surface(None, 20.0)]))
     model = Model(thick, (Vary(1, "thickness"), Vary(2, "thickness")))
     rows = [Row("MNCG", (1, 3), target=4.0, weight=1.0), Row("MXCG", (1, 3), target=0.5, weight=1.0)]
-    told = Evaluation(model, rows, conventions=Conventions(boundary="largest"))(model.start, derivatives=True)
-    assert told.values == pytest.approx([1.0, 3.0])
-    assert told.jacobian == pytest.approx(np.sqrt(0.5) * np.array([[0.0, 1.0], [1.0, 0.0]]))
+    computed = Evaluation(model, rows, conventions=Conventions(boundary="largest"))(model.start, derivatives=True)
+    assert computed.values == pytest.approx([1.0, 3.0])
+    assert computed.jacobian == pytest.approx(np.sqrt(0.5) * np.array([[0.0, 1.0], [1.0, 0.0]]))
     back = automatic(lens([surface(None, 5.0, MIRROR), surface(None, -7.0)]))
-    told = [
+    computed = [
         Evaluation(Model(back), [Row("MNCA", (1, 1), target=1.0)], conventions=convention)(np.zeros(0)).values[0]
         for convention in (Conventions(), Conventions(behind_mirrors="signed"))
     ]
-    assert told == [-5.0, 1.0]
+    assert computed == [-5.0, 1.0]
 
 
 def test_a_surface_that_is_not_there_is_named():
@@ -388,14 +388,18 @@ def test_rows_that_comply_stay_in_the_sum_of_weights():
 
 def test_rows_in_another_unit_have_the_values_of_that_unit():
     row = Row("MNCG", (1, 2), target=0.5, weight=1.0)
-    told = Evaluation(Model(plate(5.08), (Vary(1, "thickness"),)), [row], unit=25.4)(np.array([5.08]), derivatives=True)
-    assert told.values[0] == pytest.approx(0.2, rel=1e-14)
-    assert told.jacobian[0, 0] == pytest.approx(1 / 25.4)
+    computed = Evaluation(Model(plate(5.08), (Vary(1, "thickness"),)), [row], unit=25.4)(
+        np.array([5.08]), derivatives=True
+    )
+    assert computed.values[0] == pytest.approx(0.2, rel=1e-14)
+    assert computed.jacobian[0, 0] == pytest.approx(1 / 25.4)
 
 
 def test_a_range_without_surfaces_is_its_target():
-    told = Evaluation(Model(plate(3.0)), [Row("MNCA", (1, 1), target=4.0, weight=1.0), Row("MNCG", (0, 0), target=2.0)])
-    assert told(np.zeros(0)).values.tolist() == [4.0, 2.0]
+    computed = Evaluation(
+        Model(plate(3.0)), [Row("MNCA", (1, 1), target=4.0, weight=1.0), Row("MNCG", (0, 0), target=2.0)]
+    )
+    assert computed(np.zeros(0)).values.tolist() == [4.0, 2.0]
 
 
 def test_infinite_distances_comply_with_a_least_thickness():
@@ -433,15 +437,15 @@ def test_rays_that_are_lost_leave_the_size_to_the_others():
     )
     model = Model(automatic(ball, margin=(0.0, 0.0)), (Vary(2, "curvature"), Vary(1, "thickness")))
     row = Row("MNSD", (2, 3), target=3.0, weight=1.0)
-    told = Evaluation(model, [row])(model.start, derivatives=True)
+    computed = Evaluation(model, [row])(model.start, derivatives=True)
     alone = dataclasses.replace(model.lens, fields=fields())
-    assert told.values[0] == pytest.approx(sum(semi_diameters(alone)[2:4]) - 3.0, rel=1e-11)
+    assert computed.values[0] == pytest.approx(sum(semi_diameters(alone)[2:4]) - 3.0, rel=1e-11)
     for number in range(2):
         step = 1e-6 * np.eye(2)[number]
         by = [Evaluation(model, [row])(model.start + s * step).residuals[0] for s in (1, -1)]
-        assert told.jacobian[0, number] == pytest.approx((by[0] - by[1]) / 2e-6, abs=1e-7)
+        assert computed.jacobian[0, number] == pytest.approx((by[0] - by[1]) / 2e-6, abs=1e-7)
     gone = dataclasses.replace(model.lens, fields=fields("angle", (50.0,)))
-    told = Evaluation(Model(gone, model.variables), [row])(model.start, derivatives=True)
-    assert told.lost[0]
-    assert told.merit == LOST
-    assert not told.jacobian.any()
+    computed = Evaluation(Model(gone, model.variables), [row])(model.start, derivatives=True)
+    assert computed.lost[0]
+    assert computed.merit == LOST
+    assert not computed.jacobian.any()

@@ -92,7 +92,7 @@ def bundle_of(lens, name):
     return model, bundle
 
 
-def told(hits):
+def table_of(hits):
     return np.stack([*hits.position, *hits.direction, hits.opl])
 
 
@@ -110,7 +110,7 @@ def test_rays_are_those_of_launch(cases, name):
     expected = torch.cat([end.position, end.direction, end.opl[None]]).reshape(7, -1).numpy()
     valid = hits.valid & end.valid.reshape(-1).numpy()
     assert valid.mean() >= 0.75
-    assert np.allclose(told(hits)[:, valid], expected[:, valid], rtol=1e-10, atol=1e-9)
+    assert np.allclose(table_of(hits)[:, valid], expected[:, valid], rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_derivatives_are_those_of_finite_differences(cases, name, engine):
         for k in range(count):
             step = 1e-6 * max(abs(x[k]), 1e-3)
             ahead, back = (
-                told(bundle.hits(model.views[0].state(x + sign * step * np.eye(count)[k]))) for sign in (1, -1)
+                table_of(bundle.hits(model.views[0].state(x + sign * step * np.eye(count)[k]))) for sign in (1, -1)
             )
             slopes = np.stack([p.full()[k] for p in (*hits.position, *hits.direction, hits.opl)])
             difference = ((ahead - back) / (2 * step))[:, hits.valid]

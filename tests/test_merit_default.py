@@ -126,8 +126,8 @@ def test_every_configuration_has_its_rows():
 def test_boundaries_are_rows_over_all_surfaces():
     lens = rt.read_lens("double_gauss")
     rows = DefaultMerit(glass_thickness="2:15", air_thickness=(0.5, 50), edge=1).rows(lens)
-    told = {row.operand: (*row.integers, row.target, row.weight) for row in rows if row.operand[:2] in ("MN", "MX")}
-    assert told == {
+    bounds = {row.operand: (*row.integers, row.target, row.weight) for row in rows if row.operand[:2] in ("MN", "MX")}
+    assert bounds == {
         "MNCA": (1, 11, 0.5, 1),
         "MXCA": (1, 10, 50, 1),  # not of the space before the image
         "MNEA": (1, 11, 0.5, 1),

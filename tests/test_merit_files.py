@@ -43,14 +43,16 @@ def test_all_files_are_there():
 def test_the_merit_and_every_row(name):
     case, evaluate = cases()[name], evaluation(name)
     found = evaluate(evaluate.model.start)
-    for told in case["values"]:
-        row, value = evaluate.rows[told["row"] - 1], found.values[told["row"] - 1]
-        assert row.operand == told["op"]
+    for stored in case["values"]:
+        row, value = evaluate.rows[stored["row"] - 1], found.values[stored["row"] - 1]
+        assert row.operand == stored["op"]
         if row.operand in OPEN:
             continue
-        expected, value = (abs(told["value"]), abs(value)) if row.operand.startswith("OPD") else (told["value"], value)
+        expected, value = (
+            (abs(stored["value"]), abs(value)) if row.operand.startswith("OPD") else (stored["value"], value)
+        )
         close = max(CLOSE * abs(expected), NEAR_ZERO.get(row.operand, 1e-9))
-        assert value == pytest.approx(expected, abs=close), told
+        assert value == pytest.approx(expected, abs=close), stored
     assert found.merit == pytest.approx(case["mf_stored"], rel=CLOSE, abs=1e-13)
     assert not found.lost.any()
 

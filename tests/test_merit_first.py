@@ -32,9 +32,9 @@ NAMES = {
 @pytest.mark.parametrize("name", LENSES)
 def test_first_order_is_that_of_the_lens(name):
     data = first_order(lens_of(name))
-    told = values_of(name, [Row(operand) for operand in NAMES])
+    computed = values_of(name, [Row(operand) for operand in NAMES])
     expected = [float(getattr(data, word)) for word in NAMES.values()]
-    assert dict(zip(NAMES, told, strict=True)) == pytest.approx(
+    assert dict(zip(NAMES, computed, strict=True)) == pytest.approx(
         dict(zip(NAMES, expected, strict=True)), rel=1e-11, abs=1e-13
     )
     assert values_of(name, [Row("PETC")])[0] == pytest.approx(1 / float(data.petzval_radius), rel=1e-11)
@@ -46,8 +46,8 @@ def test_first_order_of_a_wavelength(name):
     for number in range(1, len(lens.wavelengths) + 1):
         data = first_order(lens, lens.wavelengths[number - 1])
         for operand in ("EFFL", "PMAG", "AMAG", "PETZ"):
-            (told,) = values_of(name, [Row(operand, (0, number))])
-            assert told == pytest.approx(float(getattr(data, NAMES[operand])), rel=1e-11, abs=1e-13), operand
+            (computed,) = values_of(name, [Row(operand, (0, number))])
+            assert computed == pytest.approx(float(getattr(data, NAMES[operand])), rel=1e-11, abs=1e-13), operand
 
 
 def axis_of(lens):

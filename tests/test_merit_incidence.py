@@ -35,14 +35,14 @@ def test_incidence_is_that_of_the_verb(name):
     model = Model(lens)
     found = rt.incidence(lens, fields=lens.fields.y)
     angles, valid = found.angle[:, 0].abs().reshape(-1), found.valid[:, 0].reshape(-1)
-    told = Evaluation(model, rows_of(lens, "RAID"))(model.start).values
-    keep = valid.numpy() & np.isfinite(told)
+    computed = Evaluation(model, rows_of(lens, "RAID"))(model.start).values
+    keep = valid.numpy() & np.isfinite(computed)
     assert keep.mean() > 0.8
-    assert told[keep] == pytest.approx(angles.numpy()[keep], rel=1e-9, abs=1e-6)
+    assert computed[keep] == pytest.approx(angles.numpy()[keep], rel=1e-9, abs=1e-6)
 
 
 def test_incidence_on_tilted_surfaces():
-    """Of mirrors, and of the image, the angle in front, told from the surface before, is the one behind."""
+    """Of mirrors, and of the image, the angle in front, computed from the surface before, is the one behind."""
     lens = rt.read_lens(shipped("lenses") / "examples" / "folded_relay.zmx")
     image = len(lens.surfaces) - 1
     keeps = [k for k, surface in enumerate(lens.surfaces) if surface.is_mirror] + [image]

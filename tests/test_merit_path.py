@@ -184,7 +184,7 @@ def test_a_fit_leaves_out_what_is_not_there():
 
 
 def test_a_common_tilt_is_one_of_the_path():
-    """It leaves more than a tilt for each colour; what is left has no common tilt, by weight, told in mm."""
+    """It leaves more than a tilt for each colour; what is left has no common tilt, by weight, in mm."""
     lens = rt.read_lens("double_gauss_28deg")
     asked = rows("OPDX", fields=[(0.0, 0.7)])
     weights, y = np.array([row.weight for row in asked]), np.array([row.numbers[3] for row in asked])

@@ -186,7 +186,7 @@ def test_one_wavelength_is_that_one_alone():
     assert np.abs(values(lens, [in_columns("MTFT", field=2), in_columns("GMTT", field=2)]) - expected).min() > 1e-2
 
 
-def test_rays_are_scaled_by_a_perfect_lens_unless_told():
+def test_rays_are_scaled_by_a_perfect_lens_by_default():
     lens = rt.read_lens("cooke_triplet")
     scaled, plain = values(lens, [in_columns("GMTS", plain=p) for p in (0.0, 1.0)])
     assert scaled / plain == pytest.approx(float(rt.mtf(lens, [20.0]).limit[0]), rel=1e-12)
@@ -326,15 +326,15 @@ def test_a_function_that_gives_no_numbers_is_refused():
 
 
 def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
-    """Its row has a name wherever results are told; in a lens file a text stands for it, with a warning."""
+    """Its row has a name in every result; in a lens file a text stands for it, with a warning."""
     lens = rt.read_lens("cooke_triplet")
     found = rt.optimize(
         lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=4
     )
     assert found.merit_after < 0.999 * found.merit_before
-    told = json.loads(json.dumps(found.document()))["operands"][0]
-    assert told["operand"] == "sharpness"
-    assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
+    document = json.loads(json.dumps(found.document()))["operands"][0]
+    assert document["operand"] == "sharpness"
+    assert document["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
     assert "sharpness" in str(found)
     with pytest.warns(LensFileWarning, match="the optimisation data"):
         rt.write_lens(found.lens, tmp_path / "found.zmx")

@@ -108,20 +108,20 @@ def test_polynomials_carry_derivatives_back_to_their_rays():
     wave = np.stack([0.3 * x**3 + 0.2 * y**8, 0.4 * (x * x + y * y) - 0.3 * y**3])
     directions = np.stack([[x + 0.02 * y * y, x], [y + 0.03 * x * y, 1.1 * y - 0.02 * y**7]])
 
-    def told(wave: np.ndarray, directions: np.ndarray) -> tuple[float, Fit, torch.Tensor]:
+    def modulated(wave: np.ndarray, directions: np.ndarray) -> tuple[float, Fit, torch.Tensor]:
         fit = Fit(layout, wave, directions)
         polynomials = torch.from_numpy(fit.polynomials)[:, None].requires_grad_()
         parts = otf(polynomials, torch.from_numpy(0.6 / fit.scale[1])[None], 16)
         return (parts.real + 2 * parts.imag).sum(), fit, polynomials
 
-    number, fit, polynomials = told(wave, directions)
+    number, fit, polynomials = modulated(wave, directions)
     by_wave, by_directions = fit.by_rays(torch.autograd.grad(number, polynomials)[0].numpy())
     for of, by in ((0, by_wave[0]), (1, by_directions[:, 0])):
         change = random.normal(size=by.shape)
         moved = [[wave, directions], [wave, directions]]
         for sign, both in zip((1, -1), moved, strict=True):
             both[of] = both[of] + sign * 1e-5 * change
-        difference = (told(*moved[0])[0] - told(*moved[1])[0]) / 2e-5
+        difference = (modulated(*moved[0])[0] - modulated(*moved[1])[0]) / 2e-5
         assert float(difference.detach()) == pytest.approx(float((by * change).sum()), rel=1e-6)
 
 

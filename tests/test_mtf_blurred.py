@@ -13,7 +13,6 @@ from raytrace.analysis import pupil_autocorrelation as smooth_pupil
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import TakesLong
 from raytrace.cli import main
-from raytrace.plotting.analysis import mtf_curves
 
 
 def defocused(by: float) -> rt.Lens:
@@ -57,15 +56,14 @@ def test_a_blurred_field_takes_a_few_thousand_rays(monkeypatch):
     assert sum(traced) < 8_000
 
 
-def test_the_quadrature_of_a_sheared_pupil_is_the_limit_of_the_grid(monkeypatch):
+def test_the_quadrature_of_a_sheared_pupil_is_the_limit_of_the_grid():
     """700 points across leave 1e-3, at the edge of the first zero; twice as many a quarter of that."""
     lens = defocused(3.0)
     frequencies = mtf.frequency_range(lens, torch.zeros(2, 1).double(), 21)
     scene = scene_of(lens, torch.zeros(2, 1).double())
     sheared = torch.stack(mtf._sheared(scene, frequencies))
-    coarse = torch.stack(mtf._gridded(scene, frequencies, None))
-    monkeypatch.setattr(mtf, "exit_pupil", lambda scene, seconds: aperture.exit_pupil(scene, size=1280))
-    fine = torch.stack(mtf._gridded(scene, frequencies, None))
+    shares = mtf.wavelength_shares(lens)
+    coarse, fine = (torch.stack(mtf.mtf_on_grid(scene, frequencies, shares, **size)) for size in ({}, {"size": 1280}))
     assert (sheared - coarse).abs().max() < 1.2e-3
     assert (sheared - fine).abs().max() < 3e-4
 
@@ -132,7 +130,8 @@ def test_text_json_and_figure_report_which_fields_are_geometric(rough, monkeypat
     assert part.document()["transfer"] == "geometric"
     assert mixed.document()["transfer"] == "diffraction (geometric for 10 degrees)"
     assert str(mixed).splitlines()[-1] == "transfer: diffraction (geometric for 10 degrees)"
-    titles = [text.get_text() for text in mtf_curves(mixed).findobj(Text)]
+    monkeypatch.setattr(mtf.Mtf, "drawn", lambda result: result)
+    titles = [text.get_text() for text in mixed.plot().findobj(Text)]
     assert any("diffraction (geometric for 10 degrees) MTF" in title for title in titles)
     assert main(["mtf", "tessar", "--frequency", "5", "--geometric", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["transfer"] == "geometric"

@@ -29,7 +29,7 @@ SLOW = r"^objective (through-focus|(FFT MTF|diffraction encircled).* (1\.125|2\.
 
 
 def listed(table: dict, case: dict):
-    return next((told for pattern, told in table.items() if re.search(pattern, case["id"])), None)
+    return next((value for pattern, value in table.items() if re.search(pattern, case["id"])), None)
 
 
 def answered() -> list:
@@ -70,12 +70,12 @@ def test_exit_pupil_of_the_objective_by_an_own_trace():
     """y' = y + t u, n'u' = nu - y c (n' - n), backwards in nothing but numbers from the centre and rim of the stop."""
     lens = opticstudio_answers.system("objective_f27")
     data = first_order(lens)
-    told = opticstudio_answers.description("objective_f27")
-    indices = [told["indices"][row[2]]["0.44"] if row[2] else 1.0 for row in told["surfaces"]]
+    system = opticstudio_answers.description("objective_f27")
+    indices = [system["indices"][row[2]]["0.44"] if row[2] else 1.0 for row in system["surfaces"]]
     ends = []
     for y, u in ((0.0, 1.0), (1.0, 0.0)):
-        for k in range(told["stop"], len(told["surfaces"]) - 1):
-            before, (curvature, thickness) = indices[k - 1], told["surfaces"][k][:2]
+        for k in range(system["stop"], len(system["surfaces"]) - 1):
+            before, (curvature, thickness) = indices[k - 1], system["surfaces"][k][:2]
             u = (before * u - y * curvature * (indices[k] - before)) / indices[k]
             y = y + float(thickness) * u
         ends.append((y, u))

@@ -16,9 +16,9 @@ from raytrace.optimization import solver as paths
 from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
+from raytrace.optimization.report import optimize_report
 from raytrace.optimization.solver import Linear, NoStep, Sides, SolverOptions, State, least_squares
 from raytrace.optimization.variables import freedom, name_of
-from raytrace.plotting.optimize import optimize_report
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface

@@ -29,6 +29,7 @@ from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.solver import Sides, State, least_squares
 from raytrace.optimization.variables import freedom, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
@@ -181,7 +182,7 @@ def test_which_glasses_vary(triplet):
         free, surfaces = without_glass(freedom(lens, "glass"), "glass")
         assert surfaces == expected
         assert free.variables == (Vary(1, "curvature"),)
-    with pytest.raises(NoProblem, match="nothing but glasses"):
+    with pytest.raises(BadVariables, match="nothing but glasses"):
         without_glass(freedom(triplet, "glass"), "glass")
 
 

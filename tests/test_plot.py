@@ -13,14 +13,14 @@ from matplotlib.patches import Circle
 from problems import number
 
 import raytrace as rt
-from raytrace import plotting as plot
+from raytrace.analysis import outline
+from raytrace.analysis.focus_report import focus_rays
+from raytrace.analysis.spot_diagram import airy_radius, field_spots, shares_of
 from raytrace.io import read_lens
 from raytrace.materials.glass import constant
 from raytrace.maths.pupil import fan, gauss_rings
-from raytrace.plotting import outline, style
-from raytrace.plotting.curve import focus_rays
-from raytrace.plotting.spots import field_spots, shares_of
-from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.plotting import style
+from raytrace.system.lens import Fields, Lens, SystemAperture, field_label, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture, Surface, sag
 from raytrace.tracing.focus import focus_of_rms
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
@@ -234,7 +234,7 @@ def test_wavelengths_that_are_given_weigh_the_same_unless_told():
 def test_airy_circle_is_the_first_dark_ring(double_gauss):
     data = first_order(double_gauss)
     radius = 1.22 * 0.530e-3 * float(data.effective_focal_length) / 33.33
-    assert float(plot.airy_radius(double_gauss)) == pytest.approx(radius, rel=1e-9)
+    assert float(airy_radius(double_gauss)) == pytest.approx(radius, rel=1e-9)
     circles = [artist for artist in by_gid(rt.spot(double_gauss, rings=4).plot(), "Airy") if isinstance(artist, Circle)]
     assert [circle.radius for circle in circles] == pytest.approx([radius] * 3)
 
@@ -332,7 +332,7 @@ def test_focus_report_takes_several_objects_and_fields(double_gauss):
 )
 def test_save_writes_the_format_of_the_suffix_and_the_same_bytes_again(double_gauss, tmp_path, suffix, start):
     for name in ("a", "b"):
-        plot.save(rt.layout(double_gauss, rays=3).plot(), tmp_path / f"{name}.{suffix}", dpi=60)
+        style.save(rt.layout(double_gauss, rays=3).plot(), tmp_path / f"{name}.{suffix}", dpi=60)
     first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
     assert first.startswith(start)
     assert first == second
@@ -342,7 +342,7 @@ def test_save_writes_the_format_of_the_suffix_and_the_same_bytes_again(double_ga
 @pytest.mark.parametrize("name", ["figure.bmp", "figure", "figure.zmx"])
 def test_an_unknown_suffix_is_refused_by_name(double_gauss, tmp_path, name):
     with pytest.raises(ValueError, match=r"names no format of figures; expected one of \.png, \.pdf, \.svg"):
-        plot.save(style.new_figure(1, 1), tmp_path / name)
+        style.save(style.new_figure(1, 1), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -357,11 +357,11 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
 
     monkeypatch.setattr(figure, "savefig", broken)
     with pytest.raises(MemoryError):
-        plot.save(figure, target)
+        style.save(figure, target)
     assert target.read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
     with pytest.raises(OSError, match="nowhere"):
-        plot.save(style.new_figure(1, 1), tmp_path / "nowhere" / "figure.png")
+        style.save(style.new_figure(1, 1), tmp_path / "nowhere" / "figure.png")
 
 
 def test_figures_touch_neither_pyplot_nor_the_settings_of_the_reader():
@@ -406,10 +406,10 @@ def test_round_lengths(length, text):
 
 
 def test_field_labels_carry_their_unit(double_gauss):
-    assert style.field_label(double_gauss, (0.0, -14.0)) == "−14°"
-    assert style.field_label(double_gauss, (3.0, 4.5)) == "(3, 4.5)°"
+    assert field_label(double_gauss, (0.0, -14.0)) == "−14°"
+    assert field_label(double_gauss, (3.0, 4.5)) == "(3, 4.5)°"
     heights = dataclasses.replace(double_gauss, fields=dataclasses.replace(double_gauss.fields, kind="object_height"))
-    assert style.field_label(heights, (0.0, 5.0)) == "5 mm"
+    assert field_label(heights, (0.0, 5.0)) == "5 mm"
 
 
 def test_wavelength_colours_follow_the_eye():

@@ -11,12 +11,12 @@ from page import outside
 from problems import number
 
 from raytrace import analysis, read_lens
-from raytrace import plotting as plot
 from raytrace.cli import main
 from raytrace.maths.grid import grid
-from raytrace.plotting.psf import DECADES
+from raytrace.plotting import style
 from raytrace.plotting.style import fill
 from raytrace.psf_models import close_up, psf
+from raytrace.psf_models.figure import DECADES, psf_grid
 
 LENSES = Path(__file__).parents[1] / "lenses"
 
@@ -62,7 +62,7 @@ def test_windows_are_alike_unless_the_light_is_not():
     distances = number([math.inf, 2000.0])
     _, light, _ = seen("telephoto", "gaussian", object_distances=distances)
     assert float(light.half[1, 0]) > 4 * float(light.half[0, 0])
-    axes = plot.psf_grid(dataclasses.replace(found, framed=True)).axes
+    axes = psf_grid(dataclasses.replace(found, framed=True)).axes
     assert {tuple(np.round(panel.get_xlim(), 9)) for panel in axes if panel.images} == {(-0.0525, 0.0525)}
 
 
@@ -74,7 +74,7 @@ def phone():
 @pytest.mark.parametrize("log", [False, True])
 def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
     found, light, _ = phone
-    figure = plot.psf_grid(found, close_up=light, log=log)
+    figure = psf_grid(found, close_up=light, log=log)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 2
     for f, panel in enumerate(panels):
@@ -94,7 +94,7 @@ def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
 
 def test_kernels_of_each_wavelength_are_rows_fields_outermost():
     found, light, _ = seen("telephoto", "gaussian", per_wavelength=True, object_distances=number([math.inf, 1e5]))
-    figure = plot.psf_grid(found, close_up=light)
+    figure = psf_grid(found, close_up=light)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 18
     for row in range(9):
@@ -110,7 +110,7 @@ def test_every_word_is_on_the_page(count, distances):
     fields = torch.stack([torch.zeros(count, dtype=torch.float64), torch.linspace(0, 3, count, dtype=torch.float64)])
     found = psf(lens, "gaussian", fields=fields, object_distances=number(distances), center="chief")
     name = "A lens with a name that is much longer than its figure is wide, f = 99.9 mm, F/4"
-    figure = plot.psf_grid(dataclasses.replace(found, lens=dataclasses.replace(lens, name=name), framed=True))
+    figure = psf_grid(dataclasses.replace(found, lens=dataclasses.replace(lens, name=name), framed=True))
     assert outside(figure) == []
     assert "".join(figure.get_suptitle().split()) == "".join(f"{name}: gaussian PSF".split())
 
@@ -129,7 +129,7 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
     found = analysis.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
     assert all(one.kernel.shape[-2:] == (11, 11) for one in found.psfs)
     assert all(float(one.grid.pitch) == 0.002 for one in found.psfs)
-    figure = plot.model_grid(found, log=True)
+    figure = found.plot(log=True)
     panels = [panel for panel in figure.axes if panel.images]
     assert panels[0].get_xlim() == pytest.approx((-0.011, 0.011))
     assert "11 × 11 pixels of 2 µm" in figure.get_supxlabel()
@@ -138,7 +138,7 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
 
 def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
     drawn = []
-    monkeypatch.setattr(plot.style, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(style, "save", lambda figure, path: drawn.append(figure))
     words = ["psf", "phone", "--model", "gaussian", "--plot", str(tmp_path / "a.png")]
     for more in ([], ["--pixel", "0.001"], ["--size", "31"], ["--per-wavelength"]):
         assert main([*words, *more]) == 0

@@ -243,7 +243,7 @@ def test_number_of_rays_is_kept_to():
     assert few.rays <= 5
     with pytest.raises(ValueError, match="wave needs at least"):
         psf(slow(double_gauss()), Wave(rays=1), **options)
-    with pytest.raises(ValueError, match="gaussian needs at least 2 rays a kernel; 1 given"):
+    with pytest.raises(ValueError, match="gaussian needs at least 2 rays a kernel; 1 requested"):
         psf(double_gauss(), Gaussian(rays=1), **options)
 
 

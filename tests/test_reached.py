@@ -30,10 +30,10 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_conditions_that_no_lens_meets_are_refused_before_the_work(triplet, case):
     vary, bounds, hold, named, why = REFUSED[case]
-    with pytest.raises(NoProblem) as told:
+    with pytest.raises(NoProblem) as error:
         rt.optimize(triplet, merit="spot", vary=vary, bounds=bounds or None, hold=hold, cycles=2)
-    assert named in str(told.value)
-    assert why in str(told.value)
+    assert named in str(error.value)
+    assert why in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -69,8 +69,8 @@ def test_what_is_missed_is_in_text_document_and_figure(triplet):
     )
     assert by_name["MXCG 1 7"].surface == 1
     assert "no variable moves it" in by_name["MXCG 1 7"].why
-    told = json.loads(json.dumps(found.document()))["conditions"]
-    assert [one["met"] for one in told] == [one.met for one in found.conditions]
+    document = json.loads(json.dumps(found.document()))["conditions"]
+    assert [one["met"] for one in document] == [one.met for one in found.conditions]
     table = str(found)[str(found).index("condition ") :]
     assert "= 100" in table
     assert table.count("not met") == 1
@@ -129,9 +129,9 @@ def test_a_lens_that_misses_what_was_asked_for_is_written_all_the_same(tmp_path,
     line = "optimize cooke_triplet --merit spot --vary sensor --glass-thickness 50 --cycles 1 -o"
     assert main([*line.split(), str(path)]) == 1
     assert rt.read_lens(path)
-    told = capsys.readouterr()
-    assert "not met" in told.out
-    assert "warning: MNCG 1 7 >= 50" in told.err
+    captured = capsys.readouterr()
+    assert "not met" in captured.out
+    assert "warning: MNCG 1 7 >= 50" in captured.err
 
 
 # -- a surface that does not reach its semi-diameter has no edge -------------------------------------------------------
@@ -186,7 +186,7 @@ def test_edges_are_smooth_across_where_a_surface_closes(operand):
     row = dataclasses.replace(
         EDGES["MNET"], operand=operand, integers=(1, 0) if operand[2] == "V" else (1, 4), target=9.0
     )
-    told = []
+    values = []
     for part in (0.99, 0.9999, 0.99995, 0.99997, 0.9999999, 1.00005, 1.01, 1.5):
         model = Model(concave(part / 10), (Vary(2, "curvature"),))
         evaluation, x, h = Evaluation(model, [row]), model.start, 1e-9
@@ -194,9 +194,9 @@ def test_edges_are_smooth_across_where_a_surface_closes(operand):
         ahead, back = evaluation(x + h), evaluation(x - h)
         by = (ahead.residuals[0] - back.residuals[0]) / (2 * h)
         assert found.jacobian[0, 0] == pytest.approx(by, rel=1e-3, abs=1e-3)  # second derivatives of 1e7 mm³ times h
-        told.append(found.values[0])
-    assert np.isfinite(told).all()
-    assert np.abs(np.diff(told[1:6])).max() < 0.3  # mm, where a root alone has a slope without end
+        values.append(found.values[0])
+    assert np.isfinite(values).all()
+    assert np.abs(np.diff(values[1:6])).max() < 0.3  # mm, where a root alone has a slope without end
 
 
 # -- several configurations --------------------------------------------------------------------------------------------
@@ -205,10 +205,10 @@ def test_edges_are_smooth_across_where_a_surface_closes(operand):
 def test_a_zoom_is_printed_and_drawn_in_all_its_configurations(triplet):
     zoom = triplet.with_configurations(thickness={2: [6.0, 9.0], 7: [77.4, 70.0]})
     found = rt.optimize(zoom, merit="spot", vary="thickness:2@1 thickness:2@2", cycles=1)
-    told = str(found)
-    assert "configuration        EFL before, mm" in told
+    text = str(found)
+    assert "configuration        EFL before, mm" in text
     lengths = [float(rt.first_order(one).effective_focal_length) for one in found.lens.configurations]
-    assert all(f"{length:.8g}" in told for length in lengths)
+    assert all(f"{length:.8g}" in text for length in lengths)
     assert {one["configuration"] for one in found.document()["operands"]} == {1, 2}
     assert set(found.columns()["configuration"].tolist()) == {1, 2}
     titles = [axes.get_title() for axes in found.plot().axes]

@@ -234,7 +234,7 @@ def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k
     """The merit has no slope along any step that meets the conditions, and curves down along one alone."""
     asked, lens = best_triplet
     place = Place(k, enlarged(lens, asked, k))
-    stage, x = place.stage(0.0, 1, SolverOptions()), place.asked.model.start
+    stage, x = place.stage(0.0, 1, SolverOptions()), place.task.model.start
     size = np.sqrt(stage.problem.state(x, False).cost)
     found = saddle(stage.problem, x, stage.moves(x))
     assert np.abs(found.slope).max() < 1e-7 * size

@@ -14,13 +14,13 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt
+from raytrace.analysis.outline import depth
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens, write_lens
 from raytrace.io.source import LensFileError
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
-from raytrace.plotting.outline import depth
 from raytrace.psf_models import psf
 from raytrace.system import shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
@@ -30,8 +30,7 @@ from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
 from raytrace.system.surface import sag, sag_at
-from raytrace.tracing.compiled import trace_engine
-from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Memo, symmetry, trace_bundle

@@ -15,7 +15,7 @@ from raytrace.cli.codesign_run import settings_of
 from raytrace.cli.settings import words as words_of
 from raytrace.files import shipped, write_table
 from raytrace.imaging import codesign as optima
-from raytrace.imaging.closed_form import even_distances, optimise_closed_form, paraxial_image, power_spectrum, scan
+from raytrace.imaging.closed_form import even_distances, optimise_closed_form, patch_spectrum, scan
 from raytrace.imaging.codesign import (
     Optimum,
     Outcome,
@@ -31,7 +31,7 @@ from raytrace.pages import kept_of, markdown
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 from raytrace.tracing.focus import best_focus
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 page_script, study, judged = script("codesign"), script("codesign_study"), script("codesign_claims")
 focus_marks = script("codesign_figures").focus_marks
@@ -41,6 +41,12 @@ AFTER_PARAXIAL, COLUMNS, StepTime = study.AFTER_PARAXIAL, study.COLUMNS, study.S
 blur_diameters, closed_forms, courses = study.blur_diameters, study.closed_forms, study.courses
 losses_by_distance, outcomes, run_folder = study.losses_by_distance, study.outcomes, study.run_folder
 run_settings, settled, step_times, summaries = study.run_settings, study.settled, study.step_times, study.summaries
+
+
+def paraxial_image(lens):
+    return paraxial_image_distance(lens, lens.surfaces[0].thickness)
+
+
 SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3
 
@@ -290,7 +296,7 @@ def test_a_study_reads_finished_runs_by_row(tmp_path):
 
 @pytest.fixture(scope="module")
 def spectrum(pictures):
-    return power_spectrum(pictures, SMALL.patch + SMALL.size - 1)
+    return patch_spectrum(pictures, SMALL.patch + SMALL.size - 1)
 
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian"])
@@ -340,7 +346,7 @@ def test_closed_forms_of_rows_begin_where_the_rows_do(lens, spectrum, monkeypatc
 @pytest.mark.parametrize(("noise", "starts"), [(0.1, ("57.4", "paraxial", "57.95")), (0.01, ("57.4", "paraxial"))])
 def test_the_optimum_of_gaussian_drt_is_no_matter_of_where_it_begins(lens, pictures, noise, starts):
     """To a micrometre. With little noise the first step of 1 mm that scipy would take lands behind another optimum."""
-    spectrum, places = power_spectrum(pictures, 36), []
+    spectrum, places = patch_spectrum(pictures, 36), []
     for start in starts:
         own = camera(lens, dataclasses.replace(SMALL, size=21, noise=noise, start=start))
         optimise_closed_form(own, spectrum, distances=even_distances(own, 9))

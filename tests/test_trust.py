@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.tracing.compiled import library
-from raytrace.tracing.compiled.library import (
+from raytrace.tracing import compiler as library
+from raytrace.tracing.compiler import (
     NoCompiler,
     Untrusted,
     check_file,
@@ -142,7 +142,8 @@ __attribute__((constructor)) static void run(void) { fclose(fopen("%s", "w")); }
 
 PROBE = """
 import os, sys, torch
-from raytrace.tracing.compiled import library
+from raytrace.tracing import compiler as library
+from raytrace.tracing.compiled import uses_compiled
 from raytrace.system.rays import Rays
 one = torch.ones(3, 1, dtype=torch.float64)
 for word in sys.argv[1:]:
@@ -150,7 +151,7 @@ for word in sys.argv[1:]:
     os.environ[name] = value
     library.cache_folder.cache_clear()
     library.is_built.cache_clear()
-    print(library.uses_compiled(Rays(one, one, one[0] > 0), one, 1), flush=True)
+    print(uses_compiled(Rays(one, one, one[0] > 0), one, 1), flush=True)
     del os.environ[name]
 """
 

@@ -11,7 +11,8 @@ from torch.autograd import gradcheck
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
 from raytrace.wave_optics.designs import BASELINES, FOCI, achromat, aim, baseline, converging, encircled_energy
-from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, as_rings, features, height, path
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, height, path
+from raytrace.wave_optics.fabrication import as_rings, features
 
 COLOURS = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
 PMMA, SILICA = find_glass("PMMA"), find_glass("F_SILICA")

@@ -19,11 +19,11 @@ from raytrace.cli import wave_options
 from raytrace.cli.commands import WAVE_COMMANDS
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
-from raytrace.plotting.wave import height_figure
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import BASELINES, aim, baseline
-from raytrace.wave_optics.element import as_rings
 from raytrace.wave_optics.element_files import read_element, read_label, write_element
+from raytrace.wave_optics.fabrication import as_rings
+from raytrace.wave_optics.figures import height_figure
 from raytrace.wave_optics.height_maps import write_heights
 from raytrace.wave_optics.plan import ENGINES, plan
 from raytrace.wave_optics.scene import WaveScene
@@ -159,7 +159,7 @@ def test_heights_keep_the_material_that_they_were_learned_for(run, tmp_path):
     (tmp_path / "rings.npy.json").unlink()
     code, _, err = run(*arguments)
     assert code == 1
-    assert "rings.npy: does not say its material (there is no rings.npy.json beside it); give --glass NAME" in err
+    assert "rings.npy: has no material (there is no rings.npy.json); give --glass NAME" in err
     np.save(tmp_path / "bare.npy", element.profile.heights.numpy())
     code, _, err = run("psf", "--element", "bare.npy", "--aperture", "1", *SMALL)
     assert code == 1
@@ -253,7 +253,7 @@ def test_text_and_the_other_figures(run, tmp_path):
         (["--element", "none.npy"], 1, "none.npy: cannot be read: No such file"),
         (["--engine", "pupil", "--samples", "48", "--depth", "500"], 1, "repeat the image every"),
         (["--engine", "radial", "--element", "cubic"], 1, "radial engine needs round elements"),
-        (["--wavelength", "0.3"], 1, "PMMA is known from 0.365 to 1.06 µm, not at 0.3"),
+        (["--wavelength", "0.3"], 1, "PMMA has indices from 0.365 to 1.06 µm, none at 0.3"),
         (["--levels", "16"], 1, "the element singlet is smooth"),
         (["--glass", "F_SILICA"], 1, "--glass belongs to a height map"),
         (["-o", "psf.txt"], 1, "psf.txt: expected a name that ends in .npz"),

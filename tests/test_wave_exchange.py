@@ -12,17 +12,8 @@ from PIL import Image
 from problems import number
 
 from raytrace.materials.catalogs import find_glass
-from raytrace.wave_optics.element import (
-    Element,
-    EvenPowers,
-    Pixels,
-    Rings,
-    as_pixels,
-    fabricated,
-    fabricated_height,
-    period,
-    wrapped,
-)
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, fabricated_height, period
+from raytrace.wave_optics.fabrication import as_pixels, fabricated, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 EXACT = (".npy", ".csv")
@@ -262,7 +253,7 @@ TEXTS = {
     "empty": (".csv", "", r"is empty"),
     "no array": (".npy", "heights", r"is no .npy file"),
     "no picture": (".png", "heights", r"cannot be read as a picture"),
-    "another suffix": (".obj", "x", r"the suffix '.obj' names no format of height maps; expected one of .npy"),
+    "another suffix": (".obj", "x", r"the suffix '.obj' is unknown; expected a height map, one of .npy"),
     "no suffix": ("", "x", r"has no suffix"),
 }
 

@@ -10,21 +10,8 @@ from problems import generator, number
 
 import raytrace as rt
 from raytrace.materials.catalogs import find_glass
-from raytrace.wave_optics.element import (
-    Element,
-    EvenPowers,
-    Pixels,
-    Rings,
-    Zernike,
-    as_pixels,
-    as_rings,
-    fabricated,
-    height,
-    height_range,
-    period,
-    with_tolerance,
-    wrapped,
-)
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
+from raytrace.wave_optics.fabrication import as_pixels, as_rings, fabricated, height_range, with_tolerance, wrapped
 
 SILICA = find_glass("F_SILICA")
 

@@ -14,7 +14,8 @@ from raytrace.psf_models.dft import integrate, phasor, sub_pixels
 from raytrace.wave_optics import mixed, propagation
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.wave_optics.fabrication import as_pixels, wrapped
 from raytrace.wave_optics.plan import plan, spread
 from raytrace.wave_optics.scene import aperture, millimetres, residual
 

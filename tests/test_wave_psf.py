@@ -184,7 +184,7 @@ def test_scenes_that_make_no_sense_are_refused(change, message):
 
 
 def test_a_window_that_is_not_square():
-    """Rows and columns are told apart: a wide window holds the middle of a square one."""
+    """Rows and columns differ: a wide window holds the middle of a square one."""
     element = (lens(), Element(Zernike(vector(0, 0, 0, 0, 1e-4, 2e-4, 1e-4)), scalar(R), PLASTIC))
     square, wide = psf(scene(*element, size=20), samples=160), psf(scene(*element, size=(8, 20)), samples=160)
     assert wide.kernel.shape == (1, 1, 8, 20)

@@ -10,8 +10,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from raytrace.plotting.images import show_image
-from raytrace.plotting.style import GREY, LOOKS, new_figure, styled
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
+
+#: How the models are drawn: colour and dashes, to be told apart in print.
+LOOKS = {
+    "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
+    "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),
+    "gaussian": (FIELD_COLOURS[2], "solid"),
+    "drt": (INK, (0, (6, 1.5, 1, 1.5))),
+    "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
+}
 
 #: Object distances in m that may be marked on an axis, in order of preference.
 _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 45, 12, 1000, *range(11, 50))

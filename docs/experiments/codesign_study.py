@@ -16,7 +16,17 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.codesign import STEPS, TEST_EPOCH, Batch, Optimum, Outcome, batch, closed_form, outcome
+from raytrace.imaging.codesign import (
+    STEPS,
+    TEST_EPOCH,
+    Batch,
+    Optimum,
+    Outcome,
+    batch,
+    closed_form,
+    freeze_lens,
+    outcome,
+)
 from raytrace.imaging.codesign import camera as camera_at_start
 from raytrace.imaging.image import blur
 from raytrace.imaging.pictures import Pictures
@@ -180,8 +190,7 @@ def trained(lens: Lens, settings: CodesignSettings, folder: Path) -> Camera:
     camera = camera_at_start(lens, settings)
     checkpoint = Path(folder) / STEPS[1] / "checkpoint.pt"
     load_state(camera, read_state(checkpoint), checkpoint)
-    camera.variables.requires_grad_(False)
-    camera.use("drt")
+    freeze_lens(camera, settings)
     return camera
 
 

@@ -35,9 +35,8 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
+from raytrace.plotting.style import GREY, array, field_colour, framed, new_figure, number_text, styled
 from raytrace.plotting.style import save as save_figure
-from raytrace.plotting.wave import framed
 from raytrace.psf_models.dft import phasor
 from raytrace.settings import Settings
 from raytrace.shards import torch_threads

@@ -28,7 +28,7 @@ from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import add_options, defaults_of, documents, picture_options, picture_words, words
 from raytrace.cli.wave_design import LIMIT, PICTURES
-from raytrace.cli.wave_design_run import LEAVES, WIDE, learn, training_pictures
+from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
 from raytrace.experiments import publish
 from raytrace.files import table as csv
 from raytrace.imaging.image import blur_layers, depth_masks
@@ -36,12 +36,13 @@ from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
 from raytrace.imaging.restoration import depth_invariant_wiener, psnr, restore
 from raytrace.imaging.wave_camera import (
     FILTERS,
-    Judged,
+    ElementReport,
     Quality,
     WaveCameraConfig,
     depth_text,
     expected_error,
     kernels,
+    mark_depths,
     mirrored,
     periodic,
     quality,
@@ -50,12 +51,11 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, picture
-from raytrace.plotting.images import show_image
-from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
-from raytrace.plotting.wave_design import mark_depths
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import Aim, aim, baseline
-from raytrace.wave_optics.element import Element, height_range
+from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.fabrication import height_range
 from raytrace.words import did_you_mean
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")
@@ -131,17 +131,17 @@ class Content:
 
 
 def elements_of(
-    rows: Iterable[str], world: WaveCameraConfig, S: Tensor, *, learned: Mapping[str, Sequence[Element]]
+    rows: Iterable[str], config: WaveCameraConfig, S: Tensor, *, learned: Mapping[str, Sequence[Element]]
 ) -> dict[str, Sequence[Element]]:
     """The elements of rows, in the order of the table: learned ones as given, those that are not there left out.
 
     Cubic plates have the strength that is best for pictures of spectrum S (n, n) on the PMMA lens, searched once.
     """
-    made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
+    made_for = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
     named = [name for name in ROWS if name in set(rows)]
     options = {}
     if any(name.startswith("cubic") for name in named):
-        options = {"strength": min(STRENGTHS, key=lambda own: _error_of_cubic(own, made_for, world, S))}
+        options = {"strength": min(STRENGTHS, key=lambda own: _error_of_cubic(own, made_for, config, S))}
     found = {}
     for name in named:
         if ROWS[name].learning is None:
@@ -151,26 +151,24 @@ def elements_of(
     return found
 
 
-def _error_of_cubic(strength: float, made_for: Aim, world: WaveCameraConfig, S: Tensor) -> float:
+def _error_of_cubic(strength: float, made_for: Aim, config: WaveCameraConfig, S: Tensor) -> float:
     elements = baseline("cubic-refractive", made_for, strength=strength)
-    return float(expected_error(transfer(kernels(elements, world), S.shape[-1]), S, world.noise))
+    return float(expected_error(transfer(kernels(elements, config), S.shape[-1]), S, config.noise))
 
 
 def table_of(
     contents: Sequence[Content],
     elements: Mapping[str, Sequence[Element]],
-    world: WaveCameraConfig,
+    config: WaveCameraConfig,
     *,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> dict[str, dict[str, Quality]]:
     """Quality by content and row, of the elements of each row."""
     found: dict[str, dict[str, Quality]] = {content.name: {} for content in contents}
     for name in progress(list(elements)):
-        own = kernels(elements[name], world)
+        own = kernels(elements[name], config)
         for content in contents:
-            found[content.name][name] = quality(
-                elements[name], world, train=content.train, test=content.test, found=own
-            )
+            found[content.name][name] = quality(elements[name], config, train=content.train, test=content.test, psf=own)
     return found
 
 
@@ -219,33 +217,33 @@ def coloured_leaves(size: int, *, colours: int = 3, seed: int = 0) -> np.ndarray
 
 @torch.no_grad()
 def flat(
-    elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, seed: int = 0
+    elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *, seed: int = 0
 ) -> tuple[dict[str, dict[str, tuple[np.ndarray, float]]], np.ndarray]:
     """A scene at the nearest, the middle and the farthest depth: by row and depth what is restored, with its PSNR; and
     the scene.
     """
     size, part = 512, slice(40, 200)
-    leaves = coloured_leaves(size // 2, colours=len(world.wavelengths), seed=seed)
+    leaves = coloured_leaves(size // 2, colours=len(config.wavelengths), seed=seed)
     picture = torch.as_tensor(np.stack([mirrored(colour) for colour in leaves]))
-    S, noise = spectrum(picture), noise_like(picture, world, seed)
+    S, noise = spectrum(picture), noise_like(picture, config, seed)
     found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
     for name, own in elements.items():
-        H = transfer(kernels(own, world), size)
-        G = depth_invariant_wiener(H, S, world.noise)
+        H = transfer(kernels(own, config), size)
+        G = depth_invariant_wiener(H, S, config.noise)
         found[name] = {}
         for d in (0, len(H) // 2, len(H) - 1):
             estimate = torch.fft.ifft2(torch.fft.fft2(torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise) * G)
             ratio = float(psnr((estimate.real - picture).square().mean()))
-            found[name][depth_text(world.depths[d])] = shown(estimate.real[:, part, part]), ratio
+            found[name][depth_text(config.depths[d])] = shown(estimate.real[:, part, part]), ratio
     return found, shown(picture[:, part, part])
 
 
 @torch.no_grad()
-def deep(elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, seed: int = 0) -> Deep:
+def deep(elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *, seed: int = 0) -> Deep:
     """Leaves on a floor from the nearest depth, below, to the farthest, above; near layers hide far ones."""
-    size, half = 320, world.size // 2
-    picture = torch.as_tensor(coloured_leaves(size + 2 * half, colours=len(world.wavelengths), seed=seed))
-    dioptres = [1e3 / depth for depth in world.depths]
+    size, half = 320, config.size // 2
+    picture = torch.as_tensor(coloured_leaves(size + 2 * half, colours=len(config.wavelengths), seed=seed))
+    dioptres = [1e3 / depth for depth in config.depths]
     rise = torch.linspace(min(dioptres), max(dioptres), size, dtype=picture.dtype)
     depth = torch.cat([rise.new_full((half,), float(rise[0])), rise, rise.new_full((half,), float(rise[-1]))])
     depth = depth[:, None].expand(picture.shape[1:])
@@ -255,21 +253,21 @@ def deep(elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, 
     seen, back = {}, {}
     depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
     for name, own in elements.items():
-        found = kernels(own, world, depths=depths)
+        found = kernels(own, config, depths=depths)
         # What misses the window comes back as haze, even over the scene.
         haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
         image = blur_layers(picture, masks, found.kernel) + haze
-        image = image + noise_like(image, world, seed)
-        G = depth_invariant_wiener(transfer(found, picture.shape[-1]), S, world.noise)
+        image = image + noise_like(image, config, seed)
+        G = depth_invariant_wiener(transfer(found, picture.shape[-1]), S, config.noise)
         estimate = restore(image, G, boundary="taper")
         seen[name] = shown(image)
         back[name] = shown(estimate), float(psnr((estimate - truth).square().mean()))
     return Deep(shown(truth), depth[half:-half, half:-half].numpy(), seen, back)
 
 
-def noise_like(like: Tensor, world: WaveCameraConfig, seed: int) -> Tensor:
+def noise_like(like: Tensor, config: WaveCameraConfig, seed: int) -> Tensor:
     random = torch.Generator().manual_seed(seed)
-    return world.noise * torch.randn(like.shape, generator=random, dtype=like.dtype)
+    return config.noise * torch.randn(like.shape, generator=random, dtype=like.dtype)
 
 
 def shown(picture: Tensor) -> np.ndarray:
@@ -280,16 +278,16 @@ def shown(picture: Tensor) -> np.ndarray:
 
 
 @styled
-def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: WaveCameraConfig) -> Figure:
+def depth_figure(found: Mapping[str, Mapping[str, Quality]], config: WaveCameraConfig) -> Figure:
     """PSNR behind the depth-invariant filter over depth in dioptres, a panel for each content, a line for each row."""
     figure = new_figure(3.1 * len(found) + 1.9, 3.8)
     axes = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
-    dioptres = [1e3 / depth for depth in world.depths]
+    dioptres = [1e3 / depth for depth in config.depths]
     for panel, (content, rows) in zip(axes, found.items(), strict=True):
         for name, own in rows.items():
             panel.plot(dioptres, own.by_depth["blind"], label=ROWS[name].title, **look(name, list(rows)))
         panel.set(title=content, xlabel="object distance")
-        mark_depths(panel, world)
+        mark_depths(panel, config)
     axes[0].set_ylabel("PSNR, depth-invariant filter (dB)")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
@@ -450,16 +448,16 @@ def edof(arguments: argparse.Namespace) -> Table:
             meant = did_you_mean(unknown[0], ROWS)
             raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(ROWS)}{meant}")
     usual = (name for name, row in ROWS.items() if not row.is_extra)
-    rows, world = [*(arguments.rows or usual), *(arguments.also or ())], WaveCameraConfig()
+    rows, config = [*(arguments.rows or usual), *(arguments.also or ())], WaveCameraConfig()
     contents, train = contents_of(arguments)
-    learned = _learned(arguments, rows, world, train)
-    elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
-    found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
+    learned = _learned(arguments, rows, config, train)
+    elements = elements_of(rows, config, spectrum(contents[0].train), learned=learned)
+    found = table_of(contents, elements, config, progress=lambda given: progress(given, "row"))
     if arguments.docs:
-        drawn = _figures(found, elements, world, arguments.seed or 0)
+        drawn = _figures(found, elements, config, arguments.seed or 0)
         named = [name for name in CAPTIONS if name in drawn]
         single = {title_of(name): own[0] for name, own in elements.items() if name in learned and len(own) == 1}
-        parts = _parts(Table(found), contents, world, _command(arguments), named, single)
+        parts = _parts(Table(found), contents, config, _command(arguments), named, single)
         rows = {"table.csv": csv(records(found), floats=lambda number: round(number, 3))}
         publish(Path(arguments.docs) / "wave_edof.md", "wave", parts, tables=rows, figures=drawn)
     return Table(found)
@@ -478,7 +476,7 @@ def contents_of(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]
 
 
 def _learned(
-    arguments: argparse.Namespace, rows: Sequence[str], world: WaveCameraConfig, train: Pictures
+    arguments: argparse.Namespace, rows: Sequence[str], config: WaveCameraConfig, train: Pictures
 ) -> dict[str, tuple[Element, ...]]:
     """The learned ones of the rows."""
     common = {name: getattr(arguments, name) for name in ("steps", "starts", "seed")}
@@ -490,7 +488,7 @@ def _learned(
         for name, learning in asked.items():
             folder = Path(arguments.folder or unkept) / name
             with torch.enable_grad():
-                camera = learn(DesignSettings.of(common, **learning), world, train, folder, ROWS[name].title)
+                camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
             found[name] = camera.variables()
     return found
 
@@ -502,19 +500,21 @@ def _command(arguments: argparse.Namespace) -> str:
     return " ".join(["python docs/experiments/wave_edof.py", *options, "-o FOLDER --docs docs"])
 
 
-def _figures(found, elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, seed: int) -> dict:
+def _figures(found, elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, seed: int) -> dict:
     """Figures of the page, by file name. Only dead leaves are shown."""
 
     first = next(iter(found.values()))
-    made = {"depth.png": depth_figure(found, world)}
+    made = {"depth.png": depth_figure(found, config)}
     if "fresnel" in first:
         made["gain.png"] = gain_figure(found)
     for name in ("learned", "learned-smooth"):
         if name in elements:
-            made[f"{name}.png"] = Judged(elements[name], world, kernels(elements[name], world), first[name]).plot()
+            made[f"{name}.png"] = ElementReport(
+                elements[name], config, kernels(elements[name], config), first[name]
+            ).plot()
     shown = {name: elements[name] for name in _SHOWN if name in elements}
-    made["scene.png"] = scene_figure(*flat(shown, world, seed=seed))
-    made["deep.png"] = deep_figure(deep(shown, world, seed=seed))
+    made["scene.png"] = scene_figure(*flat(shown, config, seed=seed))
+    made["deep.png"] = deep_figure(deep(shown, config, seed=seed))
     return made
 
 
@@ -528,23 +528,23 @@ def heights_of(elements: Mapping[str, Element]) -> str:
 def _parts(
     table: Table,
     given: Sequence[Content],
-    world: WaveCameraConfig,
+    config: WaveCameraConfig,
     command: str,
     figures: Sequence[str],
     learned: Mapping[str, Element],
 ) -> list[str]:
-    depths = ", ".join(map(depth_text, world.depths))
-    colours = ", ".join(f"{1e3 * w:.0f}" for w in world.wavelengths)
+    depths = ", ".join(map(depth_text, config.depths))
+    colours = ", ".join(f"{1e3 * w:.0f}" for w in config.wavelengths)
     judged = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
     others = ", ".join(str(len(one.train)) for one in given)
     contents = [(f"## {name[0].upper()}{name[1:]}", table.markdown(name)) for name in table.found]
     return [
         "# Extended depth of field with one phase element",
         f"    {command}",
-        f"Aperture {2 * world.radius:g} mm, sensor at {world.sensor_distance:g} mm, {colours} nm, objects at {depths}; "
-        f"pixels of {1e3 * world.pixel:g} µm, kernels of {world.size} × {world.size} pixels, light beyond them spread "
-        f"evenly as haze; noise of standard deviation {world.noise:g}. All lenses are made for "
-        f"{world.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
+        f"Aperture {2 * config.radius:g} mm, sensor at {config.sensor_distance:g} mm, {colours} nm, objects at "
+        f"{depths}; pixels of {1e3 * config.pixel:g} µm, kernels of {config.size} × {config.size} pixels, light beyond "
+        f"them spread evenly as haze; noise of standard deviation {config.noise:g}. All lenses are made for "
+        f"{config.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
         f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
         *(part for parts in contents for part in parts),
         "PSNR in dB, mean over depths, of errors pooled over pictures and as the mean of the PSNRs of single pictures; "

@@ -42,7 +42,7 @@ from raytrace.cli.settings import (
     words,
 )
 from raytrace.cli.wave_design import LIMIT, PICTURES
-from raytrace.cli.wave_design_run import learn
+from raytrace.cli.wave_run import learn
 from raytrace.experiments import Store, cases, publish, published
 from raytrace.files import table
 from raytrace.imaging.pictures import Pictures, draws
@@ -66,8 +66,9 @@ from raytrace.plotting.style import INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, Rings, fabricated, is_flat
+from raytrace.wave_optics.element import Element, Rings, is_flat
 from raytrace.wave_optics.element_files import SMOOTH, read_element, write_element
+from raytrace.wave_optics.fabrication import fabricated
 from raytrace.words import did_you_mean
 
 
@@ -107,7 +108,7 @@ class Unit:
         more = {"seed": self.start, "starts": 1, "steps": steps, "noise": (self.noise, self.noise)}
         return DesignSettings.of({}, **learning, **more)
 
-    def world(self) -> WaveCameraConfig:
+    def config(self) -> WaveCameraConfig:
         return dataclasses.replace(WaveCameraConfig(), noise=self.noise)
 
     def folder(self, root: Path) -> Path:
@@ -180,12 +181,12 @@ Errors = dict[str, Tensor]
 
 
 @torch.no_grad()
-def errors_of(H: Tensor, world: WaveCameraConfig, bank: Bank) -> Errors:
+def errors_of(H: Tensor, config: WaveCameraConfig, bank: Bank) -> Errors:
     """Of each picture at every depth in every colour, expected over noise, of transfer functions H (D, W, n, n)."""
-    at_design = H[world.depths.index(world.design)]
-    gamma = best_gamma(H, bank.spectrum, world.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, bank.spectrum, world.noise)}
-    return {name: errors_of_pictures(H, G, world.noise, bank.powers) for name, G in filters.items()}
+    at_design = H[config.depths.index(config.design)]
+    gamma = best_gamma(H, bank.spectrum, config.noise, at_design)
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, bank.spectrum, config.noise)}
+    return {name: errors_of_pictures(H, G, config.noise, bank.powers) for name, G in filters.items()}
 
 
 def pooled_psnr(errors: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -266,8 +267,8 @@ def baselines(
     rows: Sequence[str], noises: Sequence[float], strengths: Mapping[float, float]
 ) -> Iterator[tuple[str, tuple[Element, ...], list[float]]]:
     """Baselines of the rows, and the noises that each is for; strengths: of cubic plates, by noise."""
-    world = WaveCameraConfig()
-    made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
+    config = WaveCameraConfig()
+    made_for = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
     for row in rows:
         if ROWS[row].learning:
             continue
@@ -282,11 +283,11 @@ def baselines(
 @torch.no_grad()
 def best_strengths(noises: Sequence[float], S: Tensor) -> dict[float, float]:
     """The strength of cubic plates on the PMMA lens that is best for pictures of spectrum S (n, n), by noise."""
-    world = WaveCameraConfig()
-    made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
+    config = WaveCameraConfig()
+    made_for = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
     found = {}
     for strength in STRENGTHS:
-        H = transfer(kernels(baseline("cubic-refractive", made_for, strength=strength), world), S.shape[-1])
+        H = transfer(kernels(baseline("cubic-refractive", made_for, strength=strength), config), S.shape[-1])
         found[strength] = {noise: float(depth_invariant_error(H, S, noise).mean()) for noise in noises}
     return {noise: min(STRENGTHS, key=lambda own: found[own][noise]) for noise in noises}
 
@@ -406,7 +407,7 @@ def _rows(asked: Sequence[str] | None) -> list[str]:
 def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> WaveCamera:
     """The camera of a unit, learned as far as is left."""
     label = f"{ROWS[unit.row].title}, noise {unit.noise:g}, start {unit.start}"
-    return learn(unit.settings(settings.steps), unit.world(), train, unit.folder(root), label)
+    return learn(unit.settings(settings.steps), unit.config(), train, unit.folder(root), label)
 
 
 class Kept:
@@ -428,12 +429,12 @@ class Kept:
             self._forms[mark] = ClosedForm((whole,), WaveCameraConfig(), S)
         return self._forms[mark].transfer(elements)
 
-    def find(self, name: str, world: WaveCameraConfig, make: Callable[[], Tensor]) -> dict[str, Errors]:
+    def find(self, name: str, config: WaveCameraConfig, make: Callable[[], Tensor]) -> dict[str, Errors]:
         """Errors by content of transfer functions, computed only if they are not stored."""
 
         def arrays() -> dict[str, np.ndarray]:
             H = make()
-            found = {bank.name: errors_of(H, world, bank) for bank in self.banks}
+            found = {bank.name: errors_of(H, config, bank) for bank in self.banks}
             return {f"{content}/{filter}": e.numpy() for content, own in found.items() for filter, e in own.items()}
 
         stored = self.store.arrays(name, arrays)
@@ -459,8 +460,8 @@ def judge_baselines(
             return made[0]
 
         for own in noises:
-            world = dataclasses.replace(WaveCameraConfig(), noise=own)
-            found[row, own] = kept.find(f"{row}-{own:g}", world, H)
+            config = dataclasses.replace(WaveCameraConfig(), noise=own)
+            found[row, own] = kept.find(f"{row}-{own:g}", config, H)
     return found
 
 
@@ -488,8 +489,8 @@ def judge_files(
     for name, element in elements.items():
         mark, H = mark_of_elements([element]), functools.cache(lambda element=element: kept.transfer((element,)))
         for own in settings.noise:
-            world = dataclasses.replace(WaveCameraConfig(), noise=own)
-            found[name, own] = kept.find(f"file-{mark}-{own:g}", world, H)
+            config = dataclasses.replace(WaveCameraConfig(), noise=own)
+            found[name, own] = kept.find(f"file-{mark}-{own:g}", config, H)
     return found
 
 
@@ -523,7 +524,7 @@ def judge_learned(
     camera = learn_unit(unit, settings, train, root)
     with torch.no_grad():
         elements = detached(camera.variables())
-        found = kept.find(name, unit.world(), lambda: kept.transfer(elements))
+        found = kept.find(name, unit.config(), lambda: kept.transfer(elements))
         return kept.store.number(name, lambda: float(camera.expected(elements))), found
 
 

@@ -1,8 +1,11 @@
 """Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
 
+import math
+
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import SAGITTAL, chart, drawn_at_least, finished, over_field
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import (
     NothingToShow,
@@ -15,16 +18,19 @@ from raytrace.analysis.setting import (
     shown,
     unvignetted,
 )
+from raytrace.analysis.spot_diagram import airy_radius
+from raytrace.maths.dual import divide
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import FAINT, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import is_at_infinity
 from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
 
-_NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
-_NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration
+NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
+NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration
 
 
 @value
@@ -46,7 +52,6 @@ class Distortion(OverField):
     valid: Tensor
 
     COMMAND = "distortion"
-    FIGURE = "plotting.analysis.distortion_curves"
 
     def columns(self) -> dict[str, Tensor]:
         relative = {"f_tan_percent": self.f_tan, "f_theta_percent": self.f_theta}
@@ -56,6 +61,20 @@ class Distortion(OverField):
 
     def at(self, fields: Tensor) -> "Distortion":
         return _distortion(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Distortion in percent over the field: against f tan θ, and against f θ where the object is at infinity."""
+        curves = self.drawn()
+        infinite = curves.f_theta is not None
+        ideals = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta} if infinite else {"Height": curves.f_tan}
+        figure = new_figure(3.1 * len(ideals) + 0.9, 4.2)
+        panels = figure.subplots(1, len(ideals), squeeze=False)[0]
+        for panel, (name, values) in zip(panels, ideals.items(), strict=True):
+            over_field(panel, curves, 100 * values)
+            panel.set_xlabel(f"{name} distortion (%)")
+            drawn_at_least([panel], 1e-6, "x")
+        return finished(panels[-1], curves, "distortion", len(curves.wavelengths))
 
 
 @value
@@ -72,7 +91,6 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    FIGURE = "plotting.analysis.curvature_curves"
     UNIT = "mm"
 
     def columns(self) -> dict[str, Tensor]:
@@ -81,6 +99,16 @@ class FieldCurvature(OverField):
 
     def at(self, fields: Tensor) -> "FieldCurvature":
         return _field_curvature(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Foci of close rays over the field: tangential solid, sagittal dashed."""
+        curves = self.drawn()
+        _, panel = chart(4.6, 4.4, "focus from the sensor (mm)", "")
+        over_field(panel, curves, curves.tangential, suffix=" T", dashes=("solid",))
+        over_field(panel, curves, curves.sagittal, suffix=" S", dashes=(SAGITTAL,))
+        drawn_at_least([panel], 1e-6, "x")
+        return finished(panel, curves, "field curvature", 2 if len(curves.wavelengths) < 3 else 3)
 
 
 @value
@@ -97,13 +125,24 @@ class LateralColour(OverField):
     valid: Tensor
 
     COMMAND = "lateral-colour"
-    FIGURE = "plotting.analysis.lateral_curves"
 
     def columns(self) -> dict[str, Tensor]:
         return {**self.heads(wavelength=self.wavelengths), "shift": masked(self.shift, self.valid)}
 
     def at(self, fields: Tensor) -> "LateralColour":
         return _lateral_colour(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Chief-ray heights less that of the primary wavelength over the field; its Airy radius is grey."""
+        curves = self.drawn()
+        _, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
+        if math.isfinite(airy := 1e3 * float(airy_radius(curves.lens))):
+            panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
+        over_field(panel, curves, 1e3 * curves.shift)
+        if not panel.patches:
+            drawn_at_least([panel], 1e-3, "x")
+        return finished(panel, curves, "lateral colour", 4)
 
 
 def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11) -> Distortion:
@@ -127,8 +166,8 @@ def _distortion(lens: Lens, fields: Tensor) -> Distortion:
     height, valid = _height(described, angles, fields, each_axis=True)
     reach = safe_sqrt(dot_2(close_extent, close_extent))
     scale = _height(described, close_angles, close, each_axis=True)[0] / reach[:, None]
-    f_tan = _relative(height, scale * length[:, None])
-    f_theta = _relative(height, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
+    f_tan = relative_error(height, scale * length[:, None])
+    f_theta = relative_error(height, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
     return Distortion(lens, fields, height, f_tan, f_theta, valid & found[:, None])
 
 
@@ -161,7 +200,7 @@ def _field_curvature(lens: Lens, fields: Tensor) -> FieldCurvature:
 def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Tangential and sagittal foci (F, W) of fields (2, F) in one meridian (2, 1), and whether they exist."""
     across = torch.stack([along[1], -along[0]])
-    pupil = torch.cat([along, -along, across, -across], 1) * _NEAR_CHIEF
+    pupil = torch.cat([along, -along, across, -across], 1) * NEAR_CHIEF
     rays = image_rays(lens, pupil, fields=fields)
     slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
     bent = is_bent(lens)
@@ -174,7 +213,7 @@ def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tens
             opening = torch.hypot(*opening)
         else:
             apart, opening = (dot_2(part, section[:, :, None]) for part in (apart, opening))
-            foci.append(-safe_divide(apart, opening))
+            foci.append(focus_of_close_rays(apart, opening))
         exist.append(opening.abs() > 8 * torch.finfo(opening.dtype).eps)
     tangential, sagittal = (torch.where(there, at, torch.nan) for there, at in zip(exist, foci, strict=True))
     return tangential, sagittal, (rays.valid | kept).all(-1) & (exist[0] | exist[1])
@@ -208,9 +247,9 @@ def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
     """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they tell the scale of the image."""
     largest = field_range(lens, 2)[:, 1:]
     if not is_bent(lens):
-        return largest * _NEAR_AXIS
+        return largest * NEAR_AXIS
     along = torch.where((fields == 0).all(0), _meridian(largest), _meridian(fields))
-    return along * torch.hypot(*largest) * _NEAR_AXIS
+    return along * torch.hypot(*largest) * NEAR_AXIS
 
 
 def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = False) -> tuple[Tensor, Tensor]:
@@ -222,7 +261,7 @@ def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = Fals
     points, valid = chief_points(lens, fields, lens.wavelengths)
     if is_bent(lens):
         meridian = _meridian(along)
-        close = meridian * torch.hypot(*fields).amax() * _NEAR_AXIS
+        close = meridian * torch.hypot(*fields).amax() * NEAR_AXIS
         axis, _ = chief_points(lens, torch.zeros_like(fields[:, :1]), lens.wavelengths)
         way = chief_points(lens, close, lens.wavelengths)[0] - axis
         side = torch.where(dot_2(way, meridian[:, :, None]).detach() < 0, -1.0, 1.0)
@@ -240,5 +279,11 @@ def _meridian(fields: Tensor) -> Tensor:
     return torch.stack([safe_divide(side * x, length), safe_divide(side * y, length)])
 
 
-def _relative(height: Tensor, ideal: Tensor) -> Tensor:
-    return safe_divide(height - ideal, ideal)
+def relative_error(height, ideal):
+    """height/ideal - 1 of tensors or dual numbers: distortion."""
+    return divide(height - ideal, ideal)
+
+
+def focus_of_close_rays(apart, opening):
+    """mm from the sensor to where two close rays meet, -Δx/Δm, m = (L, M)/N, along one section; of any number type."""
+    return -divide(apart, opening)

@@ -3,9 +3,11 @@
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import chart, drawn_at_least, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
 from raytrace.maths.value import value
+from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order
 
@@ -23,7 +25,6 @@ class ChromaticFocalShift(Analysis):
     depth_of_focus: Tensor
 
     COMMAND = "chromatic-focal-shift"
-    FIGURE = "plotting.analysis.chromatic_curve"
     EVERY = 10
 
     def columns(self) -> dict[str, Tensor]:
@@ -32,6 +33,22 @@ class ChromaticFocalShift(Analysis):
     def about(self) -> dict[str, float]:
         extent = self.shift.max() - self.shift.min()
         return {"largest_shift": float(extent), "depth_of_focus": float(self.depth_of_focus)}
+
+    @styled
+    def draw(self):
+        """The focus over wavelength, drawn sideways, between the limits of a quarter wave."""
+        _, panel = chart(4.2, 4.4, "paraxial focus, from that of the primary wavelength (mm)", "wavelength (µm)")
+        places, shift, depth = array(self.wavelength), array(self.shift), float(self.depth_of_focus)
+        limits = f"±{1e3 * depth:.3g} µm: λ/4 of wavefront"
+        panel.axvspan(-depth, depth, color=FAINT, alpha=0.45, linewidth=0, label=limits)
+        for low, high, a, b in zip(places, places[1:], shift, shift[1:], strict=False):
+            panel.plot([a, b], [low, high], color=wavelength_colours([0.5 * (low + high)])[0], linewidth=2.0)
+        panel.plot(shift, places, color=INK, linewidth=0.4, zorder=1, label="paraxial focus")
+        panel.axvline(0, color=GREY, linewidth=0.6)
+        panel.set_ylim(places[0], places[-1])
+        drawn_at_least([panel], 1e-6, "x")
+        total = number_text(1e3 * float(shift.max() - shift.min()), 3)
+        return finished(panel, self, f"chromatic focal shift, {total} µm in all", 1)
 
 
 def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: int = 101) -> ChromaticFocalShift:

@@ -12,6 +12,8 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
+from raytrace.plotting.style import array, styled
+from raytrace.psf_models.figure import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
@@ -104,8 +106,6 @@ class Comparison(Result):
     models: tuple[str, ...]
     abilities: Abilities | None = None
 
-    FIGURE = "plotting.psf.model_grid"
-
     @property
     def sigma(self) -> Tensor:
         """σ (M, D) mm of each kernel along x or y, before pixels: √((σ_x² + σ_y²)/2).
@@ -173,6 +173,34 @@ class Comparison(Result):
             cells = (f"{1000 * s:>8.3f} {d:>6.3f} {e:>8.1e}" for s, d, e in zip(*row, strict=True))
             said.append(f"{name:>14} " + " ".join(cells))
         return "\n".join([*said, *([] if self.abilities is None else [str(self.abilities)])])
+
+    @styled
+    def draw(self, *, log: bool = False):
+        """Kernels over object distance (columns) and model (rows, with the number of its rays).
+
+        Below each kernel: its energy inside the window, and its relative L1 difference from the last row.
+        log: four decades of brightness below the peak.
+        """
+        kernels = [array(one.kernel)[:, 0] for one in self.psfs]
+        notes = [
+            [
+                f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if one is not kernels[-1] else "")
+                for k, d in zip(one, row, strict=True)
+            ]
+            for one, row in zip(kernels, array(self.difference), strict=True)
+        ]
+        labels = [
+            f"{name}\n" + (f"({one.rays} rays)" if one.rays else "")
+            for name, one in zip(self.models, self.psfs, strict=True)
+        ]
+        grid = self.psfs[-1].grid
+        pitch, distances = float(grid.pitch), self.object_distances.tolist()
+        half = 0.5 * pitch * grid.columns
+        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+        title = ": ".join(filter(None, (self.psfs[-1].lens.name, self.sensor)))
+        return worded(
+            figure, title, [window(grid), brightness(log), f"Δ: relative L¹ difference from {self.models[-1]}"]
+        )
 
 
 def compare(

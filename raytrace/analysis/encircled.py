@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import by_field, chart, finished, mark_fields
 from raytrace.analysis.pupil_autocorrelation import ExitPupil, exit_pupil
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
@@ -19,6 +20,7 @@ from raytrace.analysis.setting import (
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, styled
 from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector
 from raytrace.tracing.f_number import axial_f_number
@@ -46,7 +48,6 @@ class EncircledEnergy(Analysis):
     marked: bool = False
 
     COMMAND = "encircled-energy"
-    FIGURE = "plotting.analysis.encircled_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
@@ -54,6 +55,20 @@ class EncircledEnergy(Analysis):
 
     def drawn(self) -> "EncircledEnergy":
         return _encircled(self.lens, self.fields, fine(self.radii), self.geometric)
+
+    @styled
+    def draw(self):
+        """Share of the light over the radius about the centroid. Radii that were asked for are marked."""
+        curves = self.drawn()
+        _, panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
+        radii = 1e3 * array(curves.radii)
+        by_field(panel, curves, radii, share=array(curves.share))
+        if self.marked:
+            mark_fields(panel, 1e3 * array(self.radii), array(self.share))
+        panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
+        panel.set(xlim=(0, radii.max()), ylim=(0, 1.02))
+        light = "geometric" if curves.geometric else "diffraction"
+        return finished(panel, curves, f"{light} encircled energy", 6)
 
 
 def encircled_energy(

@@ -1,13 +1,16 @@
 """Fans: transverse ray aberration and OPD along the two principal sections of the pupil."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import by_wavelength, drawn_at_least, field_labels, finished, ruled, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting
 from raytrace.maths.pupil import fan as pupil_fan
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
@@ -34,7 +37,6 @@ class Fan(Analysis):
     sagittal_valid: Tensor
     quantity: str
 
-    FIGURE = "plotting.analysis.fan_plot"
     EVERY = 5
     COMMAND = property(lambda self: f"{self.quantity}-fan")
     UNIT = property(lambda self: {"ray": "mm", "opd": "waves"}[self.quantity])
@@ -44,6 +46,29 @@ class Fan(Analysis):
         sagittal = masked(self.sagittal, self.sagittal_valid)
         heads = self.heads(wavelength=self.wavelengths, pupil=self.pupil)
         return {**heads, "tangential": tangential, "sagittal": sagittal}
+
+    @styled
+    def draw(self):
+        """A row for each field: the tangential fan on the left, the sagittal one on the right, one scale for all."""
+        labels, ray = field_labels(self), self.quantity == "ray"
+        figure = new_figure(6.6, 1.45 * len(labels) + 1.1)
+        axes = figure.subplots(len(labels), 2, sharex=True, sharey=True, squeeze=False)
+        shown = [seen(self.tangential, self.tangential_valid), seen(self.sagittal, self.sagittal_valid)]
+        for (row, column), panel in np.ndenumerate(axes):
+            values = (1e3 if ray else 1.0) * shown[column][row].T
+            by_wavelength(ruled(panel), self, array(self.pupil), values, linewidth=1.2)
+            panel.axhline(0, color=GREY, linewidth=0.6)
+            panel.axvline(0, color=GREY, linewidth=0.6)
+        for panel, label in zip(axes[:, 0], labels, strict=True):
+            panel.set_ylabel(label)
+        axes[0][0].set_title("tangential" + (": ε$_y$ over pupil y" if ray else ": over pupil y"))
+        axes[0][1].set_title("sagittal" + (": ε$_x$ over pupil x" if ray else ": over pupil x"))
+        for panel in axes[-1]:
+            panel.set_xlim(-1, 1)
+            panel.set_xlabel("pupil coordinate")
+        figure.supylabel("transverse aberration (µm)" if ray else "OPD (waves)", fontsize=8.5)
+        drawn_at_least(axes.flat, 1e-3 if ray else 1e-4, "y")
+        return finished(axes[0][0], self, "ray fans" if ray else "OPD fans", len(self.wavelengths))
 
 
 def ray_fan(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, points: int = 41) -> Fan:

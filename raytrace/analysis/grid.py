@@ -1,8 +1,10 @@
 """Grid distortion: where a square grid of object points lands on the sensor."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import finished, wavelength_label
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import (
     Numbers,
@@ -15,6 +17,7 @@ from raytrace.analysis.setting import (
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
 from raytrace.tracing.spot import chief_points
@@ -40,7 +43,6 @@ class GridDistortion(Analysis):
     valid: Tensor
 
     COMMAND = "distortion-grid"
-    FIGURE = "plotting.analysis.distorted_grid"
 
     def columns(self) -> dict[str, Tensor]:
         (x, y), (ideal_x, ideal_y) = (masked(point, self.valid) for point in (self.actual, self.ideal))
@@ -78,6 +80,22 @@ class GridDistortion(Analysis):
             lines.append(f"distortion in % at {wavelength:g} µm over the grid, largest {100 * largest:.6f} %")
             lines += ["".join(cell(value, ">9.4f") for value in row) for row in grid.flip(0).tolist()]
         return "\n".join(lines)
+
+    @styled
+    def draw(self, *, exaggerate: float = 1.0):
+        """The ideal grid in grey, the real one over it, its distortion exaggerated; of the first wavelength."""
+        ideal, actual = (array(points[:, 0]) for points in (self.ideal, self.actual))
+        actual = np.where(array(self.valid[0]).astype(bool), ideal + exaggerate * (actual - ideal), np.nan)
+        figure = new_figure(4.6, 5.0)
+        panel = figure.add_subplot(aspect="equal")
+        rays = "chief rays" + (f", distortion × {exaggerate:g}" if exaggerate != 1 else "")
+        for points, label, colour, width in ((ideal, "ideal", GREY, 0.8), (actual, rays, field_colour(0), 1.2)):
+            panel.plot(*points, color=colour, linewidth=width)
+            panel.plot(*points.transpose(0, 2, 1), color=colour, linewidth=width)
+            panel.plot([], [], color=colour, linewidth=width, label=label)
+        panel.set(xlabel="x on the sensor (mm)", ylabel="y on the sensor (mm)")
+        largest = number_text(100 * float(self.largest()[0]), 3)
+        return finished(panel, self, f"grid distortion, largest {largest} % ({wavelength_label(self, 0)})", 2)
 
 
 def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11) -> GridDistortion:

@@ -2,15 +2,18 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import chart, few, field_axis, field_name, finished, marks
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, refuse_axis, scene_of, setting, shown, wavelength_shares
 from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, field_colour, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.wavefront import wavefront_of
 
@@ -33,7 +36,6 @@ class RelativeIllumination(OverField):
     marked: bool = False
 
     COMMAND = "relative-illumination"
-    FIGURE = "plotting.analysis.illumination_curve"
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -44,6 +46,23 @@ class RelativeIllumination(OverField):
 
     def at(self, fields: Tensor) -> "RelativeIllumination":
         return _illumination(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Relative illumination over the field, and cos⁴θ where fields are angles. Requested fields are marked."""
+        curves = self.drawn()
+        _, panel = chart(5.4, 3.6, field_name(curves.lens), "relative illumination")
+        order = np.argsort(field_axis(curves), kind="stable")
+        field, values = field_axis(curves)[order], array(curves.illumination)[order]
+        look = {"color": field_colour(0), "linewidth": 1.5, "clip_on": False, "zorder": 3, **few(field)}
+        panel.plot(field, values, label="this lens", **look)
+        if self.marked:
+            marks(panel, field_axis(self), array(self.illumination), field_colour(0))
+        if curves.lens.fields.kind == "angle":
+            fine = np.linspace(0, field.max(), 100)
+            panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":", label="cos⁴θ")
+        panel.set(xlim=(0, field.max() or 1.0), ylim=(0, 1.05 * max(1.0, values.max())))
+        return finished(panel, curves, "relative illumination", 2)
 
 
 def relative_illumination(

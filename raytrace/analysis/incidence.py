@@ -1,13 +1,16 @@
 """Angles of incidence: how steeply the middle and the rim of each field's beam meet every surface and the sensor."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import DASHES, chart, finished, wavelength_label
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setting
 from raytrace.maths.numerics import dot
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, INK, array, field_colour, styled
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
@@ -39,7 +42,6 @@ class Incidence(OverField):
     surfaces: bool = False
 
     COMMAND = "incidence"
-    FIGURE = "plotting.analysis.incidence_curves"
 
     def columns(self) -> dict[str, Tensor]:
         numbers = torch.arange(1, self.angle.shape[-1] + 1, device=self.angle.device)
@@ -57,6 +59,25 @@ class Incidence(OverField):
 
     def at(self, fields: Tensor) -> "Incidence":
         return _incidence(self.lens, fields)
+
+    @styled
+    def draw(self):
+        """Angles at the sensor over the image height, of the first wavelength: the chief ray inside its beam."""
+        curves = self.drawn()
+        _, panel = chart(5.6, 3.8, "image height (mm)", "angle of incidence on the sensor (°)")
+        table = curves.summary()
+        height = array(table["height"][:, 0])
+        order = np.argsort(height)
+        height = height[order]
+        lower, chief, upper = (array(table[name][:, 0])[order] for name in ("lower", "chief", "upper"))
+        panel.fill_between(height, lower, upper, color=field_colour(0), alpha=0.12, linewidth=0, label="beam")
+        panel.plot(height, upper, color=field_colour(0), linewidth=1.2, linestyle=DASHES[1], label="upper rim")
+        panel.plot(height, chief, color=INK, linewidth=1.5, label="chief ray")
+        panel.plot(height, lower, color=field_colour(2), linewidth=1.2, linestyle=DASHES[1], label="lower rim")
+        panel.axhline(0, color=GREY, linewidth=0.6)
+        if len(height) > 1 and np.isfinite(height).any():
+            panel.set_xlim(np.nanmin(height), np.nanmax(height))
+        return finished(panel, curves, f"angles of incidence ({wavelength_label(curves, 0)})", 4)
 
 
 def incidence(

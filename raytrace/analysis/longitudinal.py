@@ -3,11 +3,13 @@
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import by_wavelength, chart, drawn_at_least, finished, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, like
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import warn_of_filling
@@ -29,7 +31,6 @@ class LongitudinalAberration(Analysis):
     valid: Tensor
 
     COMMAND = "longitudinal-aberration"
-    FIGURE = "plotting.analysis.longitudinal_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
@@ -38,6 +39,16 @@ class LongitudinalAberration(Analysis):
             "pupil": axis(self.pupil, 1, 2),
             "crossing": masked(self.crossing, self.valid),
         }
+
+    @styled
+    def draw(self):
+        """Crossings with the axis over the height in the pupil, drawn upwards."""
+        _, panel = chart(4.2, 4.4, "crossing with the axis, from the sensor (mm)", "height in the pupil")
+        by_wavelength(panel, self, seen(self.crossing, self.valid).T, array(self.pupil), linewidth=1.4)
+        panel.axvline(0, color=GREY, linewidth=0.6)
+        panel.set_ylim(0, 1)
+        drawn_at_least([panel], 1e-6, "x")
+        return finished(panel, self, "longitudinal aberration", 3)
 
 
 def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: int = 41) -> LongitudinalAberration:

@@ -3,9 +3,12 @@
 import dataclasses
 import math
 
+import numpy as np
 import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from raytrace.analysis.panels import by_field, chart, finished, mark_fields
 from raytrace.analysis.pupil_autocorrelation import MARGIN, beam_of, exit_pupil, otf, points_needed, polynomials_of
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
@@ -24,12 +27,14 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import axis
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
 
+_SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 _FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
@@ -60,7 +65,6 @@ class Mtf(Analysis):
     marked: bool = False
 
     COMMAND = "mtf"
-    FIGURE = "plotting.analysis.mtf_curves"
     EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
@@ -76,6 +80,21 @@ class Mtf(Analysis):
 
     def __str__(self) -> str:
         return "\n".join([Analysis.__str__(self), *_remarks(self)])
+
+    @styled
+    def draw(self):
+        """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
+        curves = self.drawn()
+        _, panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
+        frequency = array(curves.frequencies)
+        by_field(panel, curves, frequency, tangential=array(curves.tangential), sagittal=array(curves.sagittal))
+        if self.marked:
+            mark_fields(panel, array(self.frequencies), array(self.tangential), array(self.sagittal))
+        if curves.limit is not None:
+            look = {"color": GREY, "linewidth": 1.0, "linestyle": ":"}
+            panel.plot(frequency, array(curves.limit), label="diffraction limit", **look)
+        panel.set(xlim=(0, frequency.max()), ylim=(0, 1.0))
+        return finished(panel, curves, f"{transfer(curves)} MTF", 6)
 
 
 @value
@@ -95,7 +114,6 @@ class ThroughFocusMtf(Analysis):
     by_rays: Tensor
 
     COMMAND = "mtf"
-    FIGURE = "plotting.analysis.mtf_through_focus_curves"
 
     def about(self) -> dict:
         return {"transfer": transfer(self)}
@@ -112,6 +130,20 @@ class ThroughFocusMtf(Analysis):
             "tangential": self.tangential,
             "sagittal": self.sagittal,
         }
+
+    @styled
+    def draw(self):
+        """Modulation at one frequency over the sensor distance, a smooth curve through the places computed."""
+        modulation = f"modulation at {number_text(float(self.frequency), 4)} cycles/mm"
+        _, panel = chart(6.4, 4.0, "sensor distance (mm)", modulation)
+        distance = array(self.sensor_distances)
+        fine = np.linspace(distance.min(), distance.max(), _SMOOTH)
+        curves = {"tangential": self.tangential, "sagittal": self.sagittal}
+        smooth = {name: CubicSpline(distance, array(curve))(fine).T.clip(0, 1) for name, curve in curves.items()}
+        by_field(panel, self, fine, **smooth)
+        panel.axvline(float(self.lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
+        panel.set(xlim=(distance.min(), distance.max()), ylim=(0, 1.0))
+        return finished(panel, self, f"{transfer(self)} MTF through focus", 6)
 
 
 def mtf(
@@ -168,16 +200,17 @@ def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Te
     if geometric:
         return *_geometric(lens, field, frequencies), True
     scene = dataclasses.replace(scene_of(lens, field), memo=Memo(1))  # the beam is aimed and traced once
+    shares = wavelength_shares(lens)
     sheared = _sheared(scene, frequencies)
     if sheared is not None:
         return *sheared, False
     try:
-        return *_gridded(scene, frequencies, None if geometric is False else _SECONDS), False
+        return *mtf_on_grid(scene, frequencies, shares, seconds=None if geometric is False else _SECONDS), False
     except TooManyPoints:
         if geometric is False:
             raise
     both = _where_diffraction_is_no_matter(scene, frequencies)
-    return (*_gridded(scene, frequencies, None), False) if both is None else (*both, True)
+    return (*mtf_on_grid(scene, frequencies, shares), False) if both is None else (*both, True)
 
 
 def _where_diffraction_is_no_matter(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -251,10 +284,13 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * axial_f_number(lens))
 
 
-def _gridded(scene: Scene, frequencies: Tensor, seconds: float | None) -> tuple[Tensor, Tensor]:
-    """MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs; seconds: see `exit_pupil`."""
-    pupil = exit_pupil(scene, seconds=seconds)
-    shift, weights = _from_primary(scene.lens, pupil.centre), wavelength_shares(scene.lens) * pupil.light
+def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tuple[Tensor, Tensor]:
+    """Tangential and sagittal MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs.
+
+    shares: (W,) of the wavelengths of the scene; grid: options of `exit_pupil`.
+    """
+    pupil = exit_pupil(scene, **grid)
+    shift, weights = pupil.centre - pupil.centre[..., :1], shares * pupil.light
     sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
     otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
     tangential, sagittal = (modulation(otf, frequencies, place, weights) for otf, place in otfs)

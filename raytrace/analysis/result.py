@@ -63,11 +63,6 @@ class Analysis(Result):
         """The same curves with points as close as a line needs that is drawn through them."""
         return self
 
-    def plot(self, path=None, **options):
-        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given."""
-        marks = {"asked": self} if getattr(self, "marked", False) else {}
-        return Result.plot(self.drawn(), path, **marks, **options)
-
     def __str__(self) -> str:
         summary = self.summary()
         return self.table(summary) if summary else self.table(self.columns(), self.EVERY)

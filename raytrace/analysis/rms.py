@@ -2,16 +2,19 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.analysis.fans import REFERENCES
+from raytrace.analysis.panels import by_wavelength, chart, field_axis, field_name, finished
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting, wavelength_shares
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, INK, array, styled
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of
@@ -39,7 +42,6 @@ class RmsOverField(OverField):
     reference: str
 
     COMMAND = "rms-over-field"
-    FIGURE = "plotting.analysis.rms_curves"
 
     @property
     def quantity(self) -> str:
@@ -72,6 +74,26 @@ class RmsOverField(OverField):
 
     def at(self, fields: Tensor) -> "RmsOverField":
         return _rms(self.lens, fields, self.quantity == "spot", self.reference, (self.points, self.weights))
+
+    @styled
+    def draw(self):
+        """RMS over the field: all wavelengths together in black, each in its colour; Maréchal's limit dotted."""
+        curves = self.drawn()
+        waves = curves.quantity == "wavefront"
+        what = "RMS wavefront error" if waves else "RMS spot radius"
+        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{what} ({'waves' if waves else 'µm'})")
+        order = np.argsort(field_axis(curves))
+        field, scale = field_axis(curves)[order], 1.0 if waves else 1e3
+        by_wavelength(panel, curves, field, scale * array(curves.rms)[order], linewidth=1.2)
+        if len(curves.wavelengths) > 1:
+            together = scale * array(curves.polychromatic)[order]
+            panel.plot(field, together, color=INK, linewidth=1.6, label="all, weighted")
+        if waves:
+            panel.axhline(1 / 14, color=GREY, linewidth=0.8, linestyle=":", label="λ/14")
+        panel.set_ylim(bottom=0)
+        if field.max() > field.min():
+            panel.set_xlim(field.min(), field.max())
+        return finished(panel, curves, what, 5)
 
 
 def rms_over_field(

@@ -16,17 +16,26 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.system.lens import Lens, field_points
+from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
+from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import is_at_infinity, paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
 from raytrace.tracing.trace import media
 from raytrace.words import named, with_article
+
+_SEIDEL = {
+    "S1": "spherical", "S2": "coma", "S3": "astigmatism", "S4": "Petzval", "S5": "distortion", "C1": "axial colour",
+    "C2": "lateral colour", "W040": "spherical", "W131": "coma", "W222": "astigmatism", "W220P": "Petzval",
+    "W311": "distortion", "W020": "axial colour", "W111": "lateral colour",
+}  # fmt: skip
+_COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
 
 
 @value
@@ -53,7 +62,6 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
-    FIGURE = "plotting.analysis.seidel_bars"
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
@@ -89,6 +97,35 @@ class Seidel(Analysis):
                 name = k if k <= self.contributions.shape[-1] else "sum"
                 lines.append(f"{name:>7}" + "".join(cell(float(value), ">13.6g") for value in row))
         return "\n".join(lines)
+
+    @styled
+    def draw(self):
+        """A row for each aberration, a bar for each surface and one for the sum, of the outermost field."""
+        field = int(field_axis(self).argmax())
+        values = {name: row for name, row in zip(self.names, array(self.contributions[:, field]), strict=True)}
+        # A lens of one wavelength has no colours to show.
+        values = {name: row for name, row in values.items() if len(self.wavelengths) > 1 or name not in _COLOURS}
+        surfaces = self.contributions.shape[-1]
+        figure = new_figure(max(5.2, 0.24 * surfaces + 2.4), 0.78 * len(values) + 1.1)
+        panels = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
+        place = [*range(1, surfaces + 1), surfaces + 1.6]
+        for panel, (name, row) in zip(panels, values.items(), strict=True):
+            panel.grid(axis="y", color="#ececec", linewidth=0.6, zorder=0)
+            panel.set_axisbelow(True)
+            panel.bar(place, [*row, row.sum()], color=[field_colour(0)] * surfaces + [INK], width=0.7)
+            panel.axhline(0, color=GREY, linewidth=0.6)
+            panel.axvline(surfaces + 0.8, color=FAINT, linewidth=0.8)
+            panel.set_ylabel(f"{name}\n{_SEIDEL.get(name, '')}".strip(), rotation=0, ha="right", va="center")
+            panel.locator_params(axis="y", nbins=3)
+            panel.tick_params(axis="x", length=0)
+            panel.margins(y=0.15)
+        shown = range(1, surfaces + 1, 1 if surfaces <= 24 else 2)
+        panels[-1].set_xticks([*shown, place[-1]], [*(str(k) for k in shown), "sum"])
+        panels[-1].set(xlim=(0.3, surfaces + 2.2), xlabel="surface")
+        figure.align_ylabels(panels)
+        quantity = "coefficients" if self.kind in ("coefficients", "waves") else f"{self.kind} aberrations"
+        label = field_label(self.lens, array(self.fields)[:, field])
+        return finished(panels[0], self, f"Seidel {quantity} ({self.unit}), field {label}")
 
 
 def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> Seidel:

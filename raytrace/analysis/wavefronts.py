@@ -3,9 +3,11 @@
 import dataclasses
 import warnings
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.panels import field_labels, finished, seen, wavelength_label
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
@@ -13,6 +15,7 @@ from raytrace.maths import zernike
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
+from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
@@ -53,7 +56,6 @@ class WavefrontMap(Analysis):
     listed: bool = False
 
     COMMAND = "wavefront"
-    FIGURE = "plotting.analysis.wavefront_maps"
     UNIT = "waves"
 
     def columns(self) -> dict[str, Tensor]:
@@ -80,6 +82,43 @@ class WavefrontMap(Analysis):
             cells = "".join(cell(c, ">14.8f") for c in row)
             lines.append(f"{j:>3} {n:>3} {m:>3}  {zernike.WORDS.get((n, m), ''):<26}{cells}")
         return "\n".join(lines)
+
+    @styled
+    def draw(self):
+        """A panel for each field (rows) and wavelength (columns), one scale for all; RMS, P-V, Strehl below.
+
+        Maps of a single wavelength follow each other in lines of four. 0 is white; the scale ends with the maps.
+        """
+        labels, count = field_labels(self), len(self.wavelengths)
+        flows = count == 1
+        shape = (-(-len(labels) // 4), min(len(labels), 4)) if flows else (len(labels), count)
+        side = 2.9 if shape == (1, 1) else 1.9
+        figure = new_figure(side * shape[1] + 1.3, (side + 0.6) * shape[0] + (0.75 if shape[0] > 1 else 0.95))
+        grid = figure.subplots(*shape, squeeze=False)
+        axes = grid.reshape(-1, 1) if flows else grid
+        opd = seen(self.opd, self.valid)
+        colours, scale = _diverging(opd)
+        for row, w in np.ndindex(len(labels), count):
+            panel = axes[row][w]
+            drawn = panel.imshow(opd[row, w], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
+            panel.set(xticks=[], yticks=[])
+            panel.spines[:].set_visible(False)
+            rms, valley, strehl = (
+                number_text(float(v[row, w]), 3) for v in (self.rms, self.peak_to_valley, self.strehl)
+            )
+            panel.set_xlabel(f"RMS {rms}, P–V {valley}\nStrehl {strehl}", fontsize=7.5, color=GREY)
+            if flows:
+                panel.set_title(labels[row], color=INK)
+            elif row == 0:
+                panel.set_title(wavelength_label(self, w), color=INK)
+            if w == 0 and not flows:
+                panel.set_ylabel(labels[row])
+        for panel in axes.ravel()[len(labels) * count :]:
+            panel.axis("off")
+        bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
+        bar.set_label("OPD (waves)")
+        bar.outline.set_visible(False)
+        return finished(grid[0][0], self, f"wavefront, {wavelength_label(self, 0)}" if flows else "wavefront")
 
 
 def wavefront(
@@ -160,3 +199,15 @@ def _strehl(view: Scene) -> Tensor:
         except ValueError:  # a map of so many waves is still worth seeing
             ratios.append(torch.full_like(view.wavelengths, torch.nan)[None])
     return torch.cat(ratios)
+
+
+def _diverging(values: np.ndarray):
+    """Blue below 0, white at 0, red above, equally deep on either side; from the least to the largest of the values."""
+    import matplotlib
+    from matplotlib.colors import ListedColormap, Normalize
+
+    low, high = min(float(np.nanmin(values, initial=0.0)), 0.0), max(float(np.nanmax(values, initial=0.0)), 0.0)
+    largest = max(-low, high, 1e-4)
+    low, high = (low, high) if high - low > 1e-4 else (-largest, largest)
+    shades = matplotlib.colormaps["RdBu_r"](0.5 + 0.5 * np.linspace(low, high, 256) / largest)
+    return ListedColormap(shades), Normalize(low, high)

@@ -16,7 +16,7 @@ from raytrace.maths.value import to
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
-from raytrace.tracing.compiled.library import NoCompiler, compiler, private_folder, run_compiler
+from raytrace.tracing.compiler import NoCompiler, compiler, private_folder, run_compiler
 from raytrace.tracing.trace import media
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no

@@ -43,7 +43,8 @@ from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.prescription import lens as lens_of
 from raytrace.system.rays import Rays
-from raytrace.tracing.compiled import NoCompiler, prepare
+from raytrace.tracing.compiled import prepare
+from raytrace.tracing.compiler import NoCompiler
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.scene import Memo, trace_bundle

@@ -16,7 +16,7 @@ from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.files import write_json
-from raytrace.imaging.closed_form import power_spectrum
+from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.codesign import (
     LENS,
     STEPS,
@@ -35,6 +35,7 @@ from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import read_json, read_log
 from raytrace.io import FORMATS, read_lens, write_lens
 from raytrace.maths.result import Result, plain
+from raytrace.plotting.style import FIELD_COLOURS, new_figure, styled
 from raytrace.settings import CodesignSettings
 from raytrace.settings import read as read_settings
 from raytrace.shards import processes, share
@@ -68,7 +69,7 @@ class Experiment:
     def spectrum(self) -> Tensor:
         """Power spectrum of the training pictures, at the size of a patch with its margin."""
         size = self.settings.patch + self.settings.size - 1
-        return power_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
+        return patch_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
 
 
 def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:
@@ -243,7 +244,24 @@ class CodesignResult(Result):
     lens: Outcome | Optimum
     curves: dict[str, Sequence[float]]
 
-    FIGURE = "plotting.codesign.learning_figure"
+    @styled
+    def draw(self):
+        """Every curve one after the other; noisy ones faint, with their running mean over a fiftieth of the curve."""
+        figure = new_figure(5.6, 3.2)
+        panel, start = figure.subplots(), 0
+        for number, (name, losses) in enumerate(self.curves.items()):
+            steps = np.arange(start, start + len(losses))
+            width = max(1, len(losses) // 50)
+            panel.plot(steps, losses, color=FIELD_COLOURS[number], linewidth=0.6, alpha=1.0 if width == 1 else 0.3)
+            means = np.convolve(losses, np.full(width, 1 / width), "valid")
+            panel.plot(steps[width - 1 :], means, color=FIELD_COLOURS[number], label=name)
+            start += len(losses)
+        is_training = len(self.curves) > 1
+        panel.set(xlabel="step" if is_training else "evaluation")
+        panel.set_ylabel("training loss (mean L¹)" if is_training else "mean square error, best linear filter")
+        if is_training:
+            panel.legend()
+        return figure
 
     def document(self) -> dict:
         limits = variables(self.experiment.lens, self.experiment.settings).limits

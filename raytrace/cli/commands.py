@@ -253,13 +253,13 @@ def _codesign(arguments: argparse.Namespace):
 
 
 def _wave_design(arguments: argparse.Namespace):
-    from raytrace.cli.wave_design_run import design
+    from raytrace.cli.wave_run import design
 
     return design(arguments)
 
 
 def _wave_restore(arguments: argparse.Namespace):
-    from raytrace.cli.wave_restore_run import restore_files
+    from raytrace.cli.wave_run import restore_files
 
     return restore_files(arguments)
 

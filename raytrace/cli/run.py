@@ -45,7 +45,7 @@ class CommandError(ValueError):
 
 
 def carry_out(arguments: argparse.Namespace) -> int:
-    """Run the command of `arguments.run`. Returns the exit code: 1 for a result that falls short of what was asked for.
+    """Run the command of the arguments. Returns the exit code: 1 for a result that misses its goal.
 
     Several object distances are passed on if the function takes `object_distances`, else it is called once for each.
     Under torchrun processes share the work of a function that takes a `share`, and the first one prints.

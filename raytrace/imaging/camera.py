@@ -24,12 +24,15 @@ from raytrace.imaging.image import as_picture, blur
 from raytrace.imaging.sensor import add_noise
 from raytrace.imaging.variables import Variables
 from raytrace.maths.grid import Grid, grid
-from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, model_of, psf
+from raytrace.maths.numerics import safe_divide
+from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, gaussian, model_of, psf
+from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.system.lens import Lens, field_points
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.scene import Memo, chief_landing, scene
+from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
 from raytrace.words import named_value
 
+_RAY_WIDTH = 0.25  # half width in pixels of a ray of pupil_points with "drt", for a derivative
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
@@ -43,6 +46,8 @@ class Camera(nn.Module):
     noise: standard deviation of the sensor noise. tol: allowed error of the kernels: the order of the PSF model is
     chosen once, for the lens at the first call (`plan`). rho: of the paraxial model.
     network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
+    pupil_points: (2, P), PSFs of these rays, all of one weight, instead of as many rays as `tol` needs ("gaussian",
+    "drt"): a Gaussian of twelve rays has their centroid and covariance, not those of all light.
     The object is planar and upright; image inversion and magnification are ignored.
     Warns UnfilledStop once, for the lens at construction.
     """
@@ -61,11 +66,12 @@ class Camera(nn.Module):
         tol: float = 1e-2,
         rho: float = 0.5,
         network_dtype: torch.dtype | None = None,
+        pupil_points: Tensor | None = None,
     ):
         super().__init__()
-        if not isinstance(getattr(variables, "lens", None), Lens):
-            found = named_value(variables)
-            raise TypeError(f"Camera: `variables` is {found}; expected the Variables of a lens: Variables(lens, …)")
+        if not isinstance(variables, Variables):
+            kind = named_value(variables)
+            raise TypeError(f"Camera: `variables` is {kind}; expected the Variables of a lens: Variables(lens, …)")
         self.variables, self.network, self.model = variables, network, model
         self.range = object_distances
         like = variables.lens.wavelengths
@@ -73,7 +79,7 @@ class Camera(nn.Module):
         warn_of_filling(variables.lens, self.fields)
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
-        self._order: int | None = None
+        self.pupil_points, self._order = pupil_points, None
         self._memo = Memo(object_distances=object_distances)
 
     @property
@@ -81,9 +87,9 @@ class Camera(nn.Module):
         """Rows and columns by which the PSF window shrinks an image."""
         return self.pixels.rows - 1
 
-    def use(self, model: str) -> None:
-        """Simulate with another PSF model."""
-        self.model, self._order = model, None
+    def use(self, model: str, pupil_points: Tensor | None = None) -> None:
+        """Simulate with another PSF model; pupil_points: as for the constructor."""
+        self.model, self.pupil_points, self._order = model, pupil_points, None
 
     @torch.no_grad()
     def plan(self) -> int:
@@ -97,6 +103,8 @@ class Camera(nn.Module):
 
     def kernels(self, object_distances: Tensor, field: int = 0) -> Tensor:
         """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, around its chief ray."""
+        if self.pupil_points is not None:
+            return self._kernels_of_points(object_distances, self.fields[:, [field]])
         order = self.plan() if self._order is None else self._order
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
 
@@ -115,6 +123,32 @@ class Camera(nn.Module):
             normalise=self.normalise,
             execution=Execution(memo=self._memo),
         )
+
+    def _kernels_of_points(self, distances: Tensor, fields: Tensor) -> Tensor:
+        """PSFs (B, rows, columns) of the rays through the pupil points alone."""
+        lens, distances = self.variables(), distances.to(fields.dtype)
+        light = scene(lens, fields, distances, lens.wavelengths, self._memo)
+        window = self._window(lens, fields, distances)
+        if window.centre.dim() > 1:  # chief rays (2, D, F), for every wavelength
+            centre = window.centre[..., None].expand(*window.centre.shape, len(lens.wavelengths))
+            window = dataclasses.replace(window, centre=centre)
+        points = self.pupil_points.to(fields)
+        weights = torch.full_like(points[0], 1 / len(points[0]))
+        if self.model == "drt":
+            kernels = drt.kernels_of_points(light, window, points, weights, width=_RAY_WIDTH).kernel
+        else:
+            traced = trace_scene(light, points)
+            valid = traced.valid.expand(*light.shape, len(weights))
+            rays = gaussian.Light(traced.position[:2].expand(2, *valid.shape), valid, weights, len(weights))
+            centroid, covariance, arrived = gaussian.spot_moments(rays, "none")
+            mirrored = points * points.new_tensor([[-1.0], [1.0]])
+            distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
+            if symmetry(light) != "none" and bool((distance < 1e-12).all()):
+                covariance = covariance[[0, 2]]  # xy is 0 but for rounding, and costs a quadrature over every pixel
+            kernels = (arrived * beam_share(light))[..., None, None] * gaussian_pixels(window, centroid, covariance)
+        shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+        kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
+        return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
 
     def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
         """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""

@@ -1,44 +1,45 @@
-"""Extended depth of field: how well one phase element and one linear filter show scenes at every depth, in all colours.
+"""A camera with a phase element and a linear filter for extended depth of field: its kernels, errors and image quality.
 
-The pictures are periodic (mirrored to twice their size, so that nothing jumps), each at one depth. Light that lands
-beyond the window of the kernel is no loss: it comes back as haze, even over the picture. Two filters restore them: the
-classic Wiener filter of the design depth with the best constant γ, and the best linear one that knows no depth.
+Pictures are periodic (mirrored to twice their size, without a jump at the border), each at one depth. Light outside the
+window of the kernel is not lost: it is even haze over the whole picture. Two filters restore them: the Wiener filter of
+the design depth with the best constant γ, and the best depth-invariant one ("blind" in stored results).
 """
 
 import dataclasses
 import functools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.optimize
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.octant import Octant, fits
-from raytrace.imaging.pictures import Pictures, draws
+from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.optimization.solver import NoOptimum, minimise_tensors
+from raytrace.optimization.solver import NoOptimum
+from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf
-from raytrace.wave_optics.element import Element, Rings
+from raytrace.wave_optics.element import Element, Rings, height
 from raytrace.wave_optics.plan import plan
 from raytrace.wave_optics.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")  # of restoration
-WAVELENGTH = 0.55  # µm: that elements are designed for, and wrapped at
-_START = 21  # last number of the key of a random start
+WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
+_BLACK = 1e-5  # of the brightest pixel of a row of kernels
 
 
 @dataclasses.dataclass(frozen=True)
 class WaveCameraConfig:
-    """Where the camera works. Lengths in mm, wavelengths in µm.
+    """Lengths in mm, wavelengths in µm.
 
-    depths: of the scenes; design: the depth whose kernel the Wiener filter inverts; pixel, size: of the window of the
+    depths: of the objects; design: the depth whose kernel the Wiener filter inverts; pixel, size: of the window of the
     kernels, an odd number, so that no picture is shifted; noise: standard deviation, for pictures in [0, 1].
     """
 
@@ -54,63 +55,62 @@ class WaveCameraConfig:
 
 
 def depth_text(depth: float, infinity: str = "infinity") -> str:
-    """A depth in mm as a reader would say it."""
+    """A depth in mm as text, in m."""
     return infinity if math.isinf(depth) else f"{1e-3 * depth:.3g} m"
 
 
-def scene(elements: Sequence[Element], world: WaveCameraConfig, *, depths: Sequence[float] | None = None) -> WaveScene:
-    """What a world looks like through elements in contact."""
+def scene(elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequence[float] | None = None) -> WaveScene:
+    """The camera's objects, through elements in contact; depths: mm, other than its own."""
     like = elements[0].radius
     return WaveScene(
         elements=tuple(elements),
-        sensor_distance=like.new_tensor(world.sensor_distance),
-        depths=like.new_tensor(world.depths if depths is None else depths),
-        wavelengths=like.new_tensor(world.wavelengths),
-        grid=grid(like.new_tensor(world.pixel), world.size),
-        exact=world.exact,
+        sensor_distance=like.new_tensor(config.sensor_distance),
+        depths=like.new_tensor(config.depths if depths is None else depths),
+        wavelengths=like.new_tensor(config.wavelengths),
+        grid=grid(like.new_tensor(config.pixel), config.size),
+        exact=config.exact,
     )
 
 
 def kernels(
-    elements: Sequence[Element], world: WaveCameraConfig, *, depths: Sequence[float] | None = None
+    elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequence[float] | None = None
 ) -> ElementPsf:
-    """PSFs of elements in a world. Where they are not round, depth by depth, for memory, to half a per cent; rings with
-    anything else are sampled at their own pitch (2,500 cells across 5 mm of 2 µm rings).
+    """PSFs of elements. Those that are not round are computed depth by depth, for memory, to 0.5 %; rings in contact
+    with other elements are sampled at their own pitch (2,500 cells across 5 mm of 2 µm rings).
     """
-    own = scene(elements, world, depths=depths)
-    if is_round(own):
-        return psf(own)
-    samples = None
-    rings = [element.profile.pitch for element in elements if isinstance(element.profile, Rings)]
-    if rings:
-        samples = math.ceil(float(2 * elements[0].radius / min(rings)))
-    parts = [
-        psf(dataclasses.replace(own, depths=depth[None]), tol=5e-3, samples=samples) for depth in own.depths.unbind()
-    ]
-    return ElementPsf(torch.cat([part.kernel for part in parts]), own, parts[0].plan)
+    whole = scene(elements, config, depths=depths)
+    if is_round(whole):
+        return psf(whole)
+    pitches = [element.profile.pitch for element in elements if isinstance(element.profile, Rings)]
+    samples = math.ceil(float(2 * elements[0].radius / min(pitches))) if pitches else None
+    parts = [psf(dataclasses.replace(whole, depths=z[None]), tol=5e-3, samples=samples) for z in whole.depths.unbind()]
+    return ElementPsf(torch.cat([part.kernel for part in parts]), whole, parts[0].plan)
 
 
-def transfer(found: ElementPsf, size: int) -> Tensor:
-    """H (D, W, size, size) of kernels normalised by the light through the aperture; what misses the window is haze."""
-    H = transfer_functions(found.kernel, size)
+def transfer(psf: ElementPsf, size: int | tuple[int, int]) -> Tensor:
+    """H (D, W, size, size) of kernels normalised by the light through the aperture; light beyond the window is haze."""
+    H = transfer_functions(psf.kernel, size)
     haze = torch.zeros_like(H.real)
     haze[..., 0, 0] = 1
-    return H + haze * (1 - found.energy)[..., None, None]
+    return H + haze * (1 - psf.energy)[..., None, None]
+
+
+# -- periodic pictures
 
 
 def periodic(pictures: Pictures, size: int) -> Tensor:
-    """Pictures (B, size, size) in [0, 1], float64: the middle of each, mirrored to one period of an endless picture."""
-    half, found = size // 2, []
+    """Pictures (B, size, size) in [0, 1], float64: the middle of each, mirrored to a period of an endless picture."""
+    half, periods = size // 2, []
     for sample in pictures.samples:
         if min(sample.shape) < half:
             raise ValueError(f"a picture of {sample.shape[0]} × {sample.shape[1]} pixels, expected {half} at least")
         row, column = ((n - half) // 2 for n in sample.shape)
-        found.append(mirrored(sample[row : row + half, column : column + half].astype(np.float64) / 255))
-    return torch.as_tensor(np.stack(found))
+        periods.append(mirrored(sample[row : row + half, column : column + half].astype(np.float64) / 255))
+    return torch.as_tensor(np.stack(periods))
 
 
 def mirrored(picture: np.ndarray) -> np.ndarray:
-    """A picture (h, w) and its mirror images: one period (2h, 2w) of a picture without a jump."""
+    """A picture (h, w) and its mirror images: one period (2h, 2w) without a jump."""
     picture = np.concatenate([picture, picture[::-1]], 0)
     return np.concatenate([picture, picture[:, ::-1]], 1)
 
@@ -126,29 +126,33 @@ def power(picture: Tensor) -> Tensor:
     return (transformed.real**2 + transformed.imag**2) / picture.numel()
 
 
+# -- errors of restored pictures
+
+
 def errors_of_pictures(H: Tensor, G: Tensor, noise: float, powers: Tensor) -> Tensor:
     """Mean square errors (B, D, W) of pictures of `power` (B, n, n) behind filters G, expected over noise."""
-    left = torch.view_as_real(1 - G * H).square().sum(-1).flatten(2)  # (D, W, n²)
+    residual = torch.view_as_real(1 - G * H).square().sum(-1).flatten(2)  # (D, W, n²)
     added = noise**2 * torch.view_as_real(G).square().sum(-1).mean((-2, -1))
-    return (left @ powers.flatten(1).T / left.shape[-1]).movedim(-1, 0) + added
+    return (residual @ powers.flatten(1).T / residual.shape[-1]).movedim(-1, 0) + added
 
 
 def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
-    """Mean square error behind the best blind filter, in closed form, mean over colours."""
+    """Mean square error behind the best depth-invariant filter, in closed form, mean over colours."""
     return depth_invariant_error(H, S, noise).mean()
 
 
 class ClosedForm:
-    """`expected_error` of elements in one world, for pictures of spectrum S (n, n); differentiable. What their heights
-    do not change is kept: first, the elements that the sampling is planned for, have their steps where others will.
-    dtype: of the sums over a radius.
+    """`expected_error` of elements of one camera, for pictures of spectrum S (n, n); differentiable.
+
+    first: the elements for which the sampling is planned, with the steps of all later ones. Whatever their heights do
+    not change is computed once. dtype: of the sums over a radius.
     """
 
     def __init__(
-        self, first: Sequence[Element], world: WaveCameraConfig, S: Tensor, *, dtype: torch.dtype = torch.float64
+        self, first: Sequence[Element], config: WaveCameraConfig, S: Tensor, *, dtype: torch.dtype = torch.float64
     ):
-        self.world, self.S, self._memo, self._dtype = world, S, Memo(), dtype
-        self._first = scene(first, world)
+        self.config, self.S, self._memo, self._dtype = config, S, Memo(), dtype
+        self._first = scene(first, config)
         self.plan = plan(self._first)
 
     @functools.cached_property
@@ -159,17 +163,51 @@ class ClosedForm:
 
     def __call__(self, elements: Sequence[Element]) -> Tensor:
         if self._octant is not None:
-            return self._octant.error(scene(elements, self.world), self.S, self.world.noise)
-        return expected_error(self.transfer(elements), self.S, self.world.noise)
+            return self._octant.error(scene(elements, self.config), self.S, self.config.noise)
+        return expected_error(self.transfer(elements), self.S, self.config.noise)
 
     def transfer(self, elements: Sequence[Element]) -> Tensor:
         """H (D, W, n, n)."""
-        return transfer(psf(scene(elements, self.world), plan=self.plan, memo=self._memo), self.S.shape[-1])
+        return transfer(psf(scene(elements, self.config), plan=self.plan, memo=self._memo), self.S.shape[-1])
+
+
+def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Captured and filtered images, each (B, W, N, N), of pictures (B, N, N) at one depth.
+
+    H, G: (W, N, N); noise: (B, W, N, N), added.
+    """
+    image = torch.fft.ifft2(torch.fft.fft2(pictures)[:, None] * H).real + noise
+    return image, torch.fft.ifft2(torch.fft.fft2(image) * G).real
+
+
+def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
+    """The constant γ of the Wiener filter of the design depth (W, N, N) with the least error over all depths."""
+
+    # The error of G = H*/(|H|² + γ), ⟨S|1 - G H_z|² + σ²|G|²⟩, needs but two means over the depths.
+    square = at_design.real**2 + at_design.imag**2
+    along = S * (at_design.conj() * H.mean(0)).real
+    power = square * (S * (H.real**2 + H.imag**2).mean(0) + noise**2)
+    rest = float(S.mean())
+
+    def error(logarithm: float) -> float:
+        weight = 1 / (square + 10**logarithm)
+        return rest + float((weight * (power * weight - 2 * along)).mean())
+
+    # Coarse steps first: far from the best γ the error is flat.
+    places = np.arange(-6.0, 2.0, 0.5)
+    start = min(places, key=error)
+    if start in (places[0], places[-1]):
+        message = f"no optimum of the filter's constant inside 10^{places[0]:g} to 10^{places[-1]:g}"
+        warnings.warn(f"{message}: the error still falls at its end", NoOptimum, stacklevel=2)
+    return 10 ** float(scipy.optimize.minimize_scalar(error, bounds=(start - 0.5, start + 0.5), method="bounded").x)
+
+
+# -- image quality
 
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """What an element is worth, by filter: PSNR in dB of restored pictures.
+    """PSNR in dB of restored pictures, by filter.
 
     by_depth: (D,) of each filter, of the error pooled over pictures and colours; mean: over the depths; of_pictures:
     the mean of the PSNRs of single pictures at each depth; spread: best less worst depth; by_colour: (W,), mean over
@@ -188,30 +226,32 @@ class Quality:
 @torch.no_grad()
 def quality(
     elements: Sequence[Element],
-    world: WaveCameraConfig,
+    config: WaveCameraConfig,
     *,
     train: Tensor,
     test: Tensor,
-    found: ElementPsf | None = None,
+    psf: ElementPsf | None = None,
 ) -> Quality:
-    """Of test pictures (B, N, N), expected over noise, behind filters made for training pictures (A, N, N) alone."""
-    found = kernels(elements, world) if found is None else found
-    size = test.shape[-1]
-    H, S = transfer(found, size), spectrum(train)
-    if world.design in world.depths:
-        at_design = H[world.depths.index(world.design)]
+    """Of test pictures (B, N, N), expected over noise, behind filters for training pictures (A, N, N) alone.
+
+    psf: `kernels` of the elements, if they are known.
+    """
+    psf = kernels(elements, config) if psf is None else psf
+    H, S = transfer(psf, test.shape[-1]), spectrum(train)
+    if config.design in config.depths:
+        at_design = H[config.depths.index(config.design)]
     else:
-        at_design = transfer(kernels(elements, world, depths=[world.design]), size)[0]
-    gamma = best_gamma(H, S, world.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, world.noise)}
+        at_design = transfer(kernels(elements, config, depths=[config.design]), test.shape[-1])[0]
+    gamma = best_gamma(H, S, config.noise, at_design)
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, config.noise)}
     powers = torch.stack([power(picture) for picture in test])
     by_depth, by_colour, of_pictures = {}, {}, {}
     for name, G in filters.items():
-        each = errors_of_pictures(H, G, world.noise, powers)  # (B, D, W)
-        left = each.mean(0)
-        of_pictures[name] = float(psnr(each.mean(-1)).mean())
-        by_depth[name] = tuple(psnr(left.mean(1)).tolist())
-        by_colour[name] = tuple(psnr(left).mean(0).tolist())
+        errors = errors_of_pictures(H, G, config.noise, powers)  # (B, D, W)
+        pooled = errors.mean(0)
+        of_pictures[name] = float(psnr(errors.mean(-1)).mean())
+        by_depth[name] = tuple(psnr(pooled.mean(1)).tolist())
+        by_colour[name] = tuple(psnr(pooled).mean(0).tolist())
     return Quality(
         by_depth,
         by_colour,
@@ -219,80 +259,64 @@ def quality(
         of_pictures,
         {name: max(values) - min(values) for name, values in by_depth.items()},
         gamma,
-        tuple(map(tuple, found.energy.tolist())),
+        tuple(map(tuple, psf.energy.tolist())),
     )
 
 
 @dataclasses.dataclass(frozen=True)
-class Judged(Result):
-    """Elements in a world: their kernels and what they are worth."""
+class ElementReport(Result):
+    """Elements of a camera, their kernels and image quality."""
 
     elements: Sequence[Element]
-    world: WaveCameraConfig
+    config: WaveCameraConfig
     kernels: ElementPsf
     quality: Quality
 
-    FIGURE = "plotting.wave_design.element_figure"
+    @styled
+    def draw(self):
+        """Height over the radius, PSNR over depth, kernels over depth and wavelength."""
+        figure = new_figure(9.2, 7.0)
+        top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
+        profile, psnrs = top.subplots(1, 2)
+        radius = self.elements[0].radius
+        r = torch.linspace(0, float(radius) * (1 - 1e-9), 4000, dtype=radius.dtype)
+        for number, element in enumerate(self.elements):
+            h = height(element, r, torch.zeros_like(r)).detach()
+            colour, label = FIELD_COLOURS[number % 3], element.glass.name
+            profile.plot(array(r), 1e3 * array(h - h.min()), lw=0.9, color=colour, label=label)
+        profile.set(xlabel="radius (mm)", ylabel="height (µm)", title="element")
+        profile.legend(fontsize=8)
+        dioptres = [1e3 / depth for depth in self.config.depths]
+        labels = {"wiener": "Wiener, 1 m kernel", "blind": "best depth-invariant filter"}
+        for filter, mark, colour in (("wiener", "o--", FIELD_COLOURS[0]), ("blind", "s-", FIELD_COLOURS[1])):
+            psnrs.plot(dioptres, self.quality.by_depth[filter], mark, ms=4, label=labels[filter], color=colour)
+        mark_depths(psnrs, self.config)
+        psnrs.set(xlabel="object distance", ylabel="PSNR (dB)")
+        psnrs.legend(fontsize=8)
+        _draw_kernels(bottom, self.kernels)
+        return figure
 
 
-def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """What the sensor sees and what the filter makes of it, each (B, W, N, N), of pictures (B, N, N) at one depth.
-
-    H, G: (W, N, N); noise: (B, W, N, N), added.
-    """
-    seen = torch.fft.ifft2(torch.fft.fft2(pictures)[:, None] * H).real + noise
-    return seen, torch.fft.ifft2(torch.fft.fft2(seen) * G).real
-
-
-def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
-    """The constant γ of the Wiener filter of the design depth (W, N, N) that errs least over all depths."""
-
-    # The error of G = H*/(|H|² + γ), ⟨S|1 - G H_z|² + σ²|G|²⟩, needs but two means over the depths.
-    own = at_design.real**2 + at_design.imag**2
-    along = S * (at_design.conj() * H.mean(0)).real
-    power = own * (S * (H.real**2 + H.imag**2).mean(0) + noise**2)
-    rest = float(S.mean())
-
-    def error(logarithm: float) -> float:
-        weight = 1 / (own + 10**logarithm)
-        return rest + float((weight * (power * weight - 2 * along)).mean())
-
-    # Coarse steps first: far from the best γ the error is flat.
-    places = np.arange(-6.0, 2.0, 0.5)
-    start = min(places, key=error)
-    if start in (places[0], places[-1]):
-        message = f"no optimum of the filter's constant inside 10^{places[0]:g} to 10^{places[-1]:g}"
-        warnings.warn(f"{message}: the error still falls at its end", NoOptimum, stacklevel=2)
-    return 10 ** float(scipy.optimize.minimize_scalar(error, bounds=(start - 0.5, start + 0.5), method="bounded").x)
+def _draw_kernels(figure, psf: ElementPsf) -> None:
+    kernels, (D, W) = array(psf.kernel.detach()), psf.kernel.shape[:2]
+    axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(psf.wavelengths.tolist())
+    half = 1e3 * float(psf.pitch) * kernels.shape[-1] / 2
+    for w in range(W):
+        brightest = kernels[:, w].max()
+        for d in range(D):
+            logarithm = np.log10(np.maximum(kernels[d, w] / brightest, _BLACK))
+            extent = (-half, half, -half, half)
+            axes[w, d].imshow(logarithm, cmap="inferno", vmin=np.log10(_BLACK), vmax=0, extent=extent)
+            axes[w, d].set(xticks=[], yticks=[])
+        axes[w, 0].set_ylabel(f"{1e3 * float(psf.wavelengths[w]):.0f} nm", color=colours[w], fontsize=9)
+    for panel, depth in zip(axes[0], psf.depths.tolist(), strict=True):
+        panel.set_title(depth_text(depth, "∞"), fontsize=9)
+    figure.supxlabel(
+        f"PSFs, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row", fontsize=8
+    )
 
 
-def best_of_starts(
-    variables: Callable[[], nn.Module],
-    world: WaveCameraConfig,
-    spectrum: Tensor,
-    *,
-    starts: int,
-    spread: float,
-    steps: int,
-    seed: int = 0,
-    progress: Callable[[Iterable], Iterable] = iter,
-) -> nn.Module:
-    """Phase variables at the least closed-form error that L-BFGS reaches from random starts; several optima exist.
-
-    variables: makes them anew; spread: standard deviation of the first changes; starts 0: as they are made.
-    """
-    best, least = variables(), math.inf
-    for number in progress(range(starts)):
-        own = variables()
-        with torch.no_grad():
-            for p in own.parameters():
-                p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
-        expected = ClosedForm(own(), world, spectrum)
-
-        def error(own=own, expected=expected) -> Tensor:
-            return expected(own())
-
-        found = min(minimise_tensors(list(own.parameters()), error, steps=steps).values)
-        if found < least:
-            best, least = own, found
-    return best
+def mark_depths(axes, config: WaveCameraConfig) -> None:
+    """Near objects on the left, even in dioptres."""
+    axes.set_xticks([1e3 / depth for depth in config.depths], [depth_text(depth, "∞") for depth in config.depths])
+    axes.invert_xaxis()

@@ -1,11 +1,11 @@
-"""Learning a phase element for extended depth of field: by the closed form, or by pictures and a filter in the loop.
+"""Design of a phase element for extended depth of field: by the closed form, or by simulated images and their filter.
 
-    closed form   e = ⟨S (S var H + σ²)/(S ⟨|H|²⟩ + σ²)⟩ over frequencies and colours: no pictures, no noise drawn
-    pictures      mean (x̂ - x)² of pictures at drawn depths with drawn noise, behind a filter that is learned with them
+    closed form   e = ⟨S (S var H + σ²)/(S ⟨|H|²⟩ + σ²)⟩ over frequencies and colours: no pictures, no random noise
+    images        mean (x̂ - x)² of pictures at random depths with random noise, restored by a filter
 
-The filter is the best blind one for the kernels as they are, or that of Sitzmann et al. (ACM Trans. Graph. 37, 2018):
-towards the measurement, for the kernel at a depth that is learned, with a weight that is learned. Or a network restores
-what the blind filter leaves. Steps, logs and checkpoints are those of `training`.
+The filter is the best depth-invariant one of the current kernels, or that of Sitzmann et al. (ACM Trans. Graph. 37,
+2018): towards the measurement, for the kernel at a trainable depth, with a trainable weight. Optionally a network
+follows the depth-invariant filter. Steps, logs and checkpoints are those of `training`.
 """
 
 import dataclasses
@@ -22,40 +22,34 @@ from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.imaging.variables import PhaseVariables
-from raytrace.imaging.wave_camera import (
-    ClosedForm,
-    WaveCameraConfig,
-    best_of_starts,
-    mirrored,
-    restored,
-    scene,
-    transfer,
-)
+from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored, restored, scene, transfer
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.value import detached
+from raytrace.optimization.solver import minimise_tensors
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, as_rings
-from raytrace.wave_optics.etching import Process, matched
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike
+from raytrace.wave_optics.fabrication import Process, as_rings, matched
 
-_NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
+_NETWORK = RedNetShape(6, 16)  # behind the depth-invariant filter, the same for every colour
 _NETWORK_RATE = 1e-3
-_SAMPLE, _START = 20, 21  # last numbers of the keys of what is drawn
+_CROPS = 4  # patches of a picture in an epoch
+_SAMPLE, _START = 20, 21  # last numbers of the keys of random numbers
 
 
 class WaveCamera(nn.Module):
-    """A learned element, a world and a filter.
+    """A camera with a trainable phase element and filter.
 
-    spectrum: S (n, n) of the pictures. v, t: square roots of the weight γ and of the design depth in m of the filter
-    "towards" the measurement, learned with it. network: (B, 1, n, n) -> the same, any module, behind the blind filter.
+    spectrum: S (n, n) of the pictures. v, t: square roots of the weight γ and of the depth in m of the filter "towards"
+    the measurement, both trained. network: (B, 1, n, n) -> the same, behind the depth-invariant filter.
     """
 
     def __init__(
         self,
         variables: PhaseVariables,
-        world: WaveCameraConfig,
+        config: WaveCameraConfig,
         spectrum: Tensor,
         *,
         restoration: str = "blind",
@@ -63,27 +57,27 @@ class WaveCamera(nn.Module):
     ):
         super().__init__()
         self.network = network
-        self.variables, self.world, self.restoration = variables, world, restoration
+        self.variables, self.config, self.restoration = variables, config, restoration
         self.register_buffer("spectrum", spectrum, persistent=False)
         if restoration == "towards":
             like = variables.change
             self.v = nn.Parameter(like.new_tensor(0.1))
-            self.t = nn.Parameter(like.new_tensor(math.sqrt(1e-3 * world.design)))
-        # Rings are learned in single precision: their sums take most of the time, and Adam needs no more.
+            self.t = nn.Parameter(like.new_tensor(math.sqrt(1e-3 * config.design)))
+        # Rings in single precision: their sums take most of the time, and Adam needs no more.
         dtype = torch.float32 if isinstance(variables.element.profile, Rings) else torch.float64
-        self.expected = ClosedForm(variables(), world, spectrum, dtype=dtype)
+        self.expected = ClosedForm(variables(), config, spectrum, dtype=dtype)
 
     def transfer(self, *, draw: torch.Generator | None = None) -> Tensor:
-        """H (D, W, n, n) of the world's depths, of an element as it may come out of fabrication."""
+        """H (D, W, n, n), with random errors of fabrication if a generator is given."""
         return self.expected.transfer(self.variables(draw=draw))
 
     def filter(self, H: Tensor) -> Tensor:
         """G (W, n, n)."""
         if self.restoration != "towards":
-            return depth_invariant_wiener(H, self.spectrum, self.world.noise)
-        at_target = dataclasses.replace(scene(self.variables(), self.world), depths=1e3 * self.t.square().reshape(1))
-        found = psf(at_target, plan=self.expected.plan)
-        return towards_measurement(transfer(found, self.spectrum.shape[-1])[0], self.v.square())
+            return depth_invariant_wiener(H, self.spectrum, self.config.noise)
+        at_depth = dataclasses.replace(scene(self.variables(), self.config), depths=1e3 * self.t.square().reshape(1))
+        kernels = psf(at_depth, plan=self.expected.plan)
+        return towards_measurement(transfer(kernels, self.spectrum.shape[-1])[0], self.v.square())
 
     def forward(self, pictures: Tensor, depth: Tensor, noise: Tensor, *, draw: torch.Generator | None = None) -> Tensor:
         """Restored colours (B, W, n, n) of pictures (B, n, n) at depths of these numbers (B,); noise: added."""
@@ -91,35 +85,46 @@ class WaveCamera(nn.Module):
         estimate = restored(H[depth], self.filter(H), pictures, noise)[1]
         if self.network is None:
             return estimate
-        single = next(self.network.parameters()).dtype
-        return (
-            self.network(estimate.flatten(0, 1)[:, None].to(single))[:, 0].to(estimate).unflatten(0, estimate.shape[:2])
-        )
+        like = next(self.network.parameters()).dtype
+        colours = self.network(estimate.flatten(0, 1)[:, None].to(like))[:, 0]
+        return colours.to(estimate).unflatten(0, estimate.shape[:2])
+
+
+# -- the initial element
 
 
 def start(
     settings: DesignSettings,
-    world: WaveCameraConfig,
+    config: WaveCameraConfig,
     spectrum: Tensor,
     *,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> PhaseVariables:
-    """Where learning begins: a lens for the design depth, or the best smooth element of several random starts; of rings
-    in steps, those nearest to it in phase."""
+    """The initial element: a lens for the design depth with random Zernike terms; the best smooth element of several
+    random starts; or the rings, of any height or in equal steps, nearest to that in phase."""
     if settings.tolerance and settings.kind != "rings":
         raise ValueError(f"a tolerance of {settings.tolerance:g} mm belongs to rings; {settings.kind!r} has none")
     glass = find_glass(settings.glass)
-    made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
-    path = converging(made_for) / (index(glass, made_for.wavelength) - 1)
-    if settings.kind == "zernike":
-        return _zernike(settings, Element(EvenPowers(path), made_for.radius, glass))
+    goal = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
+    path = converging(goal) / (index(glass, goal.wavelength) - 1)
+    if (
+        settings.kind == "zernike"
+    ):  # Noll's polynomials from piston to the last of `terms`, in contact with a fixed lens
+        lens = Element(EvenPowers(path), goal.radius, glass)
+        random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
+        profile = Zernike(lens.radius.new_zeros(settings.terms))
+        variables = PhaseVariables(dataclasses.replace(lens, profile=profile), others=(lens,))
+        with torch.no_grad():
+            variables.change.copy_(settings.spread * random)
+            variables.change[:3] = 0  # piston and tilts change no picture
+        return variables
     powers = path.new_zeros(max(settings.terms, len(path)))
     powers[: len(path)] = path
-    smooth = Element(EvenPowers(powers), made_for.radius, glass)
+    smooth = Element(EvenPowers(powers), goal.radius, glass)
     basis = radial_powers(smooth.radius, len(powers))[:, : settings.terms]
     best = best_of_starts(
         lambda: PhaseVariables(smooth, basis=basis),
-        world,
+        config,
         spectrum,
         starts=settings.starts,
         spread=settings.spread,
@@ -132,141 +137,41 @@ def start(
     (element,) = detached(best())
     element = as_rings(element, settings.pitch)
     if settings.levels:
-        process = Process(levels=settings.levels, wavelength=float(made_for.wavelength))
-        element, _ = matched(element, process, element.radius.new_tensor(world.wavelengths))
+        process = Process(levels=settings.levels, wavelength=float(goal.wavelength))
+        element, _ = matched(element, process, element.radius.new_tensor(config.wavelengths))
     return PhaseVariables(element, tolerance=settings.tolerance)
 
 
-def _zernike(settings: DesignSettings, lens: Element) -> PhaseVariables:
-    """Noll's polynomials from piston to the last of `terms`, in contact with a lens that stays."""
-    none = Zernike(lens.radius.new_zeros(settings.terms))
-    random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
-    variables = PhaseVariables(dataclasses.replace(lens, profile=none), others=(lens,))
-    with torch.no_grad():
-        variables.change.copy_(settings.spread * random)
-        variables.change[:3] = 0  # piston and tilts change no picture
-    return variables
-
-
-def learn_element(
-    camera: WaveCamera, pictures: Pictures, settings: DesignSettings, run: Run, *, every: int = 20
-) -> Iterator[tuple[int, Record]]:
-    """The steps of learning, one at a time; resumed where the run stands."""
-    groups = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
-    if camera.restoration == "towards":
-        groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})
-    if camera.network is not None:
-        groups.append({"params": list(camera.network.parameters()), "lr": _NETWORK_RATE})
-    optimizer = _optimizer(settings, groups)
-    rates = [group["lr"] for group in groups]
-
-    def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * scheduled(settings.schedule, step / settings.steps)
-        value = _loss(camera, pictures, settings, step, share)
-        return value, {"rate": optimizer.param_groups[0]["lr"], **_filter_record(camera)}
-
-    yield from train(camera, optimizer, loss, steps=settings.steps, run=run, every=every)
-
-
-def adam(
-    parameters: Iterable[nn.Parameter],
-    error: Callable[[int], Tensor],
-    *,
-    steps: int,
-    rate: float,
-    progress: Callable[[Iterable], Iterable] = iter,
-) -> Iterator[float]:
-    """Steps of Adam down the error of each step, kept nowhere; its value comes before the parameters change.
-
-    rate: falls to 0 as a cosine.
-    """
-    optimizer = torch.optim.Adam(parameters, lr=rate)
-    for step in progress(range(steps)):
-        for group in optimizer.param_groups:
-            group["lr"] = rate * scheduled("cosine", step / steps)
-        optimizer.zero_grad()
-        value = error(step)
-        value.backward()
-        yield float(value.detach())
-        optimizer.step()
-
-
-def scheduled(schedule: str, place: float) -> float:
-    """What is left of a rate at a place from 0 to 1 of the way: a function of the step alone, so that runs resume."""
-    return {"constant": 1.0, "linear": 1 - place, "cosine": 0.5 * (1 + math.cos(math.pi * place))}[schedule]
-
-
-def _optimizer(settings: DesignSettings, groups: list[dict]) -> torch.optim.Optimizer:
-    if settings.optimizer == "sgd":
-        return torch.optim.SGD(groups, momentum=0.5, nesterov=True)
-    return {"adam": torch.optim.Adam, "adadelta": torch.optim.Adadelta}[settings.optimizer](groups)
-
-
-def _loss(camera: WaveCamera, pictures: Pictures, settings: DesignSettings, step: int, share: Share) -> Tensor:
-    draw = torch.Generator().manual_seed(int(draws(settings.seed, step, _SAMPLE).integers(2**62)))
-    if settings.loss == "spectral":
-        # One process has it all: shares of a sum that is not one over samples.
-        return camera.expected(camera.variables(draw=draw)) / share.processes
-    per_epoch = max(1, len(pictures) * 4 // settings.batch)
-    epoch, place = divmod(step, per_epoch)
-    samples = share.of(range(place * settings.batch, (place + 1) * settings.batch))
-    parts = [_sample(camera, pictures, settings, sample, epoch) for sample in samples]
-    picture, depth, noise = (torch.stack(part) for part in zip(*parts, strict=True))
-    estimate = camera(picture, depth, noise, draw=draw)
-    return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch
-
-
-def _sample(camera: WaveCamera, pictures: Pictures, settings: DesignSettings, sample: int, epoch: int):
-    """Picture (n, n), number of its depth, noise (W, n, n): keyed by the sample's number."""
-    n = camera.spectrum.shape[-1]
-    count = len(pictures) * 4
-    patch = crop(pictures, sample % count, epoch=epoch, size=n // 2, crops=4, seed=settings.seed)
-    random = draws(settings.seed, epoch, sample, _SAMPLE)
-    depth = int(random.integers(len(camera.world.depths)))
-    sigma = random.uniform(*settings.noise)
-    noise = sigma * random.standard_normal((len(camera.world.wavelengths), n, n))
-    like = camera.spectrum
-    return torch.as_tensor(mirrored(patch)).to(like), torch.tensor(depth), torch.as_tensor(noise).to(like)
-
-
-def _filter_record(camera: WaveCamera) -> Record:
-    if camera.restoration != "towards":
-        return {}
-    return {"gamma": float(camera.v.detach() ** 2), "target_m": float(camera.t.detach() ** 2)}
-
-
-def begin(
-    settings: DesignSettings,
-    world: WaveCameraConfig,
+def best_of_starts(
+    variables: Callable[[], PhaseVariables],
+    config: WaveCameraConfig,
     spectrum: Tensor,
-    folder: str | Path,
     *,
-    pictures: str,
+    starts: int,
+    spread: float,
+    steps: int,
+    seed: int = 0,
     progress: Callable[[Iterable], Iterable] = iter,
-) -> tuple[WaveCamera, Run]:
-    """The camera of a run as it begins and its folder; the start is found once and kept there.
+) -> PhaseVariables:
+    """The lowest minimum of the closed-form error by L-BFGS from random starts; several minima exist.
 
-    pictures: `digest` of those that are learned from, whose spectrum it is.
-    Raises training.OtherSettings where the folder was begun with others.
+    variables: new ones at each call; spread: standard deviation of the initial changes; starts 0: unchanged variables.
     """
-    run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(world), "pictures": pictures})
-    kept = run.folder / "start.pt"
-    if kept.exists():
-        variables = start(dataclasses.replace(settings, starts=0), world, spectrum)
-        found = read_state(kept)
-        try:
-            with torch.no_grad():
-                variables.change.copy_(found["change"])
-            variables.start = found["start"]
-        except (KeyError, RuntimeError, TypeError) as error:
-            raise DamagedRun(f"{kept}: no start of this run; remove it to find it anew") from error
-    else:
-        variables = start(settings, world, spectrum, progress=progress)
-        found = {"start": variables.start, "change": variables.change.detach()}
-        write_atomically(kept, lambda file: torch.save(found, file))
-    network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
-    return WaveCamera(variables, world, spectrum, restoration=settings.restoration, network=network), run
+    best, least = variables(), math.inf
+    for number in progress(range(starts)):
+        trial = variables()
+        with torch.no_grad():
+            for p in trial.parameters():
+                p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
+        expected = ClosedForm(trial(), config, spectrum)
+
+        def error(trial=trial, expected=expected) -> Tensor:
+            return expected(trial())
+
+        lowest = min(minimise_tensors(list(trial.parameters()), error, steps=steps).values)
+        if lowest < least:
+            best, least = trial, lowest
+    return best
 
 
 def radial_powers(radius: Tensor, terms: int) -> Tensor:
@@ -274,10 +179,99 @@ def radial_powers(radius: Tensor, terms: int) -> Tensor:
 
     Z_n0 = √(n + 1) Σ_s (-1)^s (n - s)!/(s! ((n/2 - s)!)²) (r/R)^(n - 2s);   piston is left out
     """
-    found = torch.zeros(terms, terms, dtype=torch.float64)
+    coefficients = torch.zeros(terms, terms, dtype=torch.float64)
     for k in range(1, terms + 1):
         for s in range(k):
             share = math.factorial(2 * k - s) / (math.factorial(s) * math.factorial(k - s) ** 2)
-            found[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
+            coefficients[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
     power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
-    return power[:, None] * found.to(radius)
+    return power[:, None] * coefficients.to(radius)
+
+
+def begin(
+    settings: DesignSettings,
+    config: WaveCameraConfig,
+    spectrum: Tensor,
+    folder: str | Path,
+    *,
+    pictures: str,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> tuple[WaveCamera, Run]:
+    """The camera at the start of a run, and its folder, where the initial element is stored.
+
+    pictures: `digest` of the training pictures, whose spectrum is given.
+    Raises training.OtherSettings if the folder was begun with others.
+    """
+    run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(config), "pictures": pictures})
+    file = run.folder / "start.pt"
+    if file.exists():
+        variables = start(dataclasses.replace(settings, starts=0), config, spectrum)
+        state = read_state(file)
+        try:
+            with torch.no_grad():
+                variables.change.copy_(state["change"])
+            variables.start = state["start"]
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise DamagedRun(f"{file}: not the start of this run; remove it to compute it again") from error
+    else:
+        variables = start(settings, config, spectrum, progress=progress)
+        state = {"start": variables.start, "change": variables.change.detach()}
+        write_atomically(file, lambda stream: torch.save(state, stream))
+    network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
+    return WaveCamera(variables, config, spectrum, restoration=settings.restoration, network=network), run
+
+
+# -- optimisation
+
+
+def learn_element(
+    camera: WaveCamera, pictures: Pictures, settings: DesignSettings, run: Run, *, every: int = 20
+) -> Iterator[tuple[int, Record]]:
+    """The steps of optimisation, one at a time; a begun run is resumed."""
+    groups = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
+    if camera.restoration == "towards":
+        groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})
+    if camera.network is not None:
+        groups.append({"params": list(camera.network.parameters()), "lr": _NETWORK_RATE})
+    if settings.optimizer == "sgd":
+        optimizer = torch.optim.SGD(groups, momentum=0.5, nesterov=True)
+    else:
+        optimizer = {"adam": torch.optim.Adam, "adadelta": torch.optim.Adadelta}[settings.optimizer](groups)
+    rates = [group["lr"] for group in groups]
+
+    def loss(step: int, share: Share) -> tuple[Tensor, Record]:
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * scheduled(settings.schedule, step / settings.steps)
+        record = {"rate": optimizer.param_groups[0]["lr"]}
+        if camera.restoration == "towards":
+            record |= {"gamma": float(camera.v.detach() ** 2), "target_m": float(camera.t.detach() ** 2)}
+        return _loss(camera, pictures, settings, step, share), record
+
+    return train(camera, optimizer, loss, steps=settings.steps, run=run, every=every)
+
+
+def scheduled(schedule: str, part: float) -> float:
+    """Factor of a learning rate at a part (0 to 1) of the steps: a function of the step alone, so that runs resume."""
+    return {"constant": 1.0, "linear": 1 - part, "cosine": 0.5 * (1 + math.cos(math.pi * part))}[schedule]
+
+
+def _loss(camera: WaveCamera, pictures: Pictures, settings: DesignSettings, step: int, share: Share) -> Tensor:
+    draw = torch.Generator().manual_seed(int(draws(settings.seed, step, _SAMPLE).integers(2**62)))
+    if settings.loss == "spectral":
+        # Every process computes all of it: it is not a sum over samples.
+        return camera.expected(camera.variables(draw=draw)) / share.processes
+    config, like, n = camera.config, camera.spectrum, camera.spectrum.shape[-1]
+    epoch, place = divmod(step, max(1, len(pictures) * _CROPS // settings.batch))
+    samples = []
+    for number in share.of(range(place * settings.batch, (place + 1) * settings.batch)):
+        sample = number % (len(pictures) * _CROPS)
+        patch = crop(pictures, sample, epoch=epoch, size=n // 2, crops=_CROPS, seed=settings.seed)
+        random = draws(settings.seed, epoch, number, _SAMPLE)
+        depth = int(random.integers(len(config.depths)))
+        noise = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
+        samples.append(
+            (torch.as_tensor(mirrored(patch)).to(like), torch.tensor(depth), torch.as_tensor(noise).to(like))
+        )
+    picture, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
+    estimate = camera(picture, depth, noise, draw=draw)
+    return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch

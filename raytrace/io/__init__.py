@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
+from raytrace.io import oslo, ray_optics
 from raytrace.io.codev import read as codev_read
 from raytrace.io.codev import write as codev_write
-from raytrace.io.oslo import read as oslo_read
-from raytrace.io.ray_optics import read as ray_optics_read
 from raytrace.io.report import NONE, Draft, Substitutes, Varied, operand_uses, substitutes_of
 from raytrace.io.report import BadSubstitute as BadSubstitute
 from raytrace.io.report import ImportReport as ImportReport
@@ -91,8 +90,8 @@ FORMATS = {
     ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True),
     ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format("seq", codev_read.read, codev_write.write),
-    ".len": Format("len", oslo_read.read),
-    ".roa": Format("roa", ray_optics_read.read, load=read_content),
+    ".len": Format("len", oslo.read),
+    ".roa": Format("roa", ray_optics.read, load=read_content),
     ".csv": Format("table", table_read.read, table_write.write),
     ".tsv": _TEXT_TABLE,
     ".txt": _TEXT_TABLE,

@@ -1,35 +1,20 @@
-"""Results and prescriptions as pandas tables; with `ray_tables` the only modules of the library that load pandas."""
+"""Prescriptions as pandas tables; the only module that imports pandas at the top."""
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 
 import pandas as pd
 
-from raytrace.files import write_atomically
 from raytrace.io.report import Draft
 from raytrace.io.source import LensFileError, Place
 from raytrace.io.table.read import build
 from raytrace.io.table.system import written
 from raytrace.io.table.text import Table, add_metadata, add_row, header
 from raytrace.io.table.write import rows
-from raytrace.maths.result import Result, flat
 from raytrace.system.lens import Lens
 
 _NUMERIC = ("curvature", "thickness", "conic", "semi_diameter")
 _PLACE = Place("DataFrame")
-
-
-def frame_of(result: Result) -> pd.DataFrame:
-    """A result as a table: a row for every point of every curve; units of the columns are in `frame.attrs["units"]`."""
-    frame = pd.DataFrame(flat(result.columns()))
-    frame.attrs["units"] = result.units()
-    return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in result.words().items()})
-
-
-def save(result: Result, path: str | PathLike) -> None:
-    """Write a result's table as .csv, as a whole or not at all."""
-    write_atomically(path, lambda file: result.to_frame().to_csv(file, index=False))
 
 
 def to_frame(lens: Lens, *, catalogs: Sequence[Path] = ()) -> pd.DataFrame:

@@ -8,7 +8,6 @@ import os
 import warnings
 
 import numpy as np
-import pandas
 import torch
 
 from raytrace.files import read_bytes
@@ -41,8 +40,10 @@ def read_rays(path: str | os.PathLike, lens: Lens) -> Rays:
     return dataclasses.replace(rays, wavelength=torch.from_numpy(values[:, 6].copy()))
 
 
-def _parsed(path: str | os.PathLike) -> pandas.DataFrame:
+def _parsed(path: str | os.PathLike):
     """The table as words, without blank lines, which the index still counts, and without columns that are empty."""
+    import pandas
+
     try:
         content = io.BytesIO(read_bytes(path, LARGEST))
         with warnings.catch_warnings():
@@ -64,7 +65,7 @@ def _parsed(path: str | os.PathLike) -> pandas.DataFrame:
     return table.iloc[:, [k for k in range(table.shape[1]) if k not in empty]]
 
 
-def _refuse_columns(table: pandas.DataFrame, path: str | os.PathLike) -> None:
+def _refuse_columns(table, path: str | os.PathLike) -> None:
     """Refuse a table without the columns of rays, a repeated column, and a column of numbers that is not known."""
     known, names = (*COLUMNS, "wavelength", *TRACED), list(table.columns)
     expected = f"{','.join(COLUMNS)}[,wavelength]"
@@ -82,7 +83,7 @@ def _refuse_columns(table: pandas.DataFrame, path: str | os.PathLike) -> None:
             raise RayTableError(f"{path}:1: column {name[:40]!r} is not known; {meant}")
 
 
-def _refuse_values(values: np.ndarray, words: pandas.DataFrame, path: str | os.PathLike) -> None:
+def _refuse_values(values: np.ndarray, words, path: str | os.PathLike) -> None:
     """Refuse entries that are not finite, directions of length 0 and wavelengths not above 0, by their lines."""
     lines = words.index.to_numpy() + 2
     for row, column in np.argwhere(~np.isfinite(values))[:1]:
@@ -100,7 +101,7 @@ def _words(error: object) -> str:
     return " ".join(str(error).split())
 
 
-def _floats(column: pandas.Series) -> np.ndarray:
+def _floats(column) -> np.ndarray:
     """The column as float64, every text read to the nearest double; nan where it is no number."""
     try:
         return column.to_numpy(dtype=np.float64, na_value=np.nan)

@@ -19,8 +19,8 @@ from torch import Tensor
 from raytrace.io.source import LensFileError, Place
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.system.conditions import RAY_AIMING
 from raytrace.system.dimensions import DIMENSION
+from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 
 # -- substitutes ------------------------------------------------------------------------------------------------------

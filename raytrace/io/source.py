@@ -7,6 +7,7 @@ import json
 import os
 import re
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,6 +169,11 @@ def double(numbers: float | list) -> Tensor:
     return torch.as_tensor(numbers, dtype=torch.float64)
 
 
+def nonzero(number: float | None) -> Tensor | None:
+    """A number of a shape; None where it is 0 and the surface has none of it."""
+    return double(number) if number else None
+
+
 def exact(number: Tensor | float, quantity: str, place: Place) -> str:
     """The shortest decimal (at most 17 digits) that reads back as the same 64-bit number.
 
@@ -309,6 +315,29 @@ class Block:
             if keyword in self.records:
                 return self.records[keyword][-1]
         return None
+
+
+def by_word(rows: dict[str, str]) -> dict[str, str]:
+    """A text for each of the words that it has in a table of rows."""
+    return {word: text for text, words in rows.items() for word in words.split()}
+
+
+def in_lines(records: Sequence[Record]) -> str:
+    """Keywords with their lines, as an error lists them."""
+    return " and ".join(f"{record.keyword} in line {record.place.line}" for record in records)
+
+
+def refuse_surplus(surfaces: Sequence, place: Place) -> None:
+    """Raise LensFileError where there is no space for a further surface."""
+    if len(surfaces) >= MAX_SURFACES:
+        raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", place)
+
+
+def refuse_few(surfaces: Sequence[Block]) -> None:
+    """Raise LensFileError for a file with fewer surfaces than the simplest lens."""
+    if len(surfaces) < 3:
+        message = f"{len(surfaces)} surfaces, expected at least object, one surface and image; file cut off?"
+        raise LensFileError(message, surfaces[-1].place)
 
 
 def warn_of_repeats(blocks: list[Block], once, report) -> None:

@@ -11,8 +11,7 @@ from types import MappingProxyType
 import torch
 
 from raytrace.files import encoding, read_bytes, write_text
-from raytrace.materials.formulas import BY_NUMBER, FORMULAS
-from raytrace.materials.glass import Glass
+from raytrace.materials.glass import BY_NUMBER, FORMULAS, Glass
 from raytrace.words import calling_level
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}

@@ -18,8 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.materials.formulas import FORMULAS
-from raytrace.materials.glass import Glass, is_air, refractive_index
+from raytrace.materials.glass import FORMULAS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 

@@ -3,9 +3,8 @@
     (a, a') (b, b') = (a b, a' b + a b')
 
 For the many small steps of an optimisation, which are too few numbers each for torch to be fast. Operators and numpy's
-functions work on dual numbers as on arrays; what is no dual number does not change.
-
-Source: Clifford 1873; Griewank & Walther, Evaluating Derivatives, 2008, ch. 3 (vector forward mode).
+functions work on dual numbers as on arrays. Source: Clifford 1873; Griewank & Walther, Evaluating Derivatives, 2008,
+ch. 3 (vector forward mode).
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt
 
 
 class Dual:
@@ -121,6 +120,11 @@ def slope_of(number, variables: int) -> np.ndarray:
 def quotient(a, b):
     """a/b of tensors or numbers; infinite where a number b is 0."""
     return a / b if isinstance(b, Tensor) or value_of(b) != 0 else np.inf
+
+
+def divide(a, b):
+    """a/b of tensors, 0 where b is 0; of arrays or dual numbers as numpy divides."""
+    return safe_divide(a, b) if isinstance(b, Tensor) else a / b
 
 
 def select(condition, a, b):

@@ -1,51 +1,30 @@
 """Results: what a verb gives, as numbers, as a table, as text, as a document for JSON and as a figure."""
 
-import importlib
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from os import PathLike
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.files import write_atomically
 from raytrace.maths.numerics import broadcast_shape
-
-
-def lent(place: str):
-    """A method that a higher room lends to a value: `place` is "room.file.function", imported when it is called.
-
-    Called on an instance it gets the instance first, as any method.
-    """
-
-    def method(self, *arguments, **options):
-        return called(place)(self, *arguments, **options)
-
-    method.__doc__ = f"See `raytrace.{place}`."
-    return method
-
-
-def called(place: str):
-    """The function "room.file.function" of this package."""
-    module, function = place.rsplit(".", 1)
-    return getattr(importlib.import_module(f"raytrace.{module}"), function)
+from raytrace.plotting import style
 
 
 class Result:
-    """What every verb's result can do; a class of results names its columns, and its figure if it has one.
+    """A result of a public function; a class of results defines its columns, and `draw` if it has a figure.
 
-    columns: a table; to_frame: the same for pandas; document: what `--json` writes; str: what the command prints;
+    columns: a table; to_frame: the same for pandas; document: of `--json`; str: the text that the command prints;
     plot: the figure; save: what `-o` writes.
     """
 
     __slots__ = ()
 
-    #: The function that draws it, "plotting.file.function"(result, **options) -> Figure.
-    FIGURE: ClassVar[str] = ""
-
     @property
     def falls_short(self) -> bool:
-        """Whether what was asked for is not reached: the command prints and saves the result, and exits with 1."""
+        """Whether a goal is missed: the command prints and saves the result, and exits with 1."""
         return False
 
     def columns(self) -> dict[str, Tensor]:
@@ -53,27 +32,38 @@ class Result:
         raise TypeError(f"{type(self).__name__} is no table; see its document() for what it holds")
 
     def words(self) -> dict[str, Sequence[str]]:
-        """What the numbers of a column, 0 and up, stand for, by the name of the column."""
+        """Texts of a column whose numbers, 0 and up, count them, by the name of the column."""
         return {}
 
     def units(self) -> dict[str, str]:
-        """Units of columns, by the name of the column, of those that have one; `to_frame` has them in `attrs`."""
+        """Units of columns by their names, of those that have one; `to_frame` has them in `attrs`."""
         return {}
 
-    to_frame = lent("io.frames.frame_of")
-    save = lent("io.frames.save")
+    def to_frame(self):
+        """The table for pandas, a row for every point of every curve; units are in `frame.attrs["units"]`."""
+        import pandas
+
+        frame = pandas.DataFrame(flat(self.columns()))
+        frame.attrs["units"] = self.units()
+        return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in self.words().items()})
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the table as .csv, as a whole or not at all."""
+        write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
 
     def document(self) -> dict:
         """The result for JSON: plain numbers, null for what is undefined."""
         return {"results": rows(self.columns())}
 
-    def plot(self, path=None, **options):
+    def draw(self, **options):
+        """The figure of `plot`. Raises TypeError: no figure."""
+        raise TypeError(f"{type(self).__name__} has no figure")
+
+    def plot(self, path: str | PathLike | None = None, **options):
         """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given."""
-        if not self.FIGURE:
-            raise TypeError(f"{type(self).__name__} has no figure")
-        figure = called(self.FIGURE)(self, **options)
+        figure = self.draw(**options)
         if path is not None:
-            called("plotting.style.save")(figure, path)
+            style.save(figure, path)
         return figure
 
     def __repr__(self) -> str:

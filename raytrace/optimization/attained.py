@@ -1,16 +1,17 @@
-"""Reached: what conditions and boundaries of an optimisation ask for, what the lens has, and why it misses them.
+"""Conditions and boundaries of an optimisation: what is required, what is reached, and why a lens misses it.
 
-Conditions c_i = 0 or ≤ 0 exclude one another, with the bounds of the variables, where multipliers w_i exist for which
-Σ w_i c_i does not depend on the variables that are free, or is bounded by them, and is above 0 (Farkas). They come from
-the linear program of least total miss
+Conditions c_i = 0 or ≤ 0 exclude one another, with the bounds of the variables, if multipliers w_i exist for which
+Σ w_i c_i does not depend on the free variables, or is bounded by them, and is above 0 (Farkas). They come from the
+linear program of minimum total miss
 
-    least Σ t_i  where  |c_i + a_i p| ≤ t_i  or  c_i + a_i p ≤ t_i,  lower ≤ x + p ≤ upper,
+    minimise Σ t_i  with  |c_i + a_i p| ≤ t_i  or  c_i + a_i p ≤ t_i,  lower ≤ x + p ≤ upper,
 
-a_i the derivatives of c_i. At one point that is a statement about the linear model. Where the sum moves as the model
-says at other points, too, it is one about the conditions themselves.
+a_i the derivatives of c_i. At one point the result concerns the linear model. If the sum moves at other points as the
+model predicts, it concerns the conditions themselves.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -18,30 +19,29 @@ from scipy.optimize import linprog
 
 from raytrace.optimization.merit import arguments
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import RELATIONS, NoProblem, Problem, typical_of
+from raytrace.optimization.problem import RELATIONS, Condition, NoProblem, Problem, typical_of
 from raytrace.optimization.variables import name_of
 
-EXACT = 1e-6  # of a target, or of 1: by which a condition that is held may be missed
-SOFT = 1e-3  # of a target, or of 1 µm: by which a boundary may be passed that only costs what passes it
+EXACT = 1e-6  # tolerance of a condition, relative to its target, or to 1
+SOFT = 1e-3  # tolerance of a boundary in the merit function, relative to its target, or 1 µm
 _EXCLUDED = 1e-7  # total miss of the linear program, conditions by their slopes
 _COUNTS = 1e-6  # multipliers that count
-_ELSEWHERE = 0.03  # of what is a lot of a variable: how far away a contradiction is checked
+_ELSEWHERE = 0.03  # relative to the scale of the variables: distance at which a contradiction is checked
 _TRIES = 4
 _NAMED = 4  # variables in one sentence
 
 
 class NotReached(UserWarning):
-    """A condition or a boundary that the lens at the end of an optimisation does not meet."""
+    """A condition or a boundary that the optimised lens does not meet."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reached:
-    """One condition or boundary of an optimisation: what was asked for and what was reached.
+    """One condition or boundary of an optimisation.
 
-    asked, reached: in mm of conditions, in the unit of the row of rows.
-
-    name: of the condition, or of the operand and its arguments; relation: =, <= or >=; row: in the merit function, from
-    1; 0 of `hold`; configuration: 0 where the lens has one; surface: which one passes a boundary most, 0 for none.
+    name: of the condition, or of the operand and its arguments; relation: =, <= or >=; asked, reached: the target and
+    the value, in mm of conditions, in the unit of the row of rows; row: in the merit function, from 1; 0 of `hold`;
+    configuration: 0 for a lens of one; surface: the one that passes a boundary most, 0 for none; why: the reason.
     """
 
     name: str
@@ -56,22 +56,18 @@ class Reached:
 
     @property
     def words(self) -> str:
-        """What was asked for, as "efl=100"."""
-        return f"{self.name}{self.relation}{self.asked:.6g}" if not self.row else self._of_row
-
-    @property
-    def _of_row(self) -> str:
-        return f"{self.name} {self.relation} {self.asked:.6g} (row {self.row})"
+        """The condition, as "efl=100"."""
+        if self.row:
+            return f"{self.name} {self.relation} {self.asked:.6g} (row {self.row})"
+        return f"{self.name}{self.relation}{self.asked:.6g}"
 
     @property
     def place(self) -> str:
-        told = [f"surface {self.surface}"] if self.surface else []
-        return ", ".join([*told, *([f"configuration {self.configuration}"] if self.configuration else [])])
+        parts = {"surface": self.surface, "configuration": self.configuration}
+        return ", ".join(f"{name} {number}" for name, number in parts.items() if number)
 
     def document(self) -> dict:
-        found = dataclasses.asdict(self)
-        found["reached"] = self.reached if np.isfinite(self.reached) else None
-        return found
+        return {**dataclasses.asdict(self), "reached": self.reached if np.isfinite(self.reached) else None}
 
     def __str__(self) -> str:
         where = f" ({self.place})" if self.place else ""
@@ -81,13 +77,13 @@ class Reached:
 
 def reached(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> tuple[Reached, ...]:
     """Every condition, then every boundary of the merit function, at variables (n,) between bounds (n,)."""
-    found = [*_conditions(problem, x), *_boundaries(problem, x)]
-    if all(one.met for one in found):
-        return tuple(found)
-    reasons = _reasons(problem, x, lower, upper)
+    results = [*_conditions(problem, x), *_boundaries(problem, x)]
+    if all(result.met for result in results):
+        return tuple(results)
+    reasons, rows = _reasons(problem, x, lower, upper), [*_held_rows(problem), *_bounding_rows(problem)]
     return tuple(
-        one if one.met else dataclasses.replace(one, why=reasons.get(number) or _ended(one))
-        for number, one in zip(_numbers(problem), found, strict=True)
+        result if result.met else dataclasses.replace(result, why=reasons.get(row) or _default_reason(result))
+        for row, result in zip(rows, results, strict=True)
     )
 
 
@@ -98,13 +94,13 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     conflict = _conflict(problem, needs, x, lower, upper)
     if conflict is None or not _holds_elsewhere(problem, conflict, x, lower, upper):
         return
-    named = [condition_name(problem, number) for number in conflict.numbers]
-    now = {one.words: one.reached for one in _conditions(problem, x)}
-    told = ", ".join(f"{name} (now {now[name]:.6g})" if name in now else name for name in named)
-    raise NoProblem(f"`hold`: {told}: {conflict.words(problem)}; change what is held, `vary` or `bounds`")
+    named = [_condition_text(problem, number) for number in conflict.numbers]
+    values = {condition.words: condition.reached for condition in _conditions(problem, x)}
+    listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
+    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change what is held, `vary` or `bounds`")
 
 
-# -- what was reached --------------------------------------------------------------------------------------------------
+# -- values ------------------------------------------------------------------------------------------------------------
 
 
 def _held_rows(problem: Problem) -> list[int]:
@@ -114,7 +110,7 @@ def _held_rows(problem: Problem) -> list[int]:
 
 
 def _bounding_rows(problem: Problem) -> list[int]:
-    """Places of rows of the merit function that are to be met: with a weight below 0, or boundaries."""
+    """Places of rows of the merit function that must be met: with a weight below 0, or boundaries."""
     weights = problem.evaluation.weights
     return [
         k
@@ -123,74 +119,66 @@ def _bounding_rows(problem: Problem) -> list[int]:
     ]
 
 
-def _numbers(problem: Problem) -> list[int]:
-    """The places of all conditions and boundaries, in the order of `reached`."""
-    return [*_held_rows(problem), *_bounding_rows(problem)]
-
-
 def _conditions(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
-    values = problem.evaluated(x).values
-    several = len(problem.model.views) > 1
-    for k, one in zip(_held_rows(problem), problem.conditions, strict=True):
-        unit = problem.unit ** OPERANDS[one.row.operand].length
-        relation, target, number = one.relation, unit * problem.evaluation.rows[k].target, unit * float(values[k])
+    values, model = problem.evaluated(x).values, problem.model
+    for k, condition in zip(_held_rows(problem), problem.conditions, strict=True):
+        unit = problem.unit ** OPERANDS[condition.row.operand].length
+        relation, target, number = condition.relation, unit * problem.evaluation.rows[k].target, unit * float(values[k])
         missed = abs(number - target) if relation == "=" else RELATIONS[relation] * (number - target)
-        at = one.configuration or problem.model.lens.current_configuration
-        name = one.name or one.row.name
         met = bool(missed <= EXACT * max(abs(target), 1.0))
-        name = f"{name}@{at}" if one.configuration else name
-        yield Reached(name, relation, target, number, met, configuration=at if several else 0)
+        configuration = (condition.configuration or model.lens.current_configuration) if len(model.views) > 1 else 0
+        yield Reached(_name(condition), relation, target, number, met, configuration=configuration)
+
+
+def _name(condition: Condition) -> str:
+    at = f"@{condition.configuration}" if condition.configuration else ""
+    return f"{condition.name or condition.row.name}{at}"
 
 
 def _boundaries(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
-    evaluation, found = problem.evaluation, problem.evaluated(x)
-    worst = _worst(found.sides)
-    at = {line.number - 1: planner for planner, lines, _ in evaluation.groups for line in lines}
+    evaluation, evaluated = problem.evaluation, problem.evaluated(x)
+    largest: dict[int, tuple[float, int]] = {}  # excess of every one-sided row, and its surface
+    for rows, excesses, _, surfaces in evaluated.sides:
+        for row, excess, surface in zip(rows.tolist(), excesses.tolist(), surfaces.tolist(), strict=True):
+            if row not in largest or excess > largest[row][0]:
+                largest[row] = excess, surface
+    configurations = {
+        line.number - 1: planner.view.configuration for planner, lines, _ in evaluation.groups for line in lines
+    }
     several = len(problem.model.views) > 1
     for k in _bounding_rows(problem):
         row, operand = problem.rows[k], OPERANDS[problem.rows[k].operand]
-        relation, number, surface = operand.bounds or "=", float(found.values[k]), 0
+        relation, number, surface = operand.bounds or "=", float(evaluated.values[k]), 0
         side = -1.0 if relation == ">=" else 1.0
-        if k in worst:
-            excess, surface = worst[k]
+        if k in largest:
+            excess, surface = largest[k]
             number = row.target + side * excess / evaluation.factors[k]
             surface = surface if excess > 0 else 0
         elif operand.bounds and operand.refers:
-            number = float(found.values[row.integers[0] - 1])
+            number = float(evaluated.values[row.integers[0] - 1])
             number = abs(number) if row.operand.startswith("AB") else number
         missed = abs(number - row.target) if relation == "=" else side * (number - row.target)
-        part = EXACT if evaluation.weights[k] < 0 else SOFT
-        least = (1e-3 / problem.unit if operand.length == 1 else part) if part == SOFT else part
-        met = bool(missed <= (max(part * abs(row.target), least)))
-        where = at[k].view.configuration if several else 0
+        tolerance = EXACT if evaluation.weights[k] < 0 else SOFT
+        least = 1e-3 / problem.unit if tolerance == SOFT and operand.length == 1 else tolerance
+        met = bool(missed <= max(tolerance * abs(row.target), least))
         name = f"{row.name} {arguments(row)}".strip()
-        yield Reached(name, relation, row.target, number, met, k + 1, where, surface)
+        yield Reached(name, relation, row.target, number, met, k + 1, configurations[k] if several else 0, surface)
 
 
-def _worst(sides: Sequence[tuple]) -> dict[int, tuple[float, int]]:
-    """Of every one-sided row the largest excess and its surface."""
-    found: dict[int, tuple[float, int]] = {}
-    for rows, excess, _, surfaces in sides:
-        for row, e, surface in zip(rows.tolist(), excess.tolist(), surfaces.tolist(), strict=True):
-            if row not in found or e > found[row][0]:
-                found[row] = e, surface
-    return found
-
-
-def _ended(one: Reached) -> str:
-    if not np.isfinite(one.reached):
+def _default_reason(result: Reached) -> str:
+    if not np.isfinite(result.reached):
         return "a ray that it needs is lost"
-    if one.row:
+    if result.row:
         return "the rest of the merit function outweighs it: give it more weight"
     return "the descent ended first: allow more cycles, or begin nearer to it"
 
 
-# -- why ---------------------------------------------------------------------------------------------------------------
+# -- reasons -----------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class _Need:
-    """c + a p = 0, or ≤ 0: number: place of its row among all rows; part: its number among those of the row."""
+    """c + a p = 0, or ≤ 0; number: place of its row among all rows; part: its number within the row."""
 
     number: int
     miss: float
@@ -222,36 +210,36 @@ class _Conflict:
         return "they exclude one another" if several else "it is out of reach"
 
 
-def condition_name(problem: Problem, number: int) -> str:
-    """A condition as it was asked for, or a row of the merit function by its number."""
+def _condition_text(problem: Problem, number: int) -> str:
+    """A condition in the syntax of `hold`, or a row of the merit function by its number."""
     held = _held_rows(problem)
     if number in held:
-        one = problem.conditions[held.index(number)]
-        at = f"@{one.configuration}" if one.configuration else ""
-        unit = problem.unit ** OPERANDS[one.row.operand].length
-        return f"{one.name or one.row.name}{at}{one.relation}{unit * problem.evaluation.rows[number].target:.6g}"
+        condition = problem.conditions[held.index(number)]
+        unit = problem.unit ** OPERANDS[condition.row.operand].length
+        return f"{_name(condition)}{condition.relation}{unit * problem.evaluation.rows[number].target:.6g}"
     row = problem.rows[number]
     relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
     return f"{row.name} {arguments(row)}".strip() + f" {relation} {row.target:.6g} (row {number + 1})"
 
 
 def _needs(problem: Problem, x: np.ndarray) -> list[_Need]:
-    """All that is to be met at x, in units of the rows; none of rows that have no value there."""
-    found, evaluation = problem.evaluated(x, True), problem.evaluation
-    sided = {int(row) for rows, *_ in found.sides for row in rows}
-    needs = []
-    for k, residual, slope in zip(found.of_row.tolist(), found.residuals, found.jacobian, strict=True):
-        if evaluation.weights[k] < 0 and k not in sided and not found.lost[k]:
-            factor, sign = evaluation.factors[k], int(problem.signs[k])
-            needs.append(_Need(k, (sign or 1) * residual / factor, (sign or 1) * slope / factor, sign == 0))
-    for rows, excess, slopes, _ in found.sides:
-        for k, e, slope in zip(rows.tolist(), excess, slopes, strict=True):
-            factor = evaluation.factors[k]
-            needs.append(_Need(k, e / factor, slope / factor, False))
-    seen: dict[int, int] = {}
-    for place, need in enumerate(needs):
-        seen[need.number] = seen.get(need.number, -1) + 1
-        needs[place] = dataclasses.replace(need, part=seen[need.number])
+    """All conditions and boundaries at x, in units of the rows; none of rows without a value."""
+    evaluated, evaluation = problem.evaluated(x, True), problem.evaluation
+    sided = {int(row) for rows, *_ in evaluated.sides for row in rows}
+    needs, parts = [], Counter()
+
+    def add(k: int, miss: float, slope: np.ndarray, sign: float, equal: bool) -> None:
+        scale = sign / evaluation.factors[k]
+        needs.append(_Need(k, scale * miss, scale * slope, equal, parts[k]))
+        parts[k] += 1
+
+    for k, residual, slope in zip(evaluated.of_row.tolist(), evaluated.residuals, evaluated.jacobian, strict=True):
+        if evaluation.weights[k] < 0 and k not in sided and not evaluated.lost[k]:
+            sign = int(problem.signs[k])
+            add(k, residual, slope, sign or 1, sign == 0)
+    for rows, excesses, slopes, _ in evaluated.sides:
+        for k, excess, slope in zip(rows.tolist(), excesses, slopes, strict=True):
+            add(k, excess, slope, 1, False)
     return needs
 
 
@@ -261,7 +249,7 @@ def _scale(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 
 def _conflict(problem: Problem, needs: Sequence[_Need], x: np.ndarray, lower, upper) -> _Conflict | None:
-    """Needs of which the linear model says that they exclude one another within the bounds."""
+    """Needs that exclude one another within the bounds by the linear model."""
     if not needs:
         return None
     scale = _scale(problem, x)
@@ -280,20 +268,19 @@ def _conflict(problem: Problem, needs: Sequence[_Need], x: np.ndarray, lower, up
     right = np.concatenate([-misses, misses[equal]])
     ends = [*zip((lower - x) / scale, (upper - x) / scale, strict=True), *[(0.0, np.inf)] * count]
     cost = np.concatenate([np.zeros(size), np.ones(count)])
-    done = linprog(cost, A_ub=np.hstack([rows, slack]), b_ub=right, bounds=ends, method="highs")
-    if done.status != 0 or done.fun <= _EXCLUDED:
+    solution = linprog(cost, A_ub=np.hstack([rows, slack]), b_ub=right, bounds=ends, method="highs")
+    if solution.status != 0 or solution.fun <= _EXCLUDED:
         return None
-    signed = -done.ineqlin.marginals[:count]
-    signed[equal] += done.ineqlin.marginals[count:]
-    taken = np.abs(signed) > _COUNTS
-    at_bound = (np.abs(done.lower.marginals) + np.abs(done.upper.marginals))[:size] > _COUNTS
-    chosen = [k for k in range(count) if taken[k]]
+    signed = -solution.ineqlin.marginals[:count]
+    signed[equal] += solution.ineqlin.marginals[count:]
+    at_bound = (np.abs(solution.lower.marginals) + np.abs(solution.upper.marginals))[:size] > _COUNTS
+    chosen = np.flatnonzero(np.abs(signed) > _COUNTS).tolist()
     weights = (signed / units)[chosen]
     return _Conflict(tuple(needs[k] for k in chosen), weights, tuple(np.flatnonzero(at_bound).tolist()))
 
 
 def _holds_elsewhere(problem: Problem, conflict: _Conflict, x: np.ndarray, lower, upper) -> bool:
-    """Whether the weighted sum of the needs moves as their linear model says at other points, too."""
+    """Whether the weighted sum of the needs moves at other points as their linear model predicts."""
     draw, scale, checked = np.random.default_rng(0), _scale(problem, x), 0
     for _ in range(_TRIES):
         step = np.clip(x + _ELSEWHERE * scale * draw.normal(size=len(x)), lower, upper) - x
@@ -310,14 +297,14 @@ def _holds_elsewhere(problem: Problem, conflict: _Conflict, x: np.ndarray, lower
 
 
 def _reasons(problem: Problem, x: np.ndarray, lower, upper) -> dict[int, str]:
-    """Why rows are missed, by their place, where conditions, boundaries and bounds exclude one another at x."""
+    """Why rows are missed, by their place, if conditions, boundaries and bounds exclude one another at x."""
     conflict = _conflict(problem, _needs(problem, x), x, lower, upper)
     if conflict is None:
         return {}
-    found = {}
+    reasons = {}
     for number in conflict.numbers:
-        others = [condition_name(problem, one) for one in conflict.numbers if one != number]
+        others = [_condition_text(problem, other) for other in conflict.numbers if other != number]
         listed = ", ".join(others[:_NAMED]) + (", …" if len(others) > _NAMED else "")
-        told = conflict.words(problem)
-        found[number] = f"near this lens it and {listed} exclude one another" if others else f"near this lens {told}"
-    return found
+        words = f"it and {listed} exclude one another" if others else conflict.words(problem)
+        reasons[number] = f"near this lens {words}"
+    return reasons

@@ -1,4 +1,4 @@
-"""Plan: what the rows of a merit function need, found once; `EvaluationContext` gives it at variables.
+"""Plan of the rows of a merit function, made once, and `EvaluationContext`, the lens at given variables.
 
 An operand is a row of a table (`table.OPERANDS`); all rows of one operand in one configuration are evaluated
 together.
@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.lens_model import Model, View
+from raytrace.optimization.lens_model import View
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.ray_bundle import Bundle, Hits
 from raytrace.system.optimization_data import Row
 
-#: Rows that say something about the rows below them, or to the reader.
+#: Rows without a value: settings of the rows below them, and text.
 SETTINGS = {
     "CONF": "the configuration of the rows below",
     "PRIM": "the primary wavelength of the rows below",
@@ -27,7 +27,7 @@ SETTINGS = {
 
 
 class Line(NamedTuple):
-    """A row of a merit function where it stands: its number, from 1, its wavelength from 0, and the configuration's."""
+    """A row of a merit function, its number, from 1, and its wavelength, from 0: the primary one by default."""
 
     number: int
     row: Row
@@ -43,18 +43,18 @@ class Line(NamedTuple):
 
 
 class BadRow(ValueError):
-    """A row that names what the lens does not have."""
+    """A row with an argument that the lens does not have."""
 
     def __init__(self, line: Line, words: str):
         super().__init__(f"row {line.number} of the merit function: {line.row.name} {words}")
 
 
-class Found(NamedTuple):
-    """What rows come to: values (R,), an array or dual numbers, nan where a ray is lost.
+class RowValues(NamedTuple):
+    """Values of rows (R,), plain or dual, nan where a ray is lost.
 
     parts: several (R,) or (K, R), whose squares sum up to the square of the value, and which are smooth where it is 0.
-    sides: of rows that are off their target by Σ max(0, e): of which row each e is (K,), e (K,), also below 0, and of
-    which surface each is (K,).
+    sides: of rows that are off their target by Σ max(0, e): the row of each e (K,), e (K,), also below 0, and its
+    surface (K,).
     """
 
     values: object
@@ -62,18 +62,18 @@ class Found(NamedTuple):
     sides: tuple = ()
 
 
-#: Values of rows at a state; rows of arithmetic take those found so far, by their number.
-Evaluate = Callable[["EvaluationContext"], Found]
+#: Values of rows at a state; rows of arithmetic take those of earlier rows, by their number.
+Evaluate = Callable[["EvaluationContext"], RowValues]
 
 
 @dataclasses.dataclass(frozen=True)
 class Operand:
     """One operand of merit functions.
 
-    plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: what it is, with its arguments.
+    plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: description, with its arguments.
     length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
-    convention: where the field's own program is not settled, which convention is taken.
-    takes: what the two integers of its rows are, keys of `arguments.ARGUMENTS`; "" for what is not looked at.
+    convention: the convention chosen where the field's own program leaves the meaning open.
+    takes: the two integers of its rows, keys of `arguments.ARGUMENTS`; "" for one that is not read.
     refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """
@@ -88,7 +88,7 @@ class Operand:
 
 
 class Planner:
-    """What operands may ask for, of a lens in one configuration."""
+    """The rays and shared data that operands need of a lens in one configuration."""
 
     def __init__(self, view: View, primary: int, conventions: Conventions, unit: float = 1.0, rows: Sequence[Row] = ()):
         """unit: mm in the unit of length of the rows; rows: of the whole merit function."""
@@ -121,16 +121,16 @@ class Planner:
         return self.bundles[last, clips].ask(wavelength, field, pupil)
 
     def checked(self, line: Line, surface: int) -> int:
-        """The number of a surface that a row names. Raises BadRow."""
+        """The number of a surface, if the lens has it. Raises BadRow."""
         if not 0 <= surface <= self.image:
             raise BadRow(line, f"names surface {surface}: this lens has surfaces 0 to {self.image}")
         return surface
 
-    def rays(self, lines: Sequence[Line], **which) -> np.ndarray:
-        return np.array([self.ray(line, **which) for line in lines])
+    def rays(self, lines: Sequence[Line], **options) -> np.ndarray:
+        return np.array([self.ray(line, **options) for line in lines])
 
     def shared(self, kind: type):
-        """What rows of several operands share, of some class: made once, of the planner."""
+        """The instance of a class that rows of several operands share, made of the planner."""
         if kind not in self._shared:
             self._shared[kind] = kind(self)
         return self._shared[kind]
@@ -145,31 +145,19 @@ class EvaluationContext:
         self._once: dict = {}
 
     def once(self, function: Callable, *arguments):
-        """What a function makes of it and of arguments, found once."""
+        """function(context, *arguments), computed once."""
         key = function, *arguments
         if key not in self._once:
             self._once[key] = function(self, *arguments)
         return self._once[key]
 
     def hits(self, rays: np.ndarray, *, surface: int | None = None, clips: bool = False) -> Hits:
-        """Rays by their numbers behind a surface, the image by default; clips: as they were asked for."""
+        """Rays by their numbers behind a surface, the image by default; surface, clips: those of `Planner.ask`."""
         at = self.planner.image if surface is None else surface, clips
         if at not in self._hits:
             self._hits[at] = self.planner.bundles[at].hits(self.state)
         return self._hits[at].at(rays)
 
-    def starts(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
-        """The same rays where they set out, before surface 1 and in its axes."""
-        last = self.planner.image if surface is None else surface
-        return self.planner.bundles[last, False].starts(self.state).at(rays)
-
-
-def planner_of(
-    model: Model,
-    configuration: int,
-    primary: int,
-    conventions: Conventions,
-    unit: float = 1.0,
-    rows: Sequence[Row] = (),
-) -> Planner:
-    return Planner(model.views[configuration - 1], primary, conventions, unit, rows)
+    def starts(self, rays: np.ndarray, surface: int) -> Hits:
+        """Rays behind a surface at their launch, before surface 1 and in its axes."""
+        return self.planner.bundles[surface, False].starts(self.state).at(rays)

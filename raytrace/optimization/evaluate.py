@@ -14,12 +14,15 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.plotting.style import FAINT, field_colours, new_figure, number_text, styled
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.launch import warn_of_filling
 
 _WHOLE = 40  # rows that are listed one by one
 _TOGETHER = 3  # rows of one field that share a line in longer tables
+
+_BARS = 16  # of the figure
 
 
 @value
@@ -46,8 +49,6 @@ class MeritResult(Result):
     unit: float
     skipped: tuple[int, ...]
     each: bool = False
-
-    FIGURE = "plotting.merit.contributions"
 
     def columns(self) -> dict[str, Tensor]:
         kinds, said = self.words()["operand"], self.words()["arguments"]
@@ -131,6 +132,33 @@ class MeritResult(Result):
         told = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{shown}{100 * part:>8.2f}%{lost}"
         return f"{name:>9}  {row.name:<8}{said:<{width}}{told}"
 
+    @styled
+    def draw(self):
+        """A bar for every operand and field, the largest part first; rays of a field share one.
+
+        Bars are coloured by operand; the smallest are summed in the last bar.
+        """
+        shares = _shares(self)
+        names = sorted(shares, key=lambda name: -shares[name][1])
+        shown, rest = names[:_BARS], names[_BARS:]
+        kinds = [*dict.fromkeys(shares[name][0] for name in shown)]
+        colours = dict(zip(kinds, field_colours(len(kinds)), strict=True))
+        figure = new_figure(6.4, 0.24 * (len(shown) + bool(rest)) + 1.2)
+        panel = figure.subplots()
+        bars = [(name, 100 * shares[name][1], colours[shares[name][0]]) for name in shown]
+        if rest:
+            bars.append((f"{len(rest)} more", 100 * sum(shares[name][1] for name in rest), FAINT))
+        labels, parts, fills = zip(*bars, strict=True)
+        panel.barh(range(len(bars)), parts, color=fills, height=0.72)
+        panel.set_yticks(range(len(bars)), labels)
+        panel.invert_yaxis()
+        panel.grid(axis="x", color=FAINT, linewidth=0.6, alpha=0.6)
+        panel.set_axisbelow(True)
+        panel.set_xlabel("part of the square of the merit (%)")
+        title = f"merit {number_text(float(self.merit))}"
+        panel.set_title(f"{self.lens.name}: {title}" if self.lens.name else title)
+        return figure
+
 
 def evaluate(
     lens: Lens,
@@ -184,3 +212,21 @@ def _result(
         skipped=planned.skipped,
         each=each,
     )
+
+
+def _shares(found: MeritResult) -> dict[str, tuple[str, float]]:
+    """Operand and part of every bar by its name."""
+    several = len({*found.configurations.tolist()}) > 1
+    shares: dict[str, tuple[str, float]] = {}
+    numbers = (found.row, found.configurations, found.weights, found.contributions)
+    for row, number, at, weight, part in zip(found.valued(), *(n.tolist() for n in numbers), strict=True):
+        if weight:
+            name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
+            shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)
+    return shares or {"no row has a weight": ("", 0.0)}
+
+
+def _name(number: int, row: Row) -> str:
+    if any(row.numbers[2:]):
+        return f"{row.name} field {row.numbers[0]:.3g}, {row.numbers[1]:.3g}"
+    return f"{number} {row.name} {arguments(row)}".rstrip()

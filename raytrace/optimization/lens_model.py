@@ -20,7 +20,7 @@ from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_
 from raytrace.system.phases import power_of
 from raytrace.system.surface import gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.aiming import is_round_about_axis
-from raytrace.tracing.compiled.structure import structure_of
+from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import media, sequence_of
 

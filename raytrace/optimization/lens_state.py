@@ -1,10 +1,7 @@
 """LensState: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
 
-Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
-
-Solves: numbers of a lens that follow from others, a row for every kind.
-
-Each is found from the numbers of the surfaces before, at the primary wavelength; n is signed, ω = n u.
+Numbers are plain, or dual (`maths.dual`) where derivatives are computed; the formulas are the same. SOLVES computes
+the numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,16 +15,16 @@ from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
-from raytrace.system.surface import sag_at, vertex_curvature
+from raytrace.system.surface import sag_at, signed, vertex_curvature
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, power, signed
+from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
 
 
-def _ray_before(state, surface: int):
+def _marginal_ray_before(state, surface: int):
     """(y, ω) of the paraxial marginal ray in front of a surface."""
     y, omega = state.marginal_height, state.marginal_height * state.vergence
     if surface == 1:
@@ -40,19 +37,19 @@ def _pickup(state, solve: Solve):
     return solve.scale * state.number(solve.source, solve.quantity_of_source or solve.quantity) + solve.offset
 
 
-def _bent_to(state, solve: Solve, omega_behind):
-    """The curvature behind which the marginal ray has ω′: c = (ω - ω′ - K y)/(y (n′ - n)), K the power beside it."""
+def _curvature_for(state, solve: Solve, omega_behind):
+    """c = (ω - ω′ - K y)/(y (n′ - n)) behind which the marginal ray has ω′; K: power of the surface without c."""
     k, n = solve.surface, state.index(state.primary)
-    y, omega = _ray_before(state, k)
+    y, omega = _marginal_ray_before(state, k)
     return ((omega - omega_behind) / y - state.further_power(k, state.primary)) / (n[k] - n[k - 1])
 
 
 def _marginal_angle(state, solve: Solve):
-    return _bent_to(state, solve, state.index(state.primary)[solve.surface] * solve.numbers[0])
+    return _curvature_for(state, solve, state.index(state.primary)[solve.surface] * solve.numbers[0])
 
 
 def _f_number(state, solve: Solve):
-    return _bent_to(state, solve, -abs(state.index(state.primary)[solve.surface]) / (2 * solve.numbers[0]))
+    return _curvature_for(state, solve, -abs(state.index(state.primary)[solve.surface]) / (2 * solve.numbers[0]))
 
 
 def _marginal_height(state, solve: Solve):
@@ -60,12 +57,12 @@ def _marginal_height(state, solve: Solve):
     if any(solve.numbers[1:]):
         return state.through_torch(lambda lens: [_real_height(lens, solve)])[0]
     k, primary = solve.surface, state.primary
-    y, omega = _ray_before(state, k)
+    y, omega = _marginal_ray_before(state, k)
     return state.index(primary)[k] * (solve.numbers[0] - y) / (omega - state.power(k, primary) * y)
 
 
 def _real_height(lens: Lens, solve: Solve) -> Tensor:
-    """t = z + (N/M)(h - y) - z′(h) behind which a real axial ray meets the next surface at the height h; else nan."""
+    """t = z + (N/M)(h - y) - z′(h) with which a real axial ray meets the next surface at the height h, or nan."""
     k, (height, part) = solve.surface, solve.numbers
     like = lens.wavelengths
     rays = _behind(lens, k, like.new_zeros(2), like.new_tensor([0.0, part]), lens.primary)
@@ -79,28 +76,26 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
 
 def _edge_thickness(state, solve: Solve):
     """t = e + z - z′ of both surfaces at one height, by default the semi-diameter of the first."""
-    return state.through_torch(lambda lens: [_edge(lens, solve)])[0]
-
-
-def _edge(lens: Lens, solve: Solve) -> Tensor:
     k, (edge, height) = solve.surface, solve.numbers
-    at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
-    near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
-    return (edge + near - far).reshape(())
+
+    def thickness(lens: Lens) -> list[Tensor]:
+        at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
+        near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
+        return [(edge + near - far).reshape(())]
+
+    return state.through_torch(thickness)[0]
 
 
 def semi_diameter(lens: Lens, k: int) -> Tensor:
-    """mm: given, or the extent of the rays of all fields and wavelengths, with the margin of `OptimizationData`."""
-    optimization_data, own = lens.optimization_data, lens.surfaces[k].semi_diameter
-    if own and (optimization_data is None or k in optimization_data.semi_diameters):
-        return lens.wavelengths.new_tensor(own)
+    """mm: fixed, or the extent of the rays of all fields and wavelengths with the margin of `OptimizationData`."""
+    data, stored = lens.optimization_data, lens.surfaces[k].semi_diameter
+    if stored and (data is None or k in data.semi_diameters):
+        return lens.wavelengths.new_tensor(stored)
     field = torch.stack([lens.fields.x, lens.fields.y])[:, None, :, None]
     points = lens.wavelengths.new_tensor(ENDS).T[:, None, None]
     rays = _behind(lens, k, field, vignette(lens, field, points), lens.wavelengths[:, None, None])
     height = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0).amax().sqrt()
-    percent, length = (
-        (0.0, 0.0) if optimization_data is None or k == lens.stop else optimization_data.semi_diameter_margin
-    )
+    percent, length = (0.0, 0.0) if data is None or k == lens.stop else data.semi_diameter_margin
     return (1 + percent / 100) * height + length
 
 
@@ -117,13 +112,13 @@ def _power(state, solve: Solve):
 
 
 def _position(state, solve: Solve):
-    """The thickness with which those from surface `source` to this one, or from this one on to `source`, have a sum."""
+    """The thickness that completes the sum of thicknesses between surface `source` and this one."""
     k, source = solve.surface, solve.source
     others = range(source, k) if source <= k else range(k + 1, source)
     return solve.numbers[0] - sum(state.thickness[j] for j in others)
 
 
-#: How a number is found, by the kind of its solve: of a state and the solve.
+#: The number of a state that a solve sets, by kind.
 SOLVES = {
     "pickup": _pickup,
     "marginal_angle": _marginal_angle,
@@ -136,7 +131,7 @@ SOLVES = {
 
 
 _PASSES = 60  # through solves that depend on one another
-_STILL = 1e-15  # relative
+_CONVERGED = 1e-15  # relative
 
 
 class LensState:
@@ -148,7 +143,6 @@ class LensState:
             at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
             for at, (number, scale, offset) in view.variables.items()
         }
-        self._gaussian: dict[int, Gaussian] = {}
         self._kept: dict = {}
         self._solve()
 
@@ -163,8 +157,8 @@ class LensState:
 
     def number(self, surface: int, quantity: str):
         """A number of a surface, solved, picked up, varied or as it is stored."""
-        found = self.numbers.get((surface, quantity))
-        return self.view.number((surface, quantity)) if found is None else found
+        number = self.numbers.get((surface, quantity))
+        return self.view.number((surface, quantity)) if number is None else number
 
     @cached_property
     def thickness(self) -> list:
@@ -184,34 +178,32 @@ class LensState:
         return self.through_torch(lambda lens: [vertex_curvature(surface).reshape(()) for surface in lens.surfaces])
 
     def _listed(self, quantity: str, stored: list[float]) -> list:
-        found = list(stored)
+        numbers = list(stored)
         for (surface, name), number in self.numbers.items():
             if name == quantity:
-                found[surface] = number
-        return found
+                numbers[surface] = number
+        return numbers
 
     def index(self, wavelength: int) -> Sequence:
         """Signed index behind every surface at a wavelength, counted from 0."""
         stored = self.view.indices[wavelength]
         if not self.view.glasses:
             return stored
-        told = zip(stored, self.view.media, strict=True)
-        return [np.sign(n) * self.media[k][wavelength] if k in self.media else n for n, k in told]
+        pairs = zip(stored, self.view.media, strict=True)
+        return [np.sign(n) * self.media[k][wavelength] if k in self.media else n for n, k in pairs]
 
     @cached_property
     def media(self) -> dict:
-        """Indices (W,) of the media that move, by the surface that tells them."""
-        return {surface: self._medium(surface, moved) for surface, moved in self.view.glasses.items()}
-
-    def _medium(self, surface: int, moved: list):
-        leaves = {at: torch.tensor(float(value_of(self.numbers[at])), dtype=torch.float64) for at in moved}
-        leaves = {at: leaf.requires_grad_() for at, leaf in leaves.items()}
-        with torch.enable_grad():
-            n = index_behind(self.view.held(leaves), surface, self.lens.wavelengths)
-            if not self.count:
-                return n.detach().numpy()
-            each = [self.chained(one, leaves) for one in n]
-        return Dual(np.array([one.value for one in each]), np.stack([one.slope for one in each], -1))
+        """Indices (W,) of variable media, by the surface in front of them."""
+        if not self.view.glasses:
+            return {}
+        glasses, waves = self.view.glasses, self.lens.wavelengths
+        moved = [at for addresses in glasses.values() for at in addresses]
+        numbers = self.through_torch(
+            lambda lens: [n for k in glasses for n in index_behind(lens, k, waves)], only=moved
+        )
+        each = [numbers[k : k + len(waves)] for k in range(0, len(numbers), len(waves))]
+        return {surface: listed(indices, self.count) for surface, indices in zip(self.view.glasses, each, strict=True)}
 
     def power(self, k: int, wavelength: int):
         """Power in 1/mm of a surface."""
@@ -219,7 +211,7 @@ class LensState:
         return self.curvature[k] * (n[k] - n[k - 1]) + self.further_power(k, wavelength)
 
     def further_power(self, k: int, wavelength: int):
-        """Power in 1/mm of a surface beside c Δn."""
+        """Power in 1/mm of a surface in addition to c Δn: of terms of r² and of a phase."""
         bend, phase = self.view.further_power
         if bend[k] == 0:
             return phase[wavelength, k]
@@ -234,12 +226,11 @@ class LensState:
         return brackets([self.power(k, wavelength) for k in steps], gaps)
 
     def gaussian(self, wavelength: int) -> Gaussian:
-        if wavelength not in self._gaussian:
-            self._gaussian[wavelength] = self._found(wavelength)
-        return self._gaussian[wavelength]
+        """The system matrices at a wavelength."""
+        return self.kept(_gaussian, wavelength)
 
     def kept(self, function: Callable, *arguments):
-        """What a function makes of the state and arguments, found once."""
+        """function(state, *arguments), computed once."""
         key = function, *arguments
         if key not in self._kept:
             self._kept[key] = function(self, *arguments)
@@ -248,16 +239,6 @@ class LensState:
     @property
     def primary(self) -> int:
         return self.lens.primary_wavelength - 1
-
-    def _found(self, wavelength: int) -> Gaussian:
-        n, stop, last = self.index(wavelength), self.lens.stop, len(self.lens.surfaces) - 2
-        if self.view.is_plain:
-            front = self.matrix(1, stop - 1, wavelength, to_next=True)
-            A1, B1, C1, D1, A2, B2, C2, D2 = *front, *self.matrix(stop, last, wavelength)
-        else:
-            A1, B1, C1, D1, A2, B2, C2, D2 = self.through_torch(lambda lens: _halves(lens, wavelength))
-        whole = A2 * A1 + B2 * C1, A2 * B1 + B2 * D1, C2 * A1 + D2 * C1, C2 * B1 + D2 * D1
-        return Gaussian(*whole, (A1, B1), (B2, D2), n[0], n[last])
 
     # -- the beam ------------------------------------------------------------------------------------------------------
 
@@ -271,7 +252,6 @@ class LensState:
 
     @property
     def is_at_infinity(self) -> bool:
-        """Whether the object is."""
         return bool(np.isinf(value_of(self.thickness[0])))
 
     @cached_property
@@ -294,14 +274,14 @@ class LensState:
 
     @cached_property
     def entrance_pupil_diameter(self):
-        """mm, as the aperture of the lens means it, at the primary wavelength."""
+        """mm, of the aperture of the lens at the primary wavelength."""
         aperture, data = self.lens.aperture, self.gaussian(self.primary)
         number, distance = float(aperture.value), self.thickness[0]
         return data.entrance_pupil_diameter(aperture.kind, number, distance, self.vergence, self.tan_cone)
 
     @property
     def tan_cone(self) -> float | None:
-        """Of the half angle of the cone at the object, of an aperture that is given as one."""
+        """Tangent of the half angle of the cone at the object, of an aperture that is specified as one."""
         kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
         if kind not in CONES:
             return None
@@ -314,10 +294,10 @@ class LensState:
         data = self.gaussian(self.primary)
         return data.marginal_height(kind, diameter, self.thickness[0], self.vergence, self.tan_cone)
 
-    # -- what follows --------------------------------------------------------------------------------------------------
+    # -- solves and pickups --------------------------------------------------------------------------------------------
 
     def _solve(self) -> None:
-        """Solves and pickups in the order of surfaces, again until they stand still where one waits for another."""
+        """Solves and pickups in the order of surfaces, repeated until they converge where one depends on later ones."""
         solves = self.view.solves
         if not solves:
             return
@@ -327,15 +307,10 @@ class LensState:
             for one in solves:
                 self.numbers[one.surface, one.quantity] = SOLVES[one.kind](self, one)
                 self._forget()
-            if not self.view.waits or self._is_still(before):
+            pairs = ((value_of(number), value_of(before[at])) for at, number in self.numbers.items())
+            moved = (abs(a - b) / max(abs(a), abs(b), 1e-300) if a != b else 0.0 for a, b in pairs)
+            if not self.view.waits or all(step <= _CONVERGED for step in moved):
                 break
-
-    def _is_still(self, before: dict) -> bool:
-        def far(one, other) -> float:
-            a, b = value_of(one), value_of(other)
-            return abs(a - b) / max(abs(a), abs(b), 1e-300) if a != b else 0.0
-
-        return all(far(number, before[at]) <= _STILL for at, number in self.numbers.items())
 
     def _forget(self) -> None:
         for name in (
@@ -349,42 +324,43 @@ class LensState:
             "marginal_height",
         ):
             self.__dict__.pop(name, None)
-        self._gaussian.clear()
         self._kept.clear()
 
-    # -- anything else, by torch ---------------------------------------------------------------------------------------
+    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles (`ray_bundle`) -----------
 
-    def through_torch(self, function, *, clips: bool = False) -> list:
-        """Numbers () that a function takes from a lens with torch, with their derivatives by the variables.
+    def through_torch(
+        self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False, only: Sequence | None = None
+    ) -> list:
+        """Numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
-        clips: whether the lens has its apertures.
+        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on.
         """
         view = self.view.clipping if clips else self.view
         with torch.set_grad_enabled(self.count > 0):
-            leaves, lens = view.leaves({at: value_of(n) for at, n in self.numbers.items()})
-            found = function(lens)
-        return [self.chained(number, leaves) if self.count else float(number) for number in found]
+            leaves, lens = view.leaves({at: value_of(self.numbers[at]) for at in only or self.numbers})
+            numbers = function(lens)
+        return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
     def each_through_torch(self, function: Callable, arrays: Sequence):
         """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
-        with torch.enable_grad():
+        with torch.set_grad_enabled(self.count > 0):
             leaves, lens = self.view.leaves({at: value_of(n) for at, n in self.numbers.items()})
-            given = [torch.tensor(value_of(array), requires_grad=True) for array in arrays]
-            found = function(lens, *given)
+            entries = [torch.tensor(value_of(array), requires_grad=self.count > 0) for array in arrays]
+            numbers = function(lens, *entries)
             if not self.count:
-                return found.detach().numpy()
-            by = torch.autograd.grad(found.sum(), given, retain_graph=True, allow_unused=True)
-            slopes = np.zeros((self.count, len(found)))
+                return numbers.numpy()
+            by = torch.autograd.grad(numbers.sum(), entries, retain_graph=True, allow_unused=True)
+            slopes = np.zeros((self.count, len(numbers)))
             for array, derivative in zip(arrays, by, strict=True):
                 if isinstance(array, Dual) and derivative is not None:
                     slopes += array.full() * derivative.numpy()
-            own = torch.autograd.grad(found.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
-            if any(derivative is not None for derivative in own):
-                slopes += np.stack([slope_of(self.chained(number, leaves), self.count) for number in found], -1)
-        return Dual(found.detach().numpy(), slopes)
+            of_lens = torch.autograd.grad(numbers.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
+            if any(derivative is not None for derivative in of_lens):
+                slopes += np.stack([self._chained(number, leaves).slope for number in numbers], -1)
+        return Dual(numbers.detach().numpy(), slopes)
 
-    def chained(self, number: Tensor, leaves: dict) -> Dual:
-        """A number () that was computed from leaves, with its derivatives by the variables."""
+    def _chained(self, number: Tensor, leaves: dict) -> Dual:
+        """A number () computed from leaves, with its derivatives by the variables."""
         value, slope = float(number.detach()), np.zeros(self.count)
         if number.requires_grad:
             by = torch.autograd.grad(number, list(leaves.values()), retain_graph=True, allow_unused=True)
@@ -395,11 +371,30 @@ class LensState:
         return Dual(value, slope)
 
 
-def _halves(lens: Lens, wavelength: int) -> list[Tensor]:
-    """(A, B, C, D) from surface 1 to the stop, and from there to behind the last surface before the image."""
-    at, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
-    n = signed(surfaces, media(lens, at)[:-1])
-    powers = [power(s, n1, n2, at) for s, n1, n2 in zip(surfaces, n[:-1], n[1:], strict=True)]
-    gaps, stop = [surface.thickness / behind for surface, behind in zip(surfaces, n[1:], strict=True)], lens.stop - 1
-    halves = *brackets(powers[:stop], gaps[:stop]), *brackets(powers[stop:], gaps[stop:-1])
-    return [torch.as_tensor(number, dtype=torch.float64) for number in halves]
+def _gaussian(state: LensState, wavelength: int) -> Gaussian:
+    if not state.view.is_plain:
+        return _gaussian_by_torch(state, wavelength)
+    n, stop, last = state.index(wavelength), state.lens.stop, len(state.lens.surfaces) - 2
+    A1, B1, C1, D1 = state.matrix(1, stop - 1, wavelength, to_next=True)
+    A2, B2, C2, D2 = state.matrix(stop, last, wavelength)
+    whole = A2 * A1 + B2 * C1, A2 * B1 + B2 * D1, C2 * A1 + D2 * C1, C2 * B1 + D2 * D1
+    return Gaussian(*whole, (A1, B1), (B2, D2), n[0], n[last])
+
+
+def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
+    """Where variables other than curvatures, thicknesses and glasses change the power of a surface."""
+
+    def matrices(lens: Lens) -> list[Tensor]:
+        at = lens.wavelengths[wavelength]
+        found = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, at)[:-1]), at)
+        return [*found[:4], *found.front, *found.rear]
+
+    A, B, C, D, A1, B1, B2, D2 = state.through_torch(matrices)
+    n = state.index(wavelength)
+    return Gaussian(A, B, C, D, (A1, B1), (B2, D2), n[0], n[-2])
+
+
+def listed(numbers: Sequence, count: int):
+    """Numbers () as one array (R,), with derivatives by `count` variables if there are any."""
+    values = np.array([float(value_of(number)) for number in numbers])
+    return Dual(values, np.stack([slope_of(n, count) for n in numbers], -1)) if count else values

@@ -1,4 +1,4 @@
-"""Merit: what a lens is worth, as rows of (operand, arguments, target, weight), with the Jacobian of all rows.
+"""Evaluation of the rows (operand, arguments, target, weight) of a merit function, with the Jacobian of all rows.
 
     M² = Σ w (v - t)² / Σ w
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import SETTINGS, Evaluate, EvaluationContext, Found, Line, Planner, planner_of
+from raytrace.optimization.context import SETTINGS, Evaluate, EvaluationContext, Line, Planner, RowValues
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.operands.arguments import need, need_all
@@ -19,7 +19,7 @@ from raytrace.optimization.operands.arithmetic import in_order
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.optimization_data import Row
 
-#: Error of a row whose ray is lost, in the row's unit: as the stored merits of other programs are judged here.
+#: Error of a row whose ray is lost, in the row's unit.
 LOST = 10.0
 
 
@@ -61,28 +61,22 @@ class Evaluation:
         skip_unknown: bool = False,
         conventions: Conventions | None = None,
     ):
-        """unit: mm in the unit of length of the rows; conventions: where operands are open. Raises UnknownOperand."""
+        """unit: mm in the unit of length of the rows; conventions: of operands. Raises UnknownOperand."""
         self.model, self.rows, self.unit = model, tuple(rows), unit
         self.conventions = conventions or Conventions()
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
-        self.needed: frozenset[int] = frozenset()
-        self.counted: frozenset[int] = frozenset()
         self.skipped = tuple(self._plan(skip_unknown))
         self.units = np.array([unit ** OPERANDS[r.operand].length if r.operand in OPERANDS else 1.0 for r in self.rows])
-        weights = np.array([row.weight for row in self.rows])
         counted = np.zeros(len(self.rows), dtype=bool)
         counted[[line.number - 1 for _, lines, _ in self.groups for line in lines]] = True
-        self.weights = np.where(counted, weights, 0.0)
+        self.weights = np.where(counted, [row.weight for row in self.rows], 0.0)
         total = self.weights[self.weights > 0].sum()
         self.factors = np.sqrt(np.abs(self.weights) / total) if total > 0 else np.zeros(len(self.rows))
         self.targets = np.array([row.target for row in self.rows])
 
     def _plan(self, skip_unknown: bool) -> list[int]:
-        """Plan all rows, those of arithmetic last and in the order in which they wait for one another.
-
-        Returns the rows that are skipped.
-        """
+        """Plan all rows, those of arithmetic last and in the order of their references. Returns the skipped rows."""
         placed = {line.number: (settings, line) for settings, line in self._lines()}
         referred, skipped = self._referred(placed, skip_unknown)
         planners: dict[tuple[int, int], Planner] = {}
@@ -92,29 +86,29 @@ class Evaluation:
             settings, line = placed[number]
             operand = OPERANDS[line.row.operand]
             if settings not in planners:
-                planners[settings] = planner_of(self.model, *settings, self.conventions, self.unit, self.rows)
+                configuration, primary = settings
+                view = self.model.views[configuration - 1]
+                planners[settings] = Planner(view, primary, self.conventions, self.unit, self.rows)
             need_all(line, operand, planners[settings].lens)
             groups.setdefault((settings, line.row.operand, number if operand.refers else 0), []).append(line)
         for (settings, name, _), lines in groups.items():
             planner = planners[settings]
             self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
         self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
+        #: Rows that others take values of.
         self.needed = frozenset(row for rows in referred.values() for row in rows)
-        self.counted = self._counted(referred)
-        return sorted(skipped)
-
-    def _counted(self, referred: dict[int, Sequence[int]]) -> frozenset[int]:
-        """Rows with a weight, and all that rows of arithmetic among them take values of."""
-        found, left = set(), [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
+        #: Rows with a weight, and all that rows of arithmetic among them take values of.
+        self.counted: set[int] = set()
+        left = [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
         while left:
             number = left.pop()
-            if number not in found:
-                found.add(number)
+            if number not in self.counted:
+                self.counted.add(number)
                 left += referred.get(number, ())
-        return frozenset(found)
+        return sorted(skipped)
 
     def _lines(self):
-        """Rows that have a value, each with the configuration and the primary wavelength that stand above it."""
+        """Rows that have a value, each with the configuration and the primary wavelength of the settings above it."""
         lens = self.model.lens
         configuration, primary = lens.current_configuration, lens.primary_wavelength - 1
         for number, row in enumerate(self.rows, 1):
@@ -129,87 +123,84 @@ class Evaluation:
     def _referred(self, placed: dict, skip_unknown: bool) -> tuple[dict[int, Sequence[int]], set[int]]:
         """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
         referred, skipped = {}, set()
+
+        def skip(line: Line, why: str) -> None:
+            if line.row.weight != 0 and not skip_unknown:
+                raise UnknownOperand(
+                    f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out"
+                )
+            skipped.add(line.number)
+
         for number, (_, line) in placed.items():
             name = line.row.operand
             if name not in OPERANDS:
-                self._may_skip(line, f"operand {name} is not known", skip_unknown)
-                skipped.add(number)
+                skip(line, f"operand {name} is not known")
             elif OPERANDS[name].refers:
                 referred[number] = OPERANDS[name].refers(line, self.rows)
         for number in in_order(referred):
-            missing = skipped.intersection(referred[number])
-            if missing:
-                line = placed[number][1]
-                which = min(missing)
-                why = (
-                    f"{line.row.operand} takes the value of row {which}, {self.rows[which - 1].operand}, which has none"
-                )
-                self._may_skip(line, why, skip_unknown)
-                skipped.add(number)
+            if missing := skipped.intersection(referred[number]):
+                line, first = placed[number][1], min(missing)
+                value = f"the value of row {first}, {self.rows[first - 1].operand}, which has none"
+                skip(line, f"{line.row.operand} takes {value}")
         return referred, skipped
 
-    def _may_skip(self, line: Line, why: str, skip_unknown: bool) -> None:
-        if line.row.weight != 0 and not skip_unknown:
-            raise UnknownOperand(f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out")
-
     def __call__(self, variables: np.ndarray, *, derivatives: bool = False, shown: bool = True) -> Evaluated:
-        """All rows there; derivatives: with the Jacobian; shown: also operands of which no row moves the merit."""
+        """All rows at variables; derivatives: with the Jacobian; shown: also operands without a row that counts."""
         count = len(variables)
         x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
         values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
-        found, sides = {}, []
+        numbers, sides = {}, []
         states = {configuration: self.model.views[configuration - 1].state(x) for configuration, _ in self.planners}
         contexts = {
-            id(planner): EvaluationContext(planner, states[configuration], found)
+            id(planner): EvaluationContext(planner, states[configuration], numbers)
             for configuration, planner in self.planners
         }
         for planner, lines, evaluate in self.groups:
             if not (shown or any(line.number in self.counted for line in lines)):
                 continue
             places = np.array([line.number - 1 for line in lines])
-            told = evaluate(contexts[id(planner)])
             units = self.units[places]
-            sides += self._sides(told, places, units, count if derivatives else None)
-            told = Found(told.values / units, tuple(part / units for part in told.parts))
-            values[places] = value_of(told.values)
-            found |= {line.number: told.values[k] for k, line in enumerate(lines) if line.number in self.needed}
+            group = evaluate(contexts[id(planner)])
+            sides += self._sides(group, places, units, count if derivatives else None)
+            all_values, parts = group.values / units, [part / units for part in group.parts]
+            values[places] = value_of(all_values)
+            numbers |= {line.number: all_values[k] for k, line in enumerate(lines) if line.number in self.needed}
             counted = self.factors[places] > 0
-            in_parts = counted & bool(told.parts) & (self.targets[places] == 0)
-            for number, chosen in [(told.values, counted & ~in_parts), *((part, in_parts) for part in told.parts)]:
+            in_parts = counted & bool(parts) & (self.targets[places] == 0)
+            targets = self.targets[places]
+            for number, chosen, target in (
+                (all_values, counted & ~in_parts, targets),
+                *((part, in_parts, np.zeros_like(targets)) for part in parts),
+            ):
                 if not chosen.any():
                     continue
                 factor = self.factors[places][chosen]
-                target = self.targets[places][chosen] if number is told.values else 0.0
-                errors = factor * (value_of(number)[..., chosen] - target)
+                errors = factor * (value_of(number)[..., chosen] - target[chosen])
                 residuals.append(errors.ravel())
                 if derivatives:
                     slopes.append((factor * slope_of(number, count)[..., chosen]).reshape(count, -1).T)
                 of_row.append(np.broadcast_to(places[chosen], errors.shape).ravel())
-        evaluated = self._evaluated(values, residuals, slopes if derivatives else None, of_row, count)
-        return dataclasses.replace(evaluated, sides=tuple(sides))
-
-    def _sides(self, told: Found, places: np.ndarray, units: np.ndarray, count: int | None):
-        """One-sided rows of an operand, as `Evaluated.sides` has them; none of rows that are no number."""
-        if not told.sides:
-            return
-        rows, excess, surfaces = told.sides
-        undefined = np.bincount(rows, np.isnan(value_of(excess)), minlength=len(places)) > 0
-        chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
-        if chosen.any():
-            scale = (self.factors[places] / units)[rows[chosen]]
-            slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
-            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen]
-
-    def _evaluated(self, values, residuals, slopes, of_row, count: int) -> Evaluated:
         of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)
         residual = np.concatenate(residuals) if residuals else np.zeros(0)
         gone = ~np.isfinite(residual)
         parts = np.bincount(of_row, minlength=len(self.rows))[of_row]
         residual = np.where(gone, LOST * self.factors[of_row] / np.sqrt(np.maximum(parts, 1)), residual)
         jacobian = None
-        if slopes is not None:
+        if derivatives:
             jacobian = np.concatenate(slopes) if slopes else np.zeros((0, count))
             jacobian = np.where(gone[:, None], 0.0, jacobian)
         lost = np.zeros(len(self.rows), dtype=bool)
         lost[of_row[gone]] = True
-        return Evaluated(values, lost, residual, jacobian, of_row)
+        return Evaluated(values, lost, residual, jacobian, of_row, tuple(sides))
+
+    def _sides(self, group: RowValues, places: np.ndarray, units: np.ndarray, count: int | None):
+        """One-sided rows of an operand, as in `Evaluated.sides`, except those that are nan."""
+        if not group.sides:
+            return
+        rows, excess, surfaces = group.sides
+        undefined = np.bincount(rows, np.isnan(value_of(excess)), minlength=len(places)) > 0
+        chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
+        if chosen.any():
+            scale = (self.factors[places] / units)[rows[chosen]]
+            slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
+            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen]

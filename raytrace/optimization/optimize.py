@@ -37,6 +37,7 @@ from raytrace.optimization.problem import (
     optimization_data_of,
     typical_of,
 )
+from raytrace.optimization.report import optimize_report
 from raytrace.optimization.solver import (
     BestDescent,
     Cycle,
@@ -89,7 +90,9 @@ class Optimized(Result):
     glasses: tuple[GlassStep, ...] = ()
     conditions: tuple[Reached, ...] = ()
 
-    FIGURE = "plotting.optimize.optimize_report"
+    def draw(self):
+        """One page: lens, spots and merit function before and after."""
+        return optimize_report(self)
 
     @property
     def rows(self) -> tuple[int, ...]:

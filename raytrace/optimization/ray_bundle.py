@@ -1,9 +1,9 @@
 """Ray bundles: all rays of a merit function's rows, launched and traced in one pass, with derivatives.
 
 Rays start as in `tracing.launch`. Rays that depend on the lens only through its first-order data are launched and aimed
-in numpy: 126 rays and 21 variables take 1.3 ms with derivatives, against 490 ms with `tracing.launch`
-and a forward derivative for every variable; 2.8 ms against 9.7 s with real ray aiming. All others (real image heights,
-telecentric objects, curved objects, bent axes) take that second way.
+in numpy: 126 rays and 21 variables take 1.3 ms with derivatives, compared with 490 ms by `tracing.launch` and a forward
+derivative for every variable; 2.8 ms compared with 9.7 s with real ray aiming. `tracing.launch` launches all others
+(real image heights, telecentric objects, curved objects, bent axes).
 
 Ray aiming solves s(a, x) = p r(x) for the pupil points a, s the hit on the stop, p the point of the pupil, r the radius
 of the stop: by Newton's method from the last solution, and ∂a/∂x = (∂s/∂a)⁻¹ (p ∂r/∂x - ∂s/∂x).
@@ -26,8 +26,7 @@ from raytrace.optimization.variables import GLASS
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.aiming import aiming_of, is_bent
-from raytrace.tracing.compiled.run import Pushed, Task
-from raytrace.tracing.compiled.structure import is_expressible, rows_of
+from raytrace.tracing.compiled import Task, is_expressible, rows_of
 from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces
@@ -64,24 +63,24 @@ AtStop = Callable[[LensState, tuple], tuple]
 
 
 def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: np.ndarray):
-    """Pupil points, two of (W, R), as numbers or dual ones, and which rays were found.
+    """Pupil points, two of (W, R), plain or dual, which of them converged, and their values (2, W, R).
 
-    state: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: where to begin.
+    state: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: initial points.
     """
     fixed = state.fixed()
     goal = target * value_of(radius)
-    points, found, inverse = _root(fixed, at_stop, goal, abs(value_of(radius)), last)
+    points, converged, inverse = _root(fixed, at_stop, goal, abs(value_of(radius)), last)
     if not state.count:
-        return tuple(points), found, points
+        return tuple(points), converged, points
     (x, y), _ = at_stop(state, tuple(points))
-    missed = [target[0] * radius - x, target[1] * radius - y]
-    slopes = [part.full() if isinstance(part, Dual) else np.zeros((state.count, *target.shape[1:])) for part in missed]
+    slopes = [slope_of(part, state.count) for part in (target[0] * radius - x, target[1] * radius - y)]
     moved = [inverse[k][0] * slopes[0] + inverse[k][1] * slopes[1] for k in range(2)]
-    return tuple(Dual(at, np.where(found, by, 0.0)) for at, by in zip(points, moved, strict=True)), found, points
+    dual = tuple(Dual(at, np.where(converged, by, 0.0)) for at, by in zip(points, moved, strict=True))
+    return dual, converged, points
 
 
 def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray):
-    """Points (2, W, R), which were found, and the inverse of ∂s/∂a there, by components."""
+    """Points (2, W, R), which of them converged, and the inverse of ∂s/∂a there, by components."""
     points, done = start.copy(), False
     for _ in range(_STEPS):
         moving = tuple(Dual(part, np.eye(2)[:, k, None, None] * np.ones_like(part)) for k, part in enumerate(points))
@@ -106,53 +105,41 @@ def rays_by_torch(
 ) -> tuple[list, np.ndarray]:
     """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity.
 
-    backward: derivatives of every ray, one by one, where the function takes forward derivatives of its own (rays aimed
-    about a base ray), which do not nest.
+    backward: one backward pass for each number, if the function takes forward derivatives of its own (rays aimed about
+    a base ray), which do not nest; else one forward pass for each variable, of which there are fewer than rays.
     """
 
-    def told(lens: Lens) -> tuple[list[Tensor], Tensor]:
+    def parts_of(lens: Lens) -> list[Tensor]:
         rays = function(lens)
-        parts = *rays.position, *rays.direction, rays.opl
-        return [part.expand(shape) for part in parts], rays.valid.expand(shape)
+        return [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl, rays.valid)]
 
+    values = {at: torch.tensor(float(value_of(n)), dtype=torch.float64) for at, n in state.numbers.items()}
     with torch.no_grad():
-        parts, valid = told(state.view.leaves(_values(state))[1])
-        values, valid = [part.numpy().copy() for part in parts], valid.numpy().copy()
+        *parts, valid = (part.numpy().copy() for part in parts_of(state.view.held(values)))
     if not state.count:
-        return values, valid
-    slopes = (_backward if backward else _forward)(state, lambda lens: told(lens)[0], valid)
-    return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(values, slopes, strict=True)], valid
+        return parts, valid
+    if backward:
+        numbers = state.through_torch(lambda lens: [n for part in parts_of(lens)[:-1] for n in part.reshape(-1)])
+        slopes = np.stack([number.slope for number in numbers], -1).reshape(state.count, 7, *shape).swapaxes(0, 1)
+    else:
+        slopes = np.zeros((7, state.count, *shape))
+        for variable in range(state.count):
+            with forward_ad.dual_level():
+                moved = {
+                    at: forward_ad.make_dual(values[at], values[at].new_tensor(float(number.slope[variable])))
+                    for at, number in state.numbers.items()
+                    if isinstance(number, Dual)
+                }
+                for slope, part in zip(slopes, parts_of(state.view.held(values | moved))[:-1], strict=True):
+                    tangent = forward_ad.unpack_dual(part).tangent
+                    if tangent is not None:
+                        slope[variable] = tangent.numpy()
+    return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(parts, slopes, strict=True)], valid
 
 
-def _values(state: LensState) -> dict:
-    return {at: value_of(number) for at, number in state.numbers.items()}
-
-
-def _forward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
-    slopes = np.zeros((7, state.count, *valid.shape))
-    numbers = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in _values(state).items()}
-    for variable in range(state.count):
-        with forward_ad.dual_level():
-            moved = {
-                at: forward_ad.make_dual(numbers[at], numbers[at].new_tensor(float(number.slope[variable])))
-                for at, number in state.numbers.items()
-                if isinstance(number, Dual)
-            }
-            for part, number in zip(slopes, told(state.view.held(numbers | moved)), strict=True):
-                tangent = forward_ad.unpack_dual(number).tangent
-                if tangent is not None:
-                    part[variable] = tangent.numpy()
-    return slopes
-
-
-def _backward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
-    slopes = np.zeros((7, state.count, valid.size))
-    with torch.enable_grad():
-        leaves, lens = state.view.leaves(_values(state))
-        for part, number in zip(slopes, told(lens), strict=True):
-            for ray in np.flatnonzero(valid) if number.requires_grad else ():
-                part[:, ray] = state.chained(number.reshape(-1)[ray], leaves).slope
-    return slopes.reshape(7, state.count, *valid.shape)
+def largest_field(lens: Lens) -> float:
+    """Distance of the outermost field from the axis, in the lens's own kind of field."""
+    return float(torch.hypot(lens.fields.x, lens.fields.y).max())
 
 
 class Ray(NamedTuple):
@@ -166,7 +153,7 @@ class Ray(NamedTuple):
 class Hits:
     """Rays (R,) behind a surface: `position` x, y, z mm in the axes of its vertex; `direction` L, M, N; `opl`; `valid`.
 
-    Components are arrays or dual numbers, each taken from the table of the trace when it is first asked for.
+    Components are arrays or dual numbers, each taken from the table of the trace when it is first needed.
     """
 
     def __init__(self, parts: Sequence, slopes: Sequence | None, valid: np.ndarray, places: np.ndarray):
@@ -193,17 +180,17 @@ class Hits:
 
 
 class _Components:
-    """Three components of rays, each found once."""
+    """Three components of rays, each computed once."""
 
     def __init__(self, hits: Hits, first: int):
-        self._hits, self._first, self._found = hits, first, {}
+        self._hits, self._first, self._computed = hits, first, {}
 
     def __getitem__(self, k: int):
         if not 0 <= k < 3:
             raise IndexError(k)
-        if k not in self._found:
-            self._found[k] = self._hits.component(self._first + k)
-        return self._found[k]
+        if k not in self._computed:
+            self._computed[k] = self._hits.component(self._first + k)
+        return self._computed[k]
 
     def __sub__(self, other) -> Vector:
         return Vector(self) - other
@@ -237,31 +224,26 @@ class Bundle:
         """The number of a ray, by which `Hits.at` finds it."""
         return self.rays.setdefault(Ray(wavelength, tuple(field), tuple(pupil)), len(self.rays))
 
-    # -- found once ----------------------------------------------------------------------------------------------------
+    # -- computed once ------------------------------------------------------------------------------------------------
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, list[list[Ray]]]:
-        """Where every ray stands in a table of wavelengths and rays, and its rows, filled up to one length."""
+        """The place of every ray in a table of wavelengths and rays, and the rows of the table, of equal length."""
         rows: list[list[Ray]] = [[] for _ in self.view.wavelengths]
         places = []
         for ray in self.rays:
             places.append((ray.wavelength, len(rows[ray.wavelength])))
             rows[ray.wavelength].append(ray)
         length = max(map(len, rows))
-        filling = [row[0] if row else Ray(0, (0.0, 0.0), (0.0, 0.0)) for row in rows]
-        rows = [row + [one] * (length - len(row)) for row, one in zip(rows, filling, strict=True)]
+        axis = Ray(0, (0.0, 0.0), (0.0, 0.0))
+        rows = [row + [row[0] if row else axis] * (length - len(row)) for row in rows]
         return np.array([w * length + r for w, r in places]), rows
 
     @cached_property
     def field(self) -> np.ndarray:
         """(2, W, R) in the lens's own kind of field."""
-        fields = self.view.lens.fields
-        largest = float(torch.hypot(fields.x, fields.y).max())
-        return (
-            self._opening
-            * largest
-            * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
-        )
+        scale = self._opening * largest_field(self.view.lens)
+        return scale * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
 
     @cached_property
     def pupil(self) -> np.ndarray:
@@ -275,7 +257,7 @@ class Bundle:
 
     @cached_property
     def _template(self):
-        """Surfaces, structure and table (W, K) as stored, and where the table holds what moves (`_Columns`)."""
+        """Surfaces, structure and table (W, K) as stored, and the columns of what moves (`_columns`)."""
         view = self.view
         with torch.enable_grad():
             shapes = {at: n for at, n in view.stored.items() if at[1] not in GLASS}
@@ -288,7 +270,7 @@ class Bundle:
 
     @cached_property
     def is_expressible(self) -> bool:
-        """Whether tables can tell all the surfaces."""
+        """Whether the compiled trace has all the surfaces."""
         return all(map(is_expressible, self.view.lens.surfaces[1 : self.last + 1]))
 
     @cached_property
@@ -303,32 +285,35 @@ class Bundle:
     def _aims(self) -> bool:
         return aiming_of(self.view.lens) != "off"
 
+    def on(self, surface: int) -> "Bundle":
+        """The same rays on another surface."""
+        bundle = Bundle(self.view, surface)
+        bundle.rays = self.rays
+        return bundle
+
     @cached_property
     def _at_stop(self) -> "Bundle":
-        """The same rays on the stop."""
-        found = Bundle(self.view, self.view.lens.stop)
-        found.rays = self.rays
-        return found
+        return self.on(self.view.lens.stop)
 
     @cached_property
     def _marginal(self) -> "Bundle":
         """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
-        found = Bundle(self.view, self.view.lens.stop)
-        found.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
-        return found
+        bundle = Bundle(self.view, self.view.lens.stop)
+        bundle.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
+        return bundle
 
     # -- at a state ---------------------------------------------------------------------------------------------------
 
     def hits(self, state: LensState) -> Hits:
-        """All rays on surface `last`, in the order in which they were asked for; 0: in front of surface 1."""
+        """All rays on surface `last`, in the order of `ask`; 0: in front of surface 1."""
         if self.last == 0:
             return self._at_object(state)
         if not self.is_expressible:
             return self._hits_by_torch(state)
-        return self._told(*self._traced(state, *self.launched(state)))
+        return self._hits(*self._traced(state, *self.launched(state)))
 
     def _at_object(self, state: LensState) -> Hits:
-        """The rays as they leave the object: on its plane, or nowhere where that is at infinity."""
+        """The rays on the plane of the object; nan for one at infinity."""
         position, direction, opl, valid = self.launched(state)
         if np.isinf(value_of(state.thickness[0])):
             return self._as_hits(state, (*[np.full(valid.shape, np.nan)] * 3, *direction, opl), valid)
@@ -337,12 +322,18 @@ class Bundle:
         return self._as_hits(state, (x, y, 0 * step, *direction, opl), valid)
 
     def marks(self, state: LensState) -> Marks:
-        """All rays on all surfaces from 1 to `last`, in the order in which they were asked for."""
+        """All rays on all surfaces from 1 to `last`, in the order of `ask`."""
         if self.is_expressible:
             surfaces, task, changes, start, count = self._task(state, *self.launched(state))
             found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
             if found is not None:
-                return self._marked(found, rows_of(task.structure, surfaces), count)
+                places, size, rows = self._places[0], self.field[0].size, rows_of(task.structure, surfaces)
+
+                def picked(part: Tensor) -> np.ndarray:
+                    return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
+
+                by = () if count is None else map(picked, found.by_position[:2])
+                return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
         hits = [bundle.hits(state) for bundle in self._each]
         parts = [[hit.position[k] for hit in hits] for k in range(2)]
         values = (np.stack([value_of(one) for one in part]) for part in parts)
@@ -351,20 +342,7 @@ class Bundle:
 
     @cached_property
     def _each(self) -> list["Bundle"]:
-        """The same rays on one surface each."""
-        found = [Bundle(self.view, last) for last in range(1, self.last + 1)]
-        for bundle in found:
-            bundle.rays = self.rays
-        return found
-
-    def _marked(self, found: Pushed, rows: list[int], count: int | None) -> Marks:
-        places, size = self._places[0], self.field[0].size
-
-        def picked(part: Tensor) -> np.ndarray:
-            return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
-
-        by = () if count is None else map(picked, found.by_position[:2])
-        return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
+        return [self.on(surface) for surface in range(1, self.last + 1)]
 
     def _traced(self, state: LensState, position, direction, opl, valid: np.ndarray):
         """Rays behind surface `last` as a table, and by how many variables they change, if any."""
@@ -387,7 +365,7 @@ class Bundle:
         return surfaces, task, torch.from_numpy(changes), start, count
 
     def starts(self, state: LensState) -> Hits:
-        """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
+        """All rays at their launch, before surface 1 and in its axes, in the order of `ask`."""
         position, direction, opl, valid = self.launched(state)
         return self._as_hits(state, (*position, *direction, opl), valid)
 
@@ -396,16 +374,11 @@ class Bundle:
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
     def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
-        shape = count, *self.field.shape[1:]
-        found = np.zeros((7, *shape))
-        for part, number in zip(found, (*position, *direction, opl), strict=True):
-            if isinstance(number, Dual):
-                part[:] = number.full()
-        found = torch.from_numpy(found)
-        return found[:3], found[3:6], found[6]
+        slopes = torch.from_numpy(np.stack([slope_of(part, count) for part in (*position, *direction, opl)]))
+        return slopes[:3], slopes[3:6], slopes[6]
 
-    def _told(self, end, count: int | None) -> Hits:
-        """The rays of a table as those that were asked for."""
+    def _hits(self, end, count: int | None) -> Hits:
+        """The rays of `ask`, from the table of a trace."""
         parts = [*end.position.numpy(), *end.direction.numpy(), end.opl.numpy()]
         slopes = None
         if count is not None:
@@ -460,7 +433,7 @@ class Bundle:
         return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
 
     def _aimed(self, state: LensState):
-        """Pupil points, two of (W, R), whose rays pass the stop where the pupil points say, and which were found."""
+        """Pupil points, two of (W, R), whose rays pass the stop at `pupil`, and which of them converged."""
         stop, shape = self._at_stop, self.field.shape[1:]
 
         def at_stop(state: LensState, pupil):
@@ -471,14 +444,17 @@ class Bundle:
             by = end.by_position.numpy()
             return (Dual(x, by[0]), Dual(y, by[1])), end.valid.numpy()
 
-        last = self.__dict__.get("_last")
-        begin = self.pupil if last is None else last
         radius = self._stop_radius(state)
-        pupil, found, points = aimed(state, at_stop, self.pupil, radius, begin)
-        if not found.all() and last is not None:
-            pupil, found, points = aimed(state, at_stop, self.pupil, radius, self.pupil)
-        self._last = np.where(found, points, self.pupil)
-        return tuple(part + np.zeros(shape) for part in pupil), found
+        pupil, converged, points = aimed(state, at_stop, self.pupil, radius, self._last_aim)
+        if not converged.all() and self._last_aim is not self.pupil:
+            pupil, converged, points = aimed(state, at_stop, self.pupil, radius, self.pupil)
+        self._last_aim = np.where(converged, points, self.pupil)
+        return tuple(part + np.zeros(shape) for part in pupil), converged
+
+    @cached_property
+    def _last_aim(self) -> np.ndarray:
+        """The pupil points of the last aiming, where the next one starts."""
+        return self.pupil
 
     def _stop_radius(self, state: LensState):
         """mm, negative where the entrance pupil is an inverted image of the stop."""
@@ -489,31 +465,32 @@ class Bundle:
         if lens.ray_aiming == "paraxial":
             return paraxial
         marginal = self._marginal
-        hits = marginal._told(*marginal._traced(state, *marginal._through(state, marginal.pupil)))
+        hits = marginal._hits(*marginal._traced(state, *marginal._through(state, marginal.pupil)))
         height = hits.position[1][np.array([0])]
         real = np.abs(height) * np.sign(value_of(paraxial))
         return real[0] if hits.valid[0] else paraxial
 
     def _launched_by_torch(self, state: LensState):
-        def start(lens) -> Rays:
-            field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
-            return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
-
-        bent = self._aims and is_bent(self.view.lens)
-        parts, valid = rays_by_torch(state, start, self.field.shape[1:], backward=bent)
+        parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
         return parts[:3], parts[3:6], parts[6], valid
 
-    def _hits_by_torch(self, state: LensState) -> Hits:
-        def end(lens) -> Rays:
-            field, pupil, wavelength = torch.from_numpy(self.field), torch.from_numpy(self.pupil), lens.wavelengths
-            rays = rays_of_field(lens, field, pupil, wavelength=wavelength[:, None])
-            indices = unbent(lens, media(lens, wavelength[:, None])[: self.last + 1])
-            return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
+    def _start_by_torch(self, lens: Lens) -> Rays:
+        field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
+        return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
 
-        bent = self._aims and is_bent(self.view.lens)
-        parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=bent)
-        slopes = [part.full() for part in parts] if state.count else None
-        return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
+    @cached_property
+    def _aims_bent(self) -> bool:
+        return self._aims and is_bent(self.view.lens)
+
+    def _hits_by_torch(self, state: LensState) -> Hits:
+        def end(lens: Lens) -> Rays:
+            wavelength = lens.wavelengths[:, None]
+            indices = unbent(lens, media(lens, wavelength)[: self.last + 1])
+            rays = self._start_by_torch(lens)
+            return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength)
+
+        parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=self._aims_bent)
+        return self._as_hits(state, parts, valid)
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:
@@ -521,26 +498,21 @@ def _by_leaves(table: Tensor, leaves: dict) -> dict:
     every = torch.eye(table.numel(), dtype=table.dtype)
     if not leaves or not table.requires_grad:
         return {}
-    found = torch.autograd.grad(
-        table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True
-    )
-    return {
-        at: g.reshape(*table.shape, *leaves[at].shape).numpy()
-        for at, g in zip(leaves, found, strict=True)
-        if g is not None
-    }
+    by = torch.autograd.grad(table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True)
+    pairs = zip(leaves, by, strict=True)
+    return {at: g.reshape(*table.shape, *leaves[at].shape).numpy() for at, g in pairs if g is not None}
 
 
 def _columns(table: Tensor, leaves: dict) -> dict | None:
-    """The columns that hold what moves just as it is, by address; None where anything stands in it changed."""
-    found = {}
+    """The columns that hold a leaf unchanged, by address; None if a column holds a function of a leaf."""
+    columns = {}
     for at, derivative in _by_leaves(table, leaves).items():
         leaf = leaves[at].detach().numpy()
         held = (table.detach().numpy() == (leaf if leaf.ndim == 0 else leaf[:, None])).all(0)
-        as_it_is = np.eye(len(table)) if leaf.ndim else np.ones(len(table))
-        columns = derivative.swapaxes(0, 1)  # (K, W, …)
-        moving = (columns != 0).reshape(len(columns), -1).any(-1)
-        if not (held[moving].all() and (columns[moving] == as_it_is).all()):
+        unchanged = np.eye(len(table)) if leaf.ndim else np.ones(len(table))
+        by_column = derivative.swapaxes(0, 1)  # (K, W, …)
+        moving = (by_column != 0).reshape(len(by_column), -1).any(-1)
+        if not (held[moving].all() and (by_column[moving] == unchanged).all()):
             return None
-        found[at] = np.flatnonzero(moving)
-    return found
+        columns[at] = np.flatnonzero(moving)
+    return columns

@@ -17,15 +17,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
-from raytrace.maths.result import Result, called, cell
-from raytrace.maths.value import value
+from raytrace.maths.result import Result, cell
+from raytrace.maths.value import detached, value
 from raytrace.optimization.attained import refuse_contradictions
 from raytrace.optimization.default_merit import KINDS, DefaultMerit
 from raytrace.optimization.merit import Merit, merit_for
 from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import Condition, NoProblem, Problem, conditions_in_unit, optimization_data_of
+from raytrace.optimization.report import drawn_fields
 from raytrace.optimization.saddle_points import Insertion, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
@@ -42,13 +45,13 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.solver import SolverOptions
 from raytrace.optimization.variables import bounds_of, freedom
+from raytrace.plotting import style
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.spot_diagram import spot
 from raytrace.words import calling_level
 
 #: Why a search ends.
@@ -59,6 +62,7 @@ STOPPED = {
     "interrupted": "interrupted; these were found so far",
 }
 MOST = 40  # minima of a result
+_MOST, _COLUMNS = 9, 3  # lenses of the figure
 
 
 @value
@@ -84,8 +88,6 @@ class Searched(Result):
     descents: int
     seconds: float
     stopped: str
-
-    FIGURE = "plotting.search.best"
 
     @property
     def lens(self) -> Lens:
@@ -120,6 +122,25 @@ class Searched(Result):
             lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")
         return "\n".join(lines)
 
+    @style.styled
+    def draw(self):
+        """The best lenses on one scale, each with its merit, its spots and how many descents reached it."""
+        count = min(_MOST, len(self.lenses))
+        columns = min(_COLUMNS, count)
+        rows = -(-count // columns)
+        figure = style.new_figure(3.6 * max(columns, 2), 2.5 * rows + 0.5)
+        figure.suptitle(
+            style.fill(self.before.name or "Lens", figure.get_figwidth(), 11, bold=True), fontsize=11, fontweight="bold"
+        )
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for k, axes in enumerate(panels):
+            if k < count:
+                _draw(axes, self, k)
+            else:
+                axes.set_axis_off()
+        on_one_scale(panels[:count])
+        return figure
+
     def save(self, folder: str | PathLike) -> None:
         """Write a lens file and a thumbnail of every minimum, the table, and a figure of the best side by side."""
         folder = Path(folder)
@@ -129,7 +150,7 @@ class Searched(Result):
                 if number > 1:  # what a file cannot hold is the same of all
                     warnings.simplefilter("ignore", LensFileWarning)
                 write_lens(lens, folder / f"minimum_{number:02d}.zmx")
-            called("plotting.search.thumbnail")(lens, folder / f"minimum_{number:02d}.png")
+            thumbnail(lens, folder / f"minimum_{number:02d}.png")
         for path in folder.glob("minimum_*.*"):
             if path.stem.removeprefix("minimum_").isdigit() and int(path.stem.removeprefix("minimum_")) > number:
                 path.unlink()
@@ -186,6 +207,29 @@ def _spots(lens: Lens) -> Tensor:
     centre = (each.centroid * share).sum(-1, keepdim=True)
     apart = (each.centroid - centre).square().sum(0)
     return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
+
+
+def _draw(axes, found: Searched, k: int) -> None:
+    _draw_lens(axes, found.lenses[k])
+    spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
+    times = int(found.found[k])
+    axes.set_title(
+        f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
+        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
+    )  # fmt: skip
+
+
+def _draw_lens(axes, lens: Lens) -> None:
+    lens = detached(lens)
+    draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
+
+
+@style.styled
+def thumbnail(lens: Lens, path: str | PathLike) -> None:
+    """Write the cross section alone, small."""
+    figure = style.new_figure(3.0, 1.8)
+    _draw_lens(figure.add_subplot(), lens)
+    style.save(figure, path, dpi=80)
 
 
 # -- the search --------------------------------------------------------------------------------------------------------

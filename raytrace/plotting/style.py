@@ -6,23 +6,11 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
-from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
-from matplotlib.patheffects import withStroke
-from matplotlib.textpath import TextPath
 from torch import Tensor
 
 from raytrace.files import write_atomically
-from raytrace.maths.result import object_text
-from raytrace.maths.value import detached as detached
-from raytrace.system.lens import FIELD_UNITS, Lens
-from raytrace.tracing.paraxial import FirstOrder
 
 INK = "#262626"
 GREY = "#7a7a7a"
@@ -66,29 +54,25 @@ _STYLE = {
     "savefig.facecolor": "white",
 }
 
-#: How the models are drawn: colour and dashes, to be told apart in print.
-LOOKS = {
-    "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
-    "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),
-    "gaussian": (FIELD_COLOURS[2], "solid"),
-    "drt": (INK, (0, (6, 1.5, 1, 1.5))),
-    "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
-}
-
 
 def styled(function: Callable) -> Callable:
     """Run a function under the style of these figures; the reader's own settings are back when it returns."""
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
+        import matplotlib
+
         with matplotlib.rc_context(_STYLE):
             return function(*args, **kwargs)
 
     return wrapper
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float):
     """A figure of width × height inches on a canvas of its own."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
     figure.get_layout_engine().set(w_pad=0.07, h_pad=0.07)
     FigureCanvasAgg(figure)
@@ -96,7 +80,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 @styled
-def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
+def save(figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     """Write a figure as .png, .pdf or .svg by its suffix; the file is replaced as a whole or not at all.
 
     The same figure, built again, gives the same bytes. Raises ValueError for another suffix, OSError where nothing can
@@ -116,6 +100,8 @@ def array(tensor: Tensor) -> np.ndarray:
 
 def tint(index: float) -> tuple[float, ...]:
     """The colour of glass by its index."""
+    from matplotlib.colors import to_rgb
+
     light, dark = (np.array(to_rgb(colour)) for colour in GLASS_COLOURS)
     share = min(max((index - 1.4) / 0.6, 0.0), 1.0)
     return tuple(light + share * (dark - light))
@@ -129,24 +115,10 @@ def field_colours(count: int) -> list[str]:
     """A colour for each of so many fields; where there are too many to name, from dark to bright in their order."""
     if count <= len(FIELD_COLOURS):
         return [field_colour(f) for f in range(count)]
+    import matplotlib
+    from matplotlib.colors import to_hex
+
     return [to_hex(matplotlib.colormaps["viridis"](0.92 * f / (count - 1))) for f in range(count)]
-
-
-def field_label(lens: Lens, field: Sequence[float]) -> str:
-    """A field point in words: `10°`, `(3, 4)°`, `5 mm`; the x coordinate is named only where it is not 0."""
-    x, y = (float(component) + 0.0 for component in field)
-    unit = "°" if FIELD_UNITS[lens.fields.kind] == "degrees" else " mm"
-    return f"{_minus(f'{y:.6g}')}{unit}" if x == 0 else _minus(f"({x:.6g}, {y:.6g})") + unit
-
-
-def field_title(lens: Lens) -> str:
-    """What a field of this lens is."""
-    return {
-        "angle": "Field angle",
-        "object_height": "Object height",
-        "paraxial_image_height": "Paraxial image height",
-        "real_image_height": "Image height",
-    }[lens.fields.kind]
 
 
 def wavelength_colours(wavelengths: Sequence[float]) -> list[str | tuple[float, float, float]]:
@@ -170,6 +142,8 @@ def ray_colours(fields: int, wavelengths: Sequence[float]) -> list[list]:
 
 def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
     """Hues by wavelength, interpolated; chosen by eye for legibility rather than for colorimetry."""
+    from matplotlib.colors import to_rgb
+
     knots = {
         0.39: "#5b1a9a", 0.43: "#4421b8", 0.46: "#1f3fd1", 0.49: "#0077b6", 0.51: "#008f7a", 0.53: "#0a8f3c",
         0.555: "#3f9a12", 0.575: "#8a9400", 0.59: "#c78500", 0.61: "#dd5f00", 0.64: "#d62828", 0.75: "#8b0f14",
@@ -202,19 +176,6 @@ def micrometres(length: float) -> str:
     return f"{number_text(1e3 * length)} µm"
 
 
-def first_order_text(lens: Lens, paraxial: FirstOrder) -> str:
-    """`EFL 99.51 mm · F/2.99 · object at 25.00 m`, as a subtitle."""
-    parts = []
-    focal_length = float(paraxial.effective_focal_length)
-    if math.isfinite(focal_length):
-        parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(paraxial.f_number), 3)}"]
-    distance, working = float(lens.surfaces[0].thickness), float(paraxial.paraxial_working_f_number)
-    parts.append(f"object at {object_text(distance)}")
-    if math.isfinite(distance) and math.isfinite(working):
-        parts.append(f"working F/{number_text(working, 3)}")
-    return "  ·  ".join(parts)
-
-
 def round_length(length: float) -> float:
     """The largest of 1, 2, 5 × 10^n that is not above a length."""
     decade = 10.0 ** math.floor(math.log10(length))
@@ -227,7 +188,7 @@ def round_text(length: float) -> str:
     return f"{length * scale:.6g} {unit}"
 
 
-def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "center") -> None:
+def scale_bar(axes, x: float, y: float, length: float, align: str = "center") -> None:
     """A bar of a length in mm that starts at (x, y), its length written above it: centred, or from its "left"."""
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
     place = (x if align == "left" else x + length / 2, y)
@@ -237,8 +198,10 @@ def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "cente
     )  # fmt: skip
 
 
-def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
+def bar_on_dark(axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
     """A white bar of a length in mm from (x, y), on axes of so many mm a unit, its length written above it."""
+    from matplotlib.patheffects import withStroke
+
     dark = [withStroke(linewidth=1.6, foreground="black")]  # legible on bright kernels too
     frame = [withStroke(linewidth=3.0, foreground="black")]
     axes.plot([x, x + length / unit], [y, y], color="white", linewidth=1.6, zorder=6, path_effects=frame)
@@ -246,6 +209,30 @@ def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", 
         words or round_text(length), (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom",
         zorder=6, path_effects=dark,
     )  # fmt: skip
+
+
+def show_image(panel, values, title: str = "", *, top: float = 1.0, **drawing) -> None:
+    """A grey or coloured image from 0 to `top`."""
+    panel.imshow(values, **{"cmap": "gray", "vmin": 0, "vmax": top, "interpolation": "nearest"} | drawing)
+    panel.set(xticks=[], yticks=[])
+    panel.set_title(title, fontsize=7.5)
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+
+
+def framed(panel) -> None:
+    """A panel with a thin grey frame and no ticks."""
+    panel.set(xticks=[], yticks=[])
+    for spine in panel.spines.values():
+        spine.set_visible(True)
+        spine.set_color(GREY)
+
+
+def legend_entry(label: str, **look):
+    """A line or marker of a legend that no curve has."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **look)
 
 
 def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
@@ -270,6 +257,9 @@ def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
 @functools.lru_cache(maxsize=1024)
 def _width(word: str, size: float, bold: bool) -> float:
     """Points that a word of a size in points takes, from where it begins to where the next letter would."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
     font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
     between, none = (TextPath((0, 0), letters, prop=font).get_extents().width for letters in (f"n{word}n", "nn"))
     return between - none

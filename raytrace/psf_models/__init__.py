@@ -5,7 +5,7 @@
 `models.py` has the call, the table of the models and the choice of an order; `sharing.py` the work of several
 processes.
 
-| model    | what it knows of the lens                                                       | module         |
+| model    | data of the lens                                                                | module         |
 |----------|---------------------------------------------------------------------------------|----------------|
 | paraxial | focal length, principal planes, entrance pupil: a Gaussian of the defocus blur  | paraxial.py    |
 | fourier  | the same, with diffraction: a defocused (and aberrated) circular pupil          | fourier.py     |

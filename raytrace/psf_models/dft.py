@@ -1,7 +1,7 @@
 """Sums of waves: matrix DFT, FFT and direct Huygens sums, and the pixels that integrate their intensity.
 
 A path W (mm or waves) is a phase +2π W/λ. Phases are reduced to a fraction of a wave before the factor 2π, so that a
-million waves of piston cost no digits.
+million waves of piston lose no precision.
 """
 
 import math
@@ -22,7 +22,7 @@ from raytrace.words import calling_level
 
 
 class TooManyPoints(ValueError):
-    """A wave that turns too often over the pupil to be summed; the message says what helps."""
+    """A wave whose phase varies too much over the pupil to be summed."""
 
 
 class EmptyPupil(ValueError):
@@ -52,7 +52,7 @@ def huygens(
     p, q = points[:, :, None], pupil[:, None, :]
     distance = torch.sqrt(sum((a - b) ** 2 for a, b in zip(q, p, strict=True)))
     excess = sum(a * (a - 2 * b) for a, b in zip(p, q, strict=True)) / (distance + torch.abs(radius))
-    # Each term to a fraction of a wave by itself: neither spoils the digits of the other.
+    # Each term is reduced to a fraction of a wave by itself: neither costs precision of the other.
     waves = _fraction(path / wavelength) + _fraction(torch.sign(radius) * excess / wavelength)
     return phasor(waves) @ amplitude.to(phasor(waves[:1, :1]).dtype)
 
@@ -88,23 +88,30 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
     """
 
     def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
-        along_x = phasor(L[..., :, None] * (x[..., None, :] / wavelength[..., None, None]))
-        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None]))
-        return along_y @ (field[..., :, None] * along_x)
+        return _rows(M, y, wavelength) @ (field[..., :, None] * phasor(_columns(L, x, wavelength)))
 
-    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
+    return _in_chunks(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
 
 
 def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
     """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
 
     def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
-        turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
-        cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
-        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]
+        cosine = 2 * torch.cos(2 * math.pi * _fraction(_columns(L, x, wavelength)))
+        along_y = _rows(M, y, wavelength) * field[..., None, :]
         return torch.complex(along_y.real @ cosine, along_y.imag @ cosine)
 
-    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
+    return _in_chunks(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
+
+
+def _columns(L: Tensor, x: Tensor, wavelength: Tensor) -> Tensor:
+    """L x/λ (..., J, X)."""
+    return L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
+
+
+def _rows(M: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """exp(2πi M y/λ) (..., Y, J)."""
+    return phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None]))
 
 
 def rings_to_grid(field: Tensor, sine: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
@@ -116,12 +123,12 @@ def rings_to_grid(field: Tensor, sine: Tensor, x: Tensor, y: Tensor, wavelength:
         J0 = bessel_j0(argument).flatten(-3, -2)
         return torch.complex(*(J0 @ part[..., None] for part in (field.real, field.imag)))
 
-    U = _in_pieces(some, field, sine, each=32 * distance[..., 0, 0].numel() * x.shape[-1] * y.shape[-1])
+    U = _in_chunks(some, field, sine, each=32 * distance[..., 0, 0].numel() * x.shape[-1] * y.shape[-1])
     return U[..., 0].unflatten(-1, distance.shape[-2:])
 
 
-def _in_pieces(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Tensor:
-    """sum_of(*waves), a sum over the last axis of the waves (..., J), in pieces; each: bytes that one of them takes."""
+def _in_chunks(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Tensor:
+    """sum_of(*waves), a sum over the last axis of the waves (..., J), in chunks; each: bytes of a single wave."""
     parts = zip(*(torch.split(wave, piece(each), -1) for wave in torch.broadcast_tensors(*waves)), strict=True)
     total = sum_of(*next(parts))
     for part in parts:
@@ -186,10 +193,10 @@ def integrate(intensity: Tensor, weight: Tensor, pitch: Tensor) -> Tensor:
 
 
 def window_moments(intensity: Tensor, x: Tensor, y: Tensor, weight: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) mm and covariance (3, ...) mm², xx, xy, yy, of the light inside a window, pixels or not.
+    """Centroid (2, ...) mm and covariance (3, ...) mm², xx, xy, yy, of the light inside a window; 0 where there is no
+    light.
 
-    intensity: (..., Y, X) per mm² at the nodes x (..., X), y (..., Y) mm of `sub_pixels`; weight: of one pixel. 0 where
-    there is no light.
+    intensity: (..., Y, X) per mm² at the nodes x (..., X), y (..., Y) mm of `sub_pixels`; weight: of one pixel.
     """
     intensity = intensity * pitch**2
     along_x, along_y = (weight.repeat(t.shape[-1] // len(weight)) for t in (x, y))
@@ -236,15 +243,15 @@ def _bessel_slope(x: Tensor, number: int) -> Tensor:
     return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
 
 
-# -- what waves take in memory, told in the words of a lens ------------------------------------------------------------
+# -- memory ------------------------------------------------------------------------------------------------------------
 
 _HELPS = "give a larger `tol`, a smaller `size` or `pixel`, a slower aperture (`f_number`), `model=drt`"
 
 
 def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
-    """Raise OverBudget where a pupil of so many Gauss rings is too much.
+    """Raise OverBudget where a pupil of so many Gauss rings exceeds the memory budget.
 
-    phase: radians along a pupil radius. n rings are counted as a matrix n × n: so do the points that they serve grow.
+    phase: radians along a pupil radius. n rings are counted as a matrix n × n: the points that they serve grow alike.
     """
     D, F, W = scene.shape
     turns = phase / (2 * math.pi)
@@ -256,7 +263,7 @@ def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
 
 
 def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
-    """Raise OverBudget where the light at `nodes`² points of each pixel is too much; fields come one by one."""
+    """Raise OverBudget where the light at `nodes`² points of each pixel exceeds the memory budget, field by field."""
     D, _, W = scene.shape
     rows, columns = grid.rows * nodes, grid.columns * nodes
     afford(

@@ -31,7 +31,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, varies
 from raytrace.maths.value import value
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
-from raytrace.psf_models.result import Kernels, moments
+from raytrace.psf_models.result import Kernels, centroid_and_covariance
 from raytrace.system.apertures import Aperture, clearance
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
@@ -41,13 +41,20 @@ from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, tra
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
     """Bilinear deposition: each point shares its weight between the four nearest pixel centres.
 
-    The point is a box one pixel wide, which adds pitch²/12 to the variance per axis.
-    points: (2, ..., P) mm; weights: (P,) or (..., P); returns (..., rows, columns). Points outside the window are
-    dropped. A point on a pixel centre has the derivative of the side towards larger coordinates.
+    The point is a box one pixel wide, which adds pitch²/12 to the variance per axis. A point on a pixel centre has the
+    derivative of the side towards larger coordinates.
+    points: (2, ..., P) mm; weights: (P,) or (..., P); returns (..., rows, columns), without points outside the window.
     """
-    column, right = _between_centres(_in_pixels(grid, points, 0) - 0.5, grid.columns)
-    row, up = _between_centres(_in_pixels(grid, points, 1) - 0.5, grid.rows)
-    return _four(grid, column, row, right, up, weights)
+
+    def between_centres(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """The pixel centre i below u, -1 … count - 1, and the share u - i of its neighbour i + 1."""
+        u = torch.where((u > -1) & (u < count), u, -1.0)  # a NaN is outside
+        below = torch.floor(u).detach()
+        return below.long(), u - below
+
+    column, right = between_centres(_in_pixels(grid, points, 0) - 0.5, grid.columns)
+    row, up = between_centres(_in_pixels(grid, points, 1) - 0.5, grid.rows)
+    return _deposit(grid, column, row, _products(weights, right, up))
 
 
 def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -> Tensor:
@@ -58,22 +65,28 @@ def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -
     width: half width of the kernel in pixels, 0 < width <= 1/2; it adds (width·pitch)²/7 to the variance per axis.
     points, weights and result as for `splat`.
     """
-    column, right = _about_edges(_in_pixels(grid, points, 0), grid.columns, width)
-    row, up = _about_edges(_in_pixels(grid, points, 1), grid.rows, width)
-    return _four(grid, column, row, right, up, weights)
+
+    def about_edges(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """The pixel i below the edge nearest to u, and the share of pixel i + 1 behind that edge."""
+        u = torch.where((u > -0.5) & (u < count + 0.5), u, -0.5)
+        edge = torch.floor(u + 0.5).detach()
+        s = (0.5 + (u - edge) / (2 * width)).clamp(0, 1)
+        return edge.long() - 1, s * s * s * (10 - s * (15 - 6 * s))
+
+    column, right = about_edges(_in_pixels(grid, points, 0), grid.columns)
+    row, up = about_edges(_in_pixels(grid, points, 1), grid.rows)
+    return _deposit(grid, column, row, _products(weights, right, up))
 
 
 def histogram(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
-    """Energy of the points in each pixel, without derivative in their positions; arguments and result as for
-    `splat`.
-    """
+    """Energy of the points in each pixel, without derivative in their positions; arguments as for `splat`."""
     column, row = (torch.floor(_in_pixels(grid, points, axis)) for axis in (0, 1))
     # -1 or `count`, outside the window, for all points further out and for NaN.
     column, row = (
         torch.where(torch.isfinite(pixel), pixel.clamp(-1, count), -1.0).long()
         for pixel, count in ((column, grid.columns), (row, grid.rows))
     )
-    return _deposit(grid, [(column, row, weights)])
+    return _deposit(grid, column, row, [weights])
 
 
 def splat_cells(
@@ -90,7 +103,7 @@ def splat_cells(
     points: (2, ..., A, N) mm, N nodes on each of A lines at equal angles; radius: (N,) of the nodes.
     clearances: each (..., A, N), positive where light passes; the share of a cell below 0 is cut away.
     closed: whether the last line is followed by the first; otherwise it is the first line one turn later.
-    A cell may be at most one pixel wide: see `cell_widths`.
+    A cell may be at most one pixel wide (`cell_widths`).
     """
     lines = points.shape[-2] - (0 if closed else 1)
     u, v = _in_pixels(grid, points, 0), _in_pixels(grid, points, 1)
@@ -99,13 +112,8 @@ def splat_cells(
     (column, right, dense_x), (row, up, dense_y) = _shares(x, ax, bx, grid.columns), _shares(y, ay, by, grid.rows)
     both = right * up + (ax * ay + bx * by) / 3 * dense_x * dense_y
     both = torch.maximum(torch.minimum(both, torch.minimum(right, up)), (right + up - 1).clamp_min(0))
-    deposits = (
-        (column, row, 1 - right - up + both),
-        (column + 1, row, right - both),
-        (column, row + 1, up - both),
-        (column + 1, row + 1, both),
-    )
-    return _deposit(grid, [(i, j, energy * share) for i, j, share in deposits], axes=2)
+    shares = (1 - right - up + both, right - both, up - both, both)
+    return _deposit(grid, column, row, [energy * share for share in shares], axes=2)
 
 
 def cell_widths(grid: Grid, points: Tensor, largest: Callable[[Tensor], Tensor]) -> tuple[float, float, float]:
@@ -186,62 +194,28 @@ def _in_pixels(grid: Grid, points: Tensor, axis: int) -> Tensor:
     return (like - centre) / pitch + 0.5 * count
 
 
-def _between_centres(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The pixel centre i below u, -1 … count - 1, and the share u - i of its neighbour i + 1."""
-    reached = (u > -1) & (u < count)  # a NaN is not
-    u = torch.where(reached, u, -1.0)
-    below = torch.floor(u).detach()
-    return below.long(), u - below
+def _products(weights: Tensor, right: Tensor, up: Tensor) -> list[Tensor]:
+    """Weights of a pixel and its three neighbours, for independent shares along x and y."""
+    right, left = weights * right, weights * (1 - right)
+    return [left * (1 - up), right * (1 - up), left * up, right * up]
 
 
-def _about_edges(u: Tensor, count: int, width: float) -> tuple[Tensor, Tensor]:
-    """The pixel i below the edge nearest to u, and the share of pixel i + 1 behind that edge."""
-    reached = (u > -0.5) & (u < count + 0.5)
-    u = torch.where(reached, u, -0.5)
-    edge = torch.floor(u + 0.5).detach()
-    s = (0.5 + (u - edge) / (2 * width)).clamp(0, 1)
-    return edge.long() - 1, s * s * s * (10 - s * (15 - 6 * s))
-
-
-def _four(grid: Grid, column: Tensor, row: Tensor, right: Tensor, up: Tensor, weights: Tensor) -> Tensor:
-    right_weight, left_weight = weights * right, weights * (1 - right)
-    return _deposit(
-        grid,
-        [
-            (column, row, left_weight * (1 - up)),
-            (column + 1, row, right_weight * (1 - up)),
-            (column, row + 1, left_weight * up),
-            (column + 1, row + 1, right_weight * up),
-        ],
-    )
-
-
-def _deposit(grid: Grid, deposits: list[tuple[Tensor, Tensor, Tensor]], *, axes: int = 1) -> Tensor:
-    """Add (column, row, energy), each (..., P) over its last `axes` axes, to pixels (..., rows, columns)."""
-    image = None
-    dropped = grid.rows * grid.columns
-    for column, row, energy in deposits:
-        inside = (column >= 0) & (column < grid.columns) & (row >= 0) & (row < grid.rows)
-        place = torch.where(inside, row * grid.columns + column, dropped).flatten(-axes)
+def _deposit(grid: Grid, column: Tensor, row: Tensor, energies: list[Tensor], *, axes: int = 1) -> Tensor:
+    """Pixels (..., rows, columns) that hold energies (..., P), over the last `axes` axes, of the pixel (column, row)
+    and, if four are given, of its neighbours (1, 0), (0, 1) and (1, 1) further.
+    """
+    image, dropped = None, grid.rows * grid.columns
+    for (right, up), energy in zip(((0, 0), (1, 0), (0, 1), (1, 1)), energies, strict=False):
+        i, j = column + right, row + up
+        inside = (i >= 0) & (i < grid.columns) & (j >= 0) & (j < grid.rows)
+        place = torch.where(inside, j * grid.columns + i, dropped).flatten(-axes)
         energy = energy.expand(inside.shape).flatten(-axes)
         image = energy.new_zeros(*place.shape[:-1], dropped + 1) if image is None else image
         image = image.scatter_add(-1, place, energy)
     return image[..., :-1].unflatten(-1, grid.shape)
 
 
-_LINES = (
-    16,
-    24,
-    32,
-    48,
-    64,
-    96,
-    128,
-    192,
-    256,
-    384,
-    512,
-)  # by order; half as many nodes on each
+_LINES = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # by order; half as many nodes on each
 _CHUNK = 2**17  # cells deposited at once: 50 MB of temporaries
 _FINEST = 4096  # cells across the pupil at most
 
@@ -254,8 +228,7 @@ class Fans:
     clearances: one (D, F, W, A, N) for each aperture, positive where light passes, dimensionless.
     rays: number traced for each kernel.
     is_half: the light is symmetric in x, and the lines are those of x > 0 and one more beyond either end: the cells
-    between
-        the outer two lines on either side are their own mirror images; all other cells have one.
+    between the outer two lines on either side are their own mirror images; all other cells have one.
     """
 
     points: Tensor
@@ -276,12 +249,9 @@ def kernels_of_rays(
 ) -> Kernels:
     """PSFs of traced rays, without the polynomial map; differentiable in the lens, the sensor distance and the grid.
 
-    order: 0 … 10; each has twice the rays of the one before, and half its error.
-    rays: instead, that many independent rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by
-    `splat_smooth`
-        of half width `width` pixels; a width of 0 is the histogram, which has no derivative.
-    A kernel that no ray reaches has energy 0 and gradient 0. Vignetting factors of a field reduce the energy of its
-    beam.
+    order: 0 … 10; each has twice the rays of the one before, and half its error. rays: instead, that many independent
+    rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by `splat_smooth` of half width `width` pixels; a
+    width of 0 is the histogram, which has no derivative. A kernel that no ray reaches has energy 0 and gradient 0.
     """
     if rays is None:
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
@@ -460,9 +430,8 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     covariance = torch.stack([(share * pair).sum((-2, -1)) for pair in pairs])
     if fans.is_half:
         covariance = torch.stack([covariance[0], torch.zeros_like(covariance[1]), covariance[2]])
-    lit = weights.sum((-2, -1)) > 0
     centroid = torch.stack([mean_x, mean_y])[..., 0, 0] + reference[..., 0, 0]
-    return torch.where(lit, centroid, 0.0), covariance
+    return torch.where(weights.sum((-2, -1)) > 0, centroid, 0.0), covariance
 
 
 def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *, width: float) -> Kernels:
@@ -477,7 +446,7 @@ def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *
     # Relative to the first ray that arrives, a small spot far off the axis loses no precision.
     first = (energy > 0) & ((energy > 0).to(torch.int64).cumsum(-1) == 1)
     reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
-    centroid, covariance = moments(*torch.where(energy > 0, points - reference, 0.0), share)
+    centroid, covariance = centroid_and_covariance(*torch.where(energy > 0, points - reference, 0.0), share)
     centroid = centroid + reference[..., 0]
     return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=arrived * light)
 
@@ -569,34 +538,25 @@ class RayMap:
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 3) -> Kernels:
-    """PSFs through the ray map, or of traced rays where it fails; see `kernels_and_reason`."""
-    return kernels_and_reason(scene, grid, order=order)[0]
-
-
-def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Kernels, str]:
-    """PSFs through the ray map, and one line on the method used.
+    """PSFs through the ray map; of traced rays where no polynomial fits, or a ray misses a surface or is totally
+    reflected.
 
     order: 0 … 10; each has twice the cells of the one before, half its error, and a map of higher degree.
     `Kernels.residual` bounds the effect of the map's error on the kernel (relative L1); it is 0 for traced rays.
     """
-    limit = max(_PIXELS * 0.5**order, _CLOSE)
-    pitch = grid.pitch.detach()
-    why, first = "", _DEGREES[min(order, len(_DEGREES) - 1)]
+    limit, pitch = max(_PIXELS * 0.5**order, _CLOSE), grid.pitch.detach()
+    first = _DEGREES[min(order, len(_DEGREES) - 1)]
     for degree in [first, *(degree for degree in _HIGHER_DEGREES if degree > first)]:
         ray_map = fit(scene, degree)
         error = float(scene.largest((ray_map.residual / pitch).amax()))
         edge_error = float(scene.largest(ray_map.edge_residual.amax()))
         if error <= limit and edge_error <= limit:
-            return _kernels_of_map(scene, grid, ray_map, order), (
-                f"map of degree {degree} through {ray_map.rays} rays, within {error:.1e} pixels"
-            )
-        if error == float("inf"):
-            why = "a ray misses a surface or is totally reflected"
+            return _kernels_of_map(scene, grid, ray_map, order)
+        if math.isinf(error):
             break
-        why = f"a map of degree {degree} errs by {error:.1e} pixels (edges {edge_error:.1e}), above {limit:.1e}"
     finer = min(order + 2, 10)
     traced = kernels_of_fans(scene, grid, trace_fans(scene, finer), width=cell_width(finer))
-    return _with_residual(traced, torch.zeros_like(traced.centroid[0])), f"{traced.rays} rays traced: {why}"
+    return _with_residual(traced, torch.zeros_like(traced.centroid[0]))
 
 
 def fit(scene: Scene, degree: int) -> RayMap:
@@ -604,7 +564,7 @@ def fit(scene: Scene, degree: int) -> RayMap:
     like = scene.lens.surfaces[-2].thickness
     fold = symmetry(scene)
     axial, mirrored = fold == "round", fold == "mirror"
-    constant = functools.partial(torch.tensor, dtype=like.dtype, device=like.device)
+    constant = like.new_tensor
     if axial:
         terms = degree // 2 + 1  # positive Chebyshev nodes: heights on the y axis
         height = np.cos((2 * np.arange(terms) + 1) * np.pi / (4 * terms))
@@ -634,8 +594,9 @@ def fit(scene: Scene, degree: int) -> RayMap:
     crossings = tuple(coefficients(hit) for _, hit in crossed)
     edge = torch.zeros_like(hits[0, ..., 0])
     for (aperture, hit), terms in zip(crossed, crossings, strict=True):
-        error = clearance(aperture, terms @ check.T) - clearance(aperture, hit[..., count:])
-        edge = torch.maximum(edge, largest(error))
+        edge = torch.maximum(
+            edge, largest(clearance(aperture, terms @ check.T) - clearance(aperture, hit[..., count:]))
+        )
     residual = largest((mapped @ check.T - hits[..., count:]).abs().amax(0))
     apertures = tuple(aperture for aperture, _ in crossed)
     return RayMap(degree, axial, mapped, crossings, apertures, residual, edge, disc.shape[1], mirrored)
@@ -647,20 +608,16 @@ def fans_of_map(ray_map: RayMap, across: int, along: int, *, is_half: bool = Fal
     at_angle, at_radius = pupil_lines(across, along)
     if is_half:
         at_angle = at_angle[np.arange(-1, across // 2 + 1)]
-    angle, radius = (torch.as_tensor(t, dtype=like.dtype, device=like.device) for t in (at_angle, at_radius))
+    angle, radius = (like.new_tensor(t) for t in (at_angle, at_radius))
     if ray_map.axial:
-        radial = torch.as_tensor(_axial_basis(ray_map.degree, at_radius), dtype=like.dtype).to(like.device)
-
-        def on_fans(terms: Tensor) -> Tensor:
-            return rotated((terms[1] @ radial.T)[..., None, :], angle)
+        radial = like.new_tensor(_axial_basis(ray_map.degree, at_radius))
     else:
-        radial, around = (
-            torch.as_tensor(t, dtype=like.dtype, device=like.device)
-            for t in _factors(ray_map.degree, at_radius, at_angle)
-        )
+        radial, around = (like.new_tensor(t) for t in _factors(ray_map.degree, at_radius, at_angle))
 
-        def on_fans(terms: Tensor) -> Tensor:
-            return around @ (terms[..., None] * radial.T)
+    def on_fans(terms: Tensor) -> Tensor:
+        if ray_map.axial:
+            return rotated((terms[1] @ radial.T)[..., None, :], angle)
+        return around @ (terms[..., None] * radial.T)
 
     clearances = tuple(
         clearance(aperture, on_fans(terms))
@@ -693,7 +650,8 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
         2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
         for width, count, least in zip(widths, (2 * _MAP_LINES, _MAP_LINES), (_MAP_LINES, _MAP_LINES // 2), strict=True)
     )
-    is_half = ray_map.is_mirrored and _is_symmetric(grid)
+    # The window is symmetric in x too, and stays so under differentiation.
+    is_half = ray_map.is_mirrored and not varies(grid.centre) and not bool((grid.centre[0] != 0).any())
     # With their moments: 129 bytes per cell measured, 175 with a clearance.
     each = 48.0 * (3 + len(ray_map.apertures))
     afford_cells(scene.shape, across // 2 if is_half else across, along, each=each)
@@ -703,18 +661,11 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     return _with_residual(Kernels(kernel, grid, centroid, covariance, ray_map.rays), ray_map.residual)
 
 
-def _is_symmetric(grid: Grid) -> bool:
-    """Whether every window is symmetric in x, and stays so under differentiation."""
-    return not varies(grid.centre) and not bool((grid.centre[0] != 0).any())
-
-
 def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
-    """Kernels of light rotationally symmetric about the window's centre: segments of one line, rotated about the
-    axis.
-    """
+    """Kernels of light symmetric about the window's centre: segments of one line, rotated about the axis."""
     like = ray_map.hits
     nodes = np.linspace(0, 1, math.ceil(_PIECES * 2 ** (order / 2)) + 1)
-    basis = torch.as_tensor(_axial_basis(ray_map.degree, nodes), dtype=like.dtype, device=like.device)
+    basis = like.new_tensor(_axial_basis(ray_map.degree, nodes))
     height, *crossed = (terms[1] @ basis.mT for terms in (ray_map.hits, *ray_map.crossings))
     clearances = [
         clearance(aperture, torch.stack([torch.zeros_like(hit), hit]))

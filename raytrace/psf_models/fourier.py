@@ -1,8 +1,8 @@
-"""Fourier model: the diffraction PSF of an ideal lens out of focus, with Zernike aberrations if asked for.
+"""Fourier model: the diffraction PSF of an ideal lens out of focus, optionally with Zernike aberrations.
 
     PSF(x) = |F{A exp(iψ r²/R²)}|²,   ψ = (πR²/λ) (n/z_o + n'/z_i - φ)
 
-from the lens's own first-order data: power φ and principal planes at every wavelength, R the entrance pupil's radius
+from the first-order data of the lens: power φ and principal planes at every wavelength, R the entrance pupil's radius
 (Goodman, Introduction to Fourier Optics, §6.4). The field of light through a pupil of unit energy is
 
     U(x) = √π a ∫ exp(iΨ(p)) exp(-2πi a p·x) dp/π,   a = n' R/(λ z_i) cycles per mm,
@@ -38,7 +38,7 @@ from raytrace.psf_models.dft import (
 )
 from raytrace.psf_models.paraxial import chief_ray_height, need_one_focus
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves, reach
-from raytrace.psf_models.result import Kernels, moments
+from raytrace.psf_models.result import Kernels, centroid_and_covariance
 from raytrace.tracing.paraxial import first_order, signed
 from raytrace.tracing.scene import Scene, symmetry
 from raytrace.tracing.trace import media
@@ -47,8 +47,8 @@ _MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refus
 
 
 @value
-class Paraxial:
-    """What the Fourier model knows of a lens; every entry (D, F, W).
+class DefocusedPupil:
+    """First-order data of a lens; every entry (D, F, W).
 
     defocus: ψ at the edge of the pupil, radians; frequency: a, cycles per mm at the edge of the pupil;
     chief: (2, D, F, W) mm, where the paraxial chief ray meets the sensor.
@@ -63,42 +63,41 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     """Kernels of the Fourier model about the paraxial chief ray.
 
     zernike: Noll coefficients from 1 on, (J,) or (J, D, F, W) with axes of length 1 to broadcast, mm RMS of path.
-    order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error.
-    centroid and covariance are those of the light inside the window, for the second moment of
-    a hard-edged diffraction pattern does not exist; those of the geometric limit are given beside them.
-    Raises ValueError where the window or the blur would need too many pupil points, Bent as the paraxial model.
+    order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error. centroid and
+    covariance are those of the light inside the window, since the second moment of a hard-edged diffraction pattern
+    does not exist; ray_centroid and ray_covariance are those of the geometric limit. Raises ValueError where the window
+    or the blur would need too many pupil points, Bent as the paraxial model.
     """
     need_one_focus(scene.lens, "the Fourier PSF model", "take model=wave, which traces the wavefront")
-    # Phases of hundreds of radians leave single precision three digits.
+    # In single precision a phase of hundreds of radians has three digits.
     single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
     scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))
-    lens = paraxial(scene)
-    _refuse_without_pupil(lens)
-    waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
+    lens, waves = paraxial(scene), None
+    numbers = torch.stack([lens.defocus.detach(), lens.frequency.detach()])
+    if not bool(torch.isfinite(numbers).all()) or not bool((numbers[1] != 0).all()):
+        raise ValueError(
+            "the Fourier model has no pupil here: the lens is afocal, or the sensor or the object lies in a principal "
+            "plane; move them, or use a ray model"
+        )
+    if zernike is not None:  # in waves, (J, D, F, W)
+        zernike = zernike.to(torch.float64).reshape(len(zernike), *(zernike.shape[1:] or (1, 1, 1)))
+        waves = (1e3 * zernike / scene.wavelengths).expand(-1, *scene.shape)
     shift, blur = _moments(lens, waves)
     if waves is None and symmetry(scene) == "round" and is_centred(window, scene):
         kernel, centroid, covariance = _round_kernels(scene, lens, window, order)
     else:
         kernel, centroid, covariance = _kernels(scene, lens, window, waves, order)
     limit = {"ray_centroid": lens.chief + shift, "ray_covariance": blur}
-    found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
-    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid) if single else found
-
-
-def _refuse_without_pupil(lens: Paraxial) -> None:
-    """Raise ValueError where the phase of the pupil is no number."""
-    numbers = torch.stack([lens.defocus.detach(), lens.frequency.detach()])
-    if not bool(torch.isfinite(numbers).all()) or not bool((numbers[1] != 0).all()):
-        raise ValueError(
-            "the Fourier model has no pupil here: the lens is afocal, or the sensor or the object stands in a "
-            "principal plane; move them, or use a ray model"
-        )
+    shifted = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
+    return dataclasses.replace(to(shifted, dtype=grid.pitch.dtype), grid=grid) if single else shifted
 
 
 def _kernels(
-    scene: Scene, lens: Paraxial, window: Grid, waves: Tensor | None, order: int
+    scene: Scene, lens: DefocusedPupil, window: Grid, waves: Tensor | None, order: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Kernels (D, F, W, rows, columns), one after the other, for each has its own phases; centroid and covariance."""
+    """Kernels (D, F, W, rows, columns), one after the other, for each has its coefficients phases; centroid and
+    covariance.
+    """
     shape = lens.defocus.shape
     centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
     steepest = float(scene.largest(lens.frequency.detach().abs().max()))
@@ -111,15 +110,15 @@ def _kernels(
         afford_rings("the Fourier PSF", scene, rings_and_arms(phase, order)[0], phase)
     pixels, moments = [], []
     for place in itertools.product(*map(range, shape)):
-        own = None if waves is None else waves[(slice(None), *place)]
-        intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], own, order=order)
+        noll = None if waves is None else waves[(slice(None), *place)]
+        intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], noll, order=order)
         pixels.append(integrate(intensity, weight, window.pitch))
         moments.append(window_moments(intensity, x[place], y[place], weight, window.pitch))
     centroid, covariance = (torch.stack(parts, -1).unflatten(-1, shape) for parts in zip(*moments, strict=True))
     return torch.stack(pixels).unflatten(0, shape), centroid, covariance
 
 
-def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
+def _round_kernels(scene: Scene, lens: DefocusedPupil, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
     """The same on the axis, along one radius; Bessel functions are shared by all object distances.
 
     Sensor and pupil decide the frequency a, an object distance only the defocus.
@@ -143,8 +142,8 @@ def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tu
     return light_of_radii(window, 2 * steepest, order, intensity)
 
 
-def paraxial(scene: Scene) -> Paraxial:
-    """Defocus, edge frequency and chief ray of the paraxial lens, at every wavelength's own index."""
+def paraxial(scene: Scene) -> DefocusedPupil:
+    """Defocus, edge frequency and chief ray of the paraxial lens, with the index of every wavelength."""
     lens, wavelengths, shape = scene.lens, scene.wavelengths, scene.shape
     primary, coloured = first_order(lens), first_order(lens, wavelengths)
     surfaces = lens.surfaces[1:-1]
@@ -156,7 +155,7 @@ def paraxial(scene: Scene) -> Paraxial:
     waves = 1e3 * radius / wavelengths  # R/λ
     defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
     chief = chief_ray_height(scene)
-    return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
+    return DefocusedPupil(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
 
 
 def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:
@@ -172,20 +171,18 @@ def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: 
         spectrum = weights * phasor(defocus * radius * radius / (2 * math.pi))
         U = rings_to_grid(spectrum, radius, x, y, 1 / frequency)
         return math.pi * frequency**2 * (U.real**2 + U.imag**2)
-    phase += _steepest(waves)
+    # The largest slope of the aberrations in radians per pupil radius, on the rim and inside.
+    probe, _ = with_rim(*gauss_rings(8, dtype=waves.dtype, device=waves.device))
+    by_x, by_y = (waves.detach() @ g for g in polynomials.gradients(_orders(len(waves)), *probe))
+    phase += 2 * math.pi * float(torch.hypot(by_x, by_y).max())
     points, weights = disc_rule(phase, order, most=_MOST_POINTS, what="the Fourier model", like=x)
-    path = waves @ _noll(len(waves), points) + defocus * (points**2).sum(0) / (2 * math.pi)
+    path = waves @ polynomials.polynomials(_orders(len(waves)), *points)
+    path = path + defocus * (points**2).sum(0) / (2 * math.pi)
     U = to_grid(weights * phasor(path), -points[0], -points[1], x, y, 1 / frequency)
     return math.pi * frequency**2 * (U.real**2 + U.imag**2)
 
 
-def _aberrations(scene: Scene, zernike: Tensor) -> Tensor:
-    """Noll coefficients (J, D, F, W) in waves."""
-    zernike = zernike.reshape(len(zernike), *(zernike.shape[1:] or (1, 1, 1)))
-    return (1e3 * zernike / scene.wavelengths).expand(-1, *scene.shape)
-
-
-def _moments(lens: Paraxial, waves: Tensor | None) -> tuple[Tensor, Tensor]:
+def _moments(lens: DefocusedPupil, waves: Tensor | None) -> tuple[Tensor, Tensor]:
     """Centroid (2, D, F, W) from the chief ray and covariance (3, D, F, W), mm and mm², of the geometric limit.
 
     Light of path W(p) waves lands at x = ∇W/a: a disc of radius |ψ|/(π a), variance radius²/4 on each axis.
@@ -199,22 +196,11 @@ def _moments(lens: Paraxial, waves: Tensor | None) -> tuple[Tensor, Tensor]:
         (torch.einsum("j...,jp->...p", waves, g) + (lens.defocus / math.pi)[..., None] * p) / lens.frequency[..., None]
         for g, p in zip(slopes, points, strict=True)
     )
-    return moments(x, y, weights)
+    return centroid_and_covariance(x, y, weights)
 
 
 def _orders(count: int) -> list[tuple[int, int]]:
     return [polynomials.noll(j) for j in range(1, count + 1)]
-
-
-def _noll(count: int, points: Tensor) -> Tensor:
-    return polynomials.polynomials(_orders(count), *points)
-
-
-def _steepest(waves: Tensor) -> float:
-    """Largest slope of the aberrations in radians per pupil radius, on the rim and inside."""
-    points, _ = with_rim(*gauss_rings(8, dtype=waves.dtype, device=waves.device))
-    by_x, by_y = (waves.detach() @ g for g in polynomials.gradients(_orders(len(waves)), *points))
-    return 2 * math.pi * float(torch.hypot(by_x, by_y).max())
 
 
 def _rings(count: int, *, like: Tensor) -> tuple[Tensor, Tensor]:

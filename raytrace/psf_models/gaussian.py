@@ -27,11 +27,11 @@ _RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
 
 @value
 class Light:
-    """Traced rays that stand for all the light of a scene.
+    """Traced rays of a scene, or of the part of the pupil that its symmetry needs.
 
-    hits: (2, D, F, W, P) mm on the sensor; valid: (D, F, W, P), which arrive; weights: (P,) or (D, F, W, P), shares of
-    the pupil, 1 in all; rays: how many were traced for each kernel.
-    inner, outer: (D, F, W, B) radii of the parts of arms that the rays fill if anything is clipped, else None.
+    hits: (2, D, F, W, P) mm on the sensor; valid: (D, F, W, P), those that arrive; weights: (P,) or (D, F, W, P),
+    shares of the pupil, 1 in all; rays: how many were traced for each kernel. inner, outer: (D, F, W, B) radii of the
+    parts of arms that the rays fill if anything is clipped, else None.
     """
 
     hits: Tensor
@@ -45,40 +45,38 @@ class Light:
 def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """Gaussians with the centroid and covariance of `order` Gauss rings of 4·(order - 1) arms, 8 at least.
 
-    Only what the scene's symmetry does not give is traced: `order` rays of one meridian if every field is on the axis
-    of a rotationally symmetric lens, half the pupil if every field lies in the y-z plane of a lens symmetric about it.
-    σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give 9e-8.
-    Where rays are lost, rings follow the clear part of every arm, see `trace_light`.
-    The energy is the transmitted fraction of the light through the whole entrance pupil, of which vignetting factors
-    leave the share (1 - VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
-    residual: see `residual`.
+    Only rays that the scene's symmetry does not give are traced: `order` rays of one meridian if every field is on the
+    axis of a rotationally symmetric lens, half the pupil if every field lies in the y-z plane of a lens symmetric about
+    it. σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give
+    9e-8. Where rays are lost, rings follow the clear part of every arm, see `trace_light`. The energy is the
+    transmitted fraction of the light through the whole entrance pupil, of which vignetting factors leave the share (1 -
+    VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
     """
-    fold = symmetry(scene)
-    light = trace_light(scene, order, fold)
-    shape, found = _kernels_of_light(scene, grid, light, fold)
-    return dataclasses.replace(found, residual=residual(light, grid, shape, order, fold))
+    light, shape, gaussians = _kernels(scene, grid, order)
+    return dataclasses.replace(gaussians, residual=residual(light, grid, shape, order, symmetry(scene)))
 
 
 def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """The same without their residual, which takes half of the time."""
+    return _kernels(scene, grid, order)[2]
+
+
+def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kernels]:
+    """The light, the share of every pixel in the light that arrives, and the kernels."""
     fold = symmetry(scene)
-    return _kernels_of_light(scene, grid, trace_light(scene, order, fold), fold)[1]
-
-
-def _kernels_of_light(scene: Scene, grid: Grid, light: Light, fold: str) -> tuple[Tensor, Kernels]:
-    """The share of every pixel in the light that arrives, and the kernels."""
-    centroid, covariance, transmitted = moments(light, fold)
+    light = trace_light(scene, order, fold)
+    centroid, covariance, transmitted = spot_moments(light, fold)
     energy = transmitted * beam_share(scene)
     shape = gaussian_pixels(grid, centroid, covariance if fold == "none" else covariance[::2])
-    return shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays)
+    return light, shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays)
 
 
 def trace_light(scene: Scene, order: int, fold: str) -> Light:
-    """The rays of an order, of the part of the pupil that stands for all of it.
+    """The rays of an order, of the part of the pupil that symmetry needs.
 
-    If all rays arrive, those at the rim too that are added for a lens with apertures, that is all. If some are lost, or
-    something stands in the pupil, 2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`):
-    energy and σ then err by 2e-4 at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
+    If any ray is lost, of these or of those at the rim that are added for a lens with apertures, or an obstruction lies
+    in the pupil, 2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ
+    then err by 2e-4 at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
     """
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     count = 0
@@ -109,7 +107,7 @@ def arms_of(order: int) -> int:
 
 
 def fold_pupil(order: int, fold: str, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Pupil points (2, P) and weights (P,) of what is traced, in the dtype and on the device of `like`."""
+    """Pupil points (2, P) and weights (P,) of the rays to trace, in the dtype and on the device of `like`."""
     if fold == "round":
         points, weights = gauss_rings(order, 1, dtype=like.dtype, device=like.device)
         radius = torch.linalg.vector_norm(points, dim=0)
@@ -117,8 +115,8 @@ def fold_pupil(order: int, fold: str, like: Tensor) -> tuple[Tensor, Tensor]:
     points, weights = gauss_rings(order, arms_of(order), dtype=like.dtype, device=like.device)
     if fold == "none":
         return points, weights
-    kept = points[0] > 0
-    return points[:, kept], 2 * weights[kept]
+    right = points[0] > 0
+    return points[:, right], 2 * weights[right]
 
 
 def rim_points(order: int, fold: str, like: Tensor) -> Tensor:
@@ -139,11 +137,11 @@ def directions(arms: int, fold: str, like: Tensor) -> Tensor:
     return unit if fold == "none" else unit[:, : arms // 2]
 
 
-def moments(light: Light, fold: str) -> tuple[Tensor, Tensor, Tensor]:
+def spot_moments(light: Light, fold: str) -> tuple[Tensor, Tensor, Tensor]:
     """Centroid (2, ...), covariance (3, ...) and transmitted fraction (...) of traced light.
 
     One ray is subtracted before the mean is formed and the mean before squares are, so that a small spot far off the
-    axis keeps its digits and no variance is negative.
+    axis loses no precision and no variance is negative.
     """
     valid = light.valid
     weights = torch.where(valid, light.weights, 0.0)
@@ -172,24 +170,22 @@ def _centred(x: Tensor, share: Tensor, first: Tensor, valid: Tensor) -> tuple[Te
 
 
 def residual(light: Light, grid: Grid, shape: Tensor, order: int, fold: str) -> Tensor:
-    """How wrong a Gaussian is here: Σ |h - g| / Σ h over the pixels of the window, (...), without gradient.
+    """Distance of the Gaussian from the rays: Σ |h - g| / Σ h over the pixels of the window, (...), without gradient.
 
     g: the Gaussian's share of every pixel, `shape`; h: that of the rays themselves, counted at thousands of points of
     a polynomial map from pupil to sensor through the same few rays (a constant matrix: nothing more is traced). Within
     0.01 of the true distance on the double Gauss (0.32 at 25 m on the axis, 0.59 at 14°, of 5 µm pixels); the counting
-    itself leaves about 0.01. 2 is the most that two distributions of equal energy differ by.
+    itself leaves about 0.01. 2 is the largest distance of two distributions of equal energy.
     """
     with torch.no_grad():
-        points, weights = _many_points(light, order, fold) if light.inner is None else _points_of_arms(light, fold)
+        if light.inner is None:  # of Sobol points of the pupil, by a fit through the rings
+            matrix = torch.as_tensor(_ray_map(order), device=light.hits.device)
+            points = _unfold(light.hits, order, fold) @ matrix.to(light.hits.dtype).mT
+            weights = torch.ones_like(points[0])
+        else:
+            points, weights = _points_of_arms(light, fold)
         h = histogram(grid, points, safe_divide(weights, weights.sum(-1, keepdim=True).expand_as(weights)))
         return safe_divide((h - shape).abs().sum((-2, -1)), h.sum((-2, -1)))
-
-
-def _many_points(light: Light, order: int, fold: str) -> tuple[Tensor, Tensor]:
-    """Hits (2, ..., P) of Sobol points of the pupil, and weights, by a fit through the rings."""
-    matrix = torch.as_tensor(_ray_map(order), device=light.hits.device)
-    points = _unfold(light.hits, order, fold) @ matrix.to(light.hits.dtype).mT
-    return points, torch.ones_like(points[0])
 
 
 def _points_of_arms(light: Light, fold: str) -> tuple[Tensor, Tensor]:
@@ -235,7 +231,7 @@ def _unfold(position: Tensor, order: int, fold: str) -> Tensor:
 def _ray_map(order: int) -> np.ndarray:
     """Matrix (4096, P) from values on the rings to Sobol points.
 
-    A fit of r^n cos mθ and r^n sin mθ, m ≤ n < 2·order, n - m even, up to the m that the arms tell apart.
+    A fit of r^n cos mθ and r^n sin mθ, m ≤ n < 2·order, n - m even, up to the m that the arms resolve.
     """
     arms = arms_of(order)
     points, weights = (t.numpy() for t in gauss_rings(order, arms))

@@ -464,7 +464,7 @@ def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Mode
         reason = f"{model.name}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
         warnings.warn(reason, NotConverged, stacklevel=calling_level())
     residual, order = psfs.residual, psfs.order
-    # Derivatives by any number of the scene, the pixels or the model's own options.
+    # Derivatives by any number of the scene, the pixels or the model.
     numbers = pytree.tree_leaves((batch, pixels, weights, getattr(model.kernels, "keywords", {})))
     if torch.is_grad_enabled() and any(varies(number) for number in numbers):
         psfs = by_order(batch, pixels, weights, model, order)
@@ -483,7 +483,7 @@ def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, co
             break
         before, coarser = psfs, before
     if before is None:
-        raise ValueError(f"{model.name} needs at least {psfs.rays} rays a kernel; {count} given")
+        raise ValueError(f"{model.name} needs at least {psfs.rays} rays a kernel; {count} requested")
     return before if coarser is None else dataclasses.replace(before, error=_change(coarser, before, model).detach())
 
 

@@ -27,7 +27,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0
 
     order: 0, the only one; rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and
     so is its gradient: the Gaussian's energy moves between pixels with σ², so nothing is lost.
-    Raises Bent for a lens whose axis bends, or that bends light differently along x and y.
+    Raises Bent for a lens whose axis bends, or whose powers along x and y differ.
     """
     need_one_focus(scene.lens, "the paraxial PSF model", "take model=gaussian, drt or wave, which trace rays")
     sigma = rho * blur_radius(scene)
@@ -44,7 +44,7 @@ def need_one_focus(lens: Lens, what: str, instead: str) -> None:
     if has_one_focus(lens):
         return
     number = next(k for k, surface in enumerate(lens.surfaces) if not is_round(surface))
-    raise Bent(f"{what} needs one focus, but surface {number} bends light differently along x and y; {instead}")
+    raise Bent(f"{what} needs one focus, but surface {number} has different powers along x and y; {instead}")
 
 
 def has_one_focus(lens: Lens) -> bool:

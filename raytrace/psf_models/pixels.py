@@ -18,7 +18,7 @@ _FAR = 40.0
 #: Half-widths h (and h·m, m the midpoint; both over σ) up to which an interval is integrated by its midpoint series.
 _NARROW = 0.25
 _TERMS = 8  # of that series: the next one is 1e-18 of the first
-#: The rotated rule leaves out what lies e^-37 below its peak, and takes Φ(t) as 1 beyond t = 8.3.
+#: The rotated rule neglects values e^-37 below its peak, and takes Φ(t) as 1 beyond t = 8.3.
 _DROP, _SATURATED = 74.0, 8.3
 _NODES, _WEIGHTS = (x.tolist() for x in legendre.leggauss(28))
 #: The product rule: half a pixel over the smaller conditional deviation, σ_x √(1 - ρ²) or σ_y √(1 - ρ²), up to which
@@ -35,7 +35,7 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
 
     centroid: (2, ...) mm; covariance: (3, ...) mm², xx, xy, yy, or (2, ...), xx and yy of a Gaussian known to have no
     xy: then P is a product of two differences of Φ, of rows + columns numbers. In general P is an integral of the
-    density by a product of Gauss rules where pixels are narrow, else over x of Φ differences in y: rules that keep
+    density by a product of Gauss rules where pixels are narrow, else over x of Φ differences in y. Both rules keep
     relative precision in the tails, the latter in the limits xy = 0 and det Σ = 0, a line, too. A variance of 0 is a
     point: all in one pixel, halves on an edge, and derivative 0.
     First and second derivatives are exact in all of centroid, covariance, pitch and centre.
@@ -134,17 +134,12 @@ class _Rotated(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         slopes = (gradient * slope for slope in _slopes(*ctx.saved_tensors))
-        return *(_summed(g, t) for g, t in zip(slopes, ctx.saved_tensors, strict=False)), None, None
+        return *(g.sum_to_size(t.shape) for g, t in zip(slopes, ctx.saved_tensors, strict=False)), None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
         pairs = zip(_slopes(*ctx.saved_tensors), tangents, strict=False)
         return sum(slope * tangent for slope, tangent in pairs if tangent is not None)
-
-
-def _summed(gradient: Tensor, like: Tensor) -> Tensor:
-    """The gradient of a tensor that was broadcast."""
-    return gradient.sum_to_size(like.shape)
 
 
 def _slopes(x, y, half, xx, yy, xy, x_edges, y_edges) -> tuple[Tensor, ...]:
@@ -158,7 +153,7 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
     """P by the product rule where half a pixel is no wider than 1.5 conditional σ, else by `_rule`."""
     det = _determinant(xx, xy, yy)
     if any(map(is_functorch_wrapped_tensor, (*across, *along, xx, xy, yy))):
-        return _rule(across, along, xx, xy, yy, det)  # what is chosen by numbers cannot be mapped
+        return _rule(across, along, xx, xy, yy, det)  # a choice by values cannot be mapped
     width = across[3] * safe_sqrt(safe_divide(torch.maximum(xx, yy), det))
     narrow = (det > 0) & (width <= _WIDEST)
     if bool(narrow.all()):
@@ -174,10 +169,10 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
 
         return *(tuple(map(some, side)) for side in (across, along)), *map(some, (xx, xy, yy, det))
 
-    found = xx.new_zeros(*batch, along[2].shape[-2], across[2].shape[-1])
-    found[narrow] = _product_rule(*chosen(narrow))
-    found[~narrow] = _rule(*chosen(~narrow))
-    return found
+    energy = xx.new_zeros(*batch, along[2].shape[-2], across[2].shape[-1])
+    energy[narrow] = _product_rule(*chosen(narrow))
+    energy[~narrow] = _rule(*chosen(~narrow))
+    return energy
 
 
 def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
@@ -197,7 +192,9 @@ def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tenso
     width, reach = max(largest[:2]) ** 0.5, min(largest[3] ** 0.5, _NOTHING)
     # In steps of a twelfth, so that few rules are made.
     nodes = _count_nodes(*(math.ceil(12 * math.log2(max(t, 2.0**-20))) for t in (width, reach * width)))
-    node, moments = (xx.new_tensor(t) for t in _gauss_moments(nodes, _count_terms(largest[2])))
+    # Terms of exp(c ξη) for ξη in [-1, 1].
+    terms = next(k for k in itertools.count(1) if largest[2] ** k <= _CLOSE_ERROR * math.factorial(k))
+    node, moments = (xx.new_tensor(t) for t in _gauss_moments(nodes, terms))
     sums = [
         torch.exp(
             (-0.25 * twice_energy)[..., None] - (h * slope)[..., None] * node - (0.5 * h * h / s)[..., None] * node**2
@@ -205,18 +202,9 @@ def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tenso
         @ moments
         for slope, s in ((from_y / s_x, s_x), (from_x / s_y, s_y))
     ]
-    return (2 / torch.pi) * h * h / safe_sqrt(det) * (_powers(c, moments.shape[1]) * sums[0] * sums[1]).sum(-1)
-
-
-def _powers(c: Tensor, terms: int) -> Tensor:
-    """c^k/k! (..., K)."""
     k = torch.arange(terms, dtype=c.dtype, device=c.device)
-    return c[..., None] ** k / torch.exp(torch.lgamma(k + 1))
-
-
-def _count_terms(c: float) -> int:
-    """Terms of exp(c ξη) for ξη in [-1, 1]."""
-    return next(k for k in itertools.count(1) if c**k <= _CLOSE_ERROR * math.factorial(k))
+    powers = c[..., None] ** k / torch.exp(torch.lgamma(k + 1))
+    return (2 / torch.pi) * h * h / safe_sqrt(det) * (powers * sums[0] * sums[1]).sum(-1)
 
 
 @functools.cache
@@ -285,16 +273,16 @@ def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor)
     lower, upper, middle, half = other
     sigma, slope = safe_sqrt(variance), safe_divide(xy, variance)
     s = safe_sqrt(safe_divide(det, variance))
-    own, strip, energy, tilt, ends = [], [], [], [], []
+    density, strip, energy, tilt, ends = [], [], [], [], []
     for x in side[:2]:
         shift = slope * x
-        own.append(_density(x, sigma))
+        density.append(_density(x, sigma))
         strip.append(_interval(lower - shift, upper - shift, middle - shift, half, s))
-        ends.append(own[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
-        energy.append(own[-1] * strip[-1])
+        ends.append(density[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
+        energy.append(density[-1] * strip[-1])
         tilt.append(-(safe_divide(x, torch.broadcast_tensors(variance, x)[0]) * energy[-1]) - slope * ends[-1])
     difference = 0.5 * (
-        _difference(own, side, sigma) * (strip[0] + strip[1]) + (own[0] + own[1]) * (strip[1] - strip[0])
+        _difference(density, side, sigma) * (strip[0] + strip[1]) + (density[0] + density[1]) * (strip[1] - strip[0])
     )
     return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
 
@@ -327,7 +315,7 @@ def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Te
     y0, y1, y, y_half = (_standard(t, sigma_y) for t in (lower, upper, middle, half))
     a, b, x, x_half = (_standard(t, sigma_x) for t in across)
 
-    # Narrow pixels count u from their centre, so that their width keeps its digits.
+    # Narrow pixels count u from their centre, so that their width loses no precision.
     origin = torch.where(x_half <= 1, x, 0.0)
     a, b = torch.where(x_half <= 1, -x_half, a), torch.where(x_half <= 1, x_half, b)
     pieces = _pieces(a + origin, b + origin, y0, y1, rho, r)

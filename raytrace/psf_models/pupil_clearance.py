@@ -1,7 +1,7 @@
 """Clear pupil: where along arms of the pupil light passes every aperture, and how those edges move with the lens.
 
-An edge ρ of the clear part of an arm is a zero of a clearance c of `apertures.clearance`. Traced rays find it without
-derivatives. Two Newton steps with a constant slope s, ρ - c(ρ)/s, then carry its derivatives.
+An edge ρ of the clear part of an arm is a zero of a clearance c of `apertures.clearance`. It is found with traced rays
+without derivatives. Two Newton steps with a constant slope s, ρ - c(ρ)/s, then carry its derivatives.
 """
 
 import torch
@@ -21,11 +21,11 @@ _MOST_PARTS = 3  # clear parts of one arm
 def clear_arms(scene: Scene, unit: Tensor) -> tuple[Tensor, Tensor]:
     """Radii (D, F, W, B) between which light passes on arms in the directions (2, A).
 
-    B is A, or a multiple of it if something stands in an arm: then the second clear parts of all arms follow the first
-    ones. A part that an arm does not have lies between 0 and 0.
-    First derivatives are exact to 1e-6, second ones to 1e-3, where an aperture of any shape sets the edge; where rays
-    miss a surface or are totally reflected it stands still. Clear parts and gaps shorter than a step of the scan, 1/32,
-    may be missed, and gaps behind the third clear part are filled: their rays are blocked one by one.
+    B is A, or a multiple of it if an obstruction lies in an arm: then the second clear parts of all arms follow the
+    first ones. A part that an arm does not have lies between 0 and 0. First derivatives are exact to 1e-6, second ones
+    to 1e-3, where an aperture of any shape sets the edge; where rays miss a surface or are totally reflected the edge
+    has none. Clear parts and gaps shorter than a step of the scan, 1/32, may be missed, and gaps behind the third clear
+    part are filled: their rays are blocked one by one.
     """
     arms = unit.shape[1]
     with torch.no_grad():
@@ -71,8 +71,8 @@ def _clearances(scene: Scene, radii: Tensor, unit: Tensor) -> Tensor:
     points = torch.stack([(radii * direction).movedim(0, -2).flatten(-2) for direction in unit])
     _, crossed, met = trace_apertures(scene, points)
     arrives = torch.where(met, 1.0, -1.0).to(radii.dtype)
-    found = torch.stack([*(clearance(aperture, hit) for aperture, hit in crossed), arrives])
-    return found.unflatten(-1, (len(radii), unit.shape[1])).movedim(-2, 1)
+    clearances = torch.stack([*(clearance(aperture, hit) for aperture, hit in crossed), arrives])
+    return clearances.unflatten(-1, (len(radii), unit.shape[1])).movedim(-2, 1)
 
 
 def _clear(clearances: Tensor) -> Tensor:
@@ -89,15 +89,15 @@ def _edges(scene: Scene, passes: Tensor, blocked: Tensor, unit: Tensor) -> Tenso
         share = torch.linspace(0, 1, _SECTIONS + 1, dtype=passes.dtype, device=passes.device)
         for _ in range(_ZOOMS):
             radii = passes + share[:, None, None, None, None, None] * (blocked - passes)
-            found = _clearances(scene, radii.flatten(0, 1), unit).unflatten(1, radii.shape[:2])
-            index = _clear(found)[1:].to(torch.int64).cumprod(0).sum(0)[None]
+            clearances = _clearances(scene, radii.flatten(0, 1), unit).unflatten(1, radii.shape[:2])
+            index = _clear(clearances)[1:].to(torch.int64).cumprod(0).sum(0)[None]
             pair = index, (index + 1).clamp_max(_SECTIONS)
             passes, blocked = (radii.gather(0, at)[0] for at in pair)
-        inside, outside = (found.gather(1, at.expand(len(found), *at.shape))[:, 0] for at in pair)
+        inside, outside = (clearances.gather(1, at.expand(len(clearances), *at.shape))[:, 0] for at in pair)
         # The aperture that stops the ray; a missed surface, last in the list, has no slope.
         lowest, number = outside.min(0, keepdim=True)
         slope = safe_divide((outside - inside).gather(0, number)[0], blocked - passes)
-        slope = torch.where(((lowest < 0) & (number < len(found) - 1))[0], slope, 0.0)
+        slope = torch.where(((lowest < 0) & (number < len(clearances) - 1))[0], slope, 0.0)
     radius = passes
     for _ in range(2):
         radius = radius - safe_divide(_clearances(scene, radius, unit).gather(0, number)[0], slope)

@@ -1,4 +1,4 @@
-"""Round kernels: what is symmetric about the centre of the window is computed along one radius only.
+"""Rotationally symmetric kernels: light symmetric about the centre of the window is computed along one radius only.
 
     E_ij = ∬_ij I(r) dx dy = Σ_k M_ijk I(r_k)      waves: I is band-limited, so that a few radii hold all of it
     E_ij = ∫ g_ij(r) dE(r)                         rays: g_ij the share of a ring of radius r that lies in the pixel
@@ -23,9 +23,7 @@ _STEPS = 64  # of the table of g in a pixel
 
 
 def is_centred(grid: Grid, scene: Scene | None = None) -> bool:
-    """Whether every window (of the whole scene) is centred on the axis, to a billionth of a pixel, and stays there
-    under differentiation.
-    """
+    """Whether every window (of the whole scene) is centred on the axis, to 1e-9 pixel, also under differentiation."""
     if varies(grid.centre):
         return False
     centred = (grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all()
@@ -38,8 +36,8 @@ def reach(grid: Grid) -> float:
 
 
 def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tensor]:
-    """Radii (K,) mm at which to know an intensity of frequencies up to `cutoff` in 1/mm, and the matrix (U, K) mm² to
-    the energy of the pixels that differ, for `unfold`.
+    """Radii (K,) mm at which an intensity of frequencies up to `cutoff` in 1/mm is sampled, and the matrix (U, K) mm²
+    to the energy of the distinct pixels, for `unfold`.
 
     Even Chebyshev terms up to degree 2K - 2 hold exp(iat) up to J_2K(a), a = 2π · cutoff · reach.
     """
@@ -48,8 +46,8 @@ def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tenso
 
 
 def light_of_radii(grid: Grid, cutoff: float, order: int, intensity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Kernel (..., rows, columns), and of the light inside the window centroid (2, ...) mm and covariance (3, ...) mm²,
-    0 if there is none, of round light about the axis, from its intensity (..., K) at those radii.
+    """Kernel (..., rows, columns), centroid (2, ...) mm and covariance (3, ...) mm² of the light inside the window, 0
+    if there is none, of round light about the axis, from its intensity (..., K) at those radii.
     """
     _, matrix, second = (grid.pitch.new_tensor(a) for a in _rule_of(grid, cutoff, order))
     kernel = unfold(grid, intensity @ (matrix * grid.pitch**2).mT)
@@ -74,12 +72,12 @@ def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndar
 
 
 def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> Tensor:
-    """Pixel energies (..., U) of pieces of one meridian turned about the axis; for `unfold`.
+    """Pixel energies (..., U) of pieces of one meridian rotated about the axis; for `unfold`.
 
         E_u = Σ_c e_c (G_u(b_c) - G_u(a_c))/(b_c - a_c),   G_u(h) = ∫_0^h g_u(|r|) dr
 
-    first, last: (..., C) mm, heights of either sign a, b where a piece begins and ends; energy: (..., C) of the pieces,
-    spread evenly over their heights.
+    first, last: (..., C) mm, signed heights a, b of the ends of a piece; energy: (..., C) of the pieces, spread evenly
+    over their heights.
     """
     table = grid.pitch.new_tensor(_ring_table(grid.rows, grid.columns))
     last_step = len(table) - 1
@@ -101,7 +99,9 @@ def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> 
 
 
 def lit_part(first: Tensor, last: Tensor, clearances: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor | float]:
-    """Where between a and b (..., C) light passes, if clearances (..., C + 1) run linearly: its ends, and its share."""
+    """The ends and the share of the part between a and b (..., C) where light passes, for linear clearances (..., C +
+    1).
+    """
     begin, end = torch.zeros_like(first), torch.ones_like(first)
     for clearance in clearances:
         c, d = clearance[..., :-1], clearance[..., 1:]
@@ -113,14 +113,16 @@ def lit_part(first: Tensor, last: Tensor, clearances: Sequence[Tensor]) -> tuple
 
 
 def unfold(grid: Grid, values: Tensor) -> Tensor:
-    """Pixels (..., rows, columns) from those that differ (..., U)."""
+    """Pixels (..., rows, columns) from the distinct ones (..., U)."""
     index = torch.as_tensor(_distinct(grid.rows, grid.columns)[1], device=values.device)
     return values[..., index]
 
 
 @functools.lru_cache(maxsize=16)
 def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (U, 2) in pixels of the pixels that differ, 0 <= a <= b; and which each pixel is, (rows, columns)."""
+    """Centres (U, 2) in pixels of the distinct pixels, 0 <= a <= b; and the index of each pixel among them, (rows,
+    columns).
+    """
     y, x = np.abs(np.arange(rows) - 0.5 * (rows - 1)), np.abs(np.arange(columns) - 0.5 * (columns - 1))
     pair = np.sort(np.stack(np.broadcast_arrays(y[:, None], x[None, :]), -1), -1)
     places, index = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
@@ -130,7 +132,7 @@ def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 @functools.lru_cache(maxsize=16)
 def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Chebyshev radii (K,) in pixels; and the matrices (U, K) to pixels and (2, K) to the second moments of all of them
-    along x and y, by Gauss-Legendre nodes read off the series.
+    along x and y, by Gauss-Legendre nodes.
     """
     corner = 0.5 * math.hypot(rows, columns)
     angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
@@ -158,13 +160,13 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
 
 
 def _squares(rows: int, columns: int, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Weights (U, A, A) by which an intensity at the nodes of the pixels that differ makes ∬ I x² and ∬ I y².
+    """Weights (U, A, A) by which an intensity at the nodes of the distinct pixels gives ∬ I x² and ∬ I y².
 
     x, y: (U, A) of `_distinct`, x <= y: a pixel with |x| > |y| on the sensor is the image of one with both exchanged.
     """
-    own = np.abs(np.arange(columns) - 0.5 * (columns - 1)) <= np.abs(np.arange(rows) - 0.5 * (rows - 1))[:, None]
+    upright = np.abs(np.arange(columns) - 0.5 * (columns - 1)) <= np.abs(np.arange(rows) - 0.5 * (rows - 1))[:, None]
     index = _distinct(rows, columns)[1]
-    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (own, ~own))
+    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (upright, ~upright))
     x, y, rule = x[:, :, None] ** 2, y[:, None, :] ** 2, weight[:, None] * weight
     return rule * (as_is * x + exchanged * y), rule * (as_is * y + exchanged * x)
 

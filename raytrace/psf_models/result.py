@@ -1,4 +1,4 @@
-"""What a PSF model gives back, Kernels, and what the call that drives it does, a Psf; and how several become one."""
+"""PSFs of a model, `Kernels`, and the result of `psf`, a `Psf`; centroids and covariances of sums of distributions."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.tracing.spot import where_lit
 
-#: How many axes stand before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
+#: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
 _BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
 _BEFORE |= {"centroid": 1, "covariance": 1, "ray_centroid": 1, "ray_covariance": 1}
 
@@ -32,12 +32,12 @@ class Kernels:
     kernel: (D, F, W, rows, columns), energy in each pixel; 1 = all light through the entrance pupil.
     grid: its centre is (2,) or (2, D, F, W).
     centroid: (2, D, F, W) mm; covariance: (3, D, F, W) mm², xx, xy, yy, of the model's distribution before it is
-        integrated over pixels; of waves, of what lies inside the window: behind a hard edge there is no second moment.
-        None where nobody asks for them.
-    ray_centroid, ray_covariance: of waves, the same of the rays they follow, whatever the window; else None.
-    rays: how many rays were traced for each kernel; 0 if none.
-    residual: (D, F, W) how wrong the model itself is here, where it can tell (relative L1), or None.
-    arrived: (D, F, W) of plain rays, the energy on the whole sensor plane, or None.
+        integrated over pixels; of waves, of the light inside the window: behind a hard edge the second moment diverges.
+        None where they are not computed.
+    ray_centroid, ray_covariance: of waves, the same of their rays, whatever the window; else None.
+    rays: number of rays traced for each kernel; 0 if none.
+    residual: (D, F, W) error of the model itself (relative L1), or None where it has no estimate.
+    arrived: (D, F, W) of independent rays, the energy on the whole sensor plane, or None.
     """
 
     kernel: Tensor
@@ -57,14 +57,14 @@ class Kernels:
 
     @property
     def ray_moments(self) -> tuple[Tensor, Tensor]:
-        """Centroid and covariance of geometric optics: of the rays that waves follow, else the model's own."""
+        """Centroid and covariance of geometric optics: of the rays of waves, else those of the model."""
         if self.ray_centroid is None:
             return self.centroid, self.covariance
         return self.ray_centroid, self.ray_covariance
 
     @property
     def dark(self) -> Tensor:
-        """Which kernels no traced ray reaches, (D, F, W): their moments are 0 and mean nothing."""
+        """Which kernels no traced ray reaches, (D, F, W): their moments are 0, without meaning."""
         return _is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
 
 
@@ -72,29 +72,24 @@ class Kernels:
 class Psf(Result):
     """PSFs over object distance × field, or object distance × field × wavelength: (D, F, W) for each (D, F) below.
 
-    kernel: (D, F, rows, columns), integrated over pixels; summed over the wavelengths by their weights, or with an
-        axis of them, (D, F, W, rows, columns).
-    grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
-    energy: (D, F) inside the window, of the light through the entrance pupil.
-    error: (D, F) estimated relative L1 error of the kernel against the model's own limit (a Gaussian's: relative error
-        of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
-    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration:
-        of all its light; of waves of the light inside the window, because behind a hard edge the second moment grows
-        with the window without limit. nan with gradient 0 where no ray reaches the sensor.
-    ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of waves those of the rays they
-        follow, or of their geometric limit, else again centroid and covariance.
-    residual: (D, F) how wrong the model itself is, where it can tell, or None.
-    arrived: (D, F) of plain rays, the energy on the whole sensor plane: what `energy` lacks of it lies beside the
-        window, what it lacks of 1 was lost in the lens; else None.
-    model: its name; waves: whether its light is diffracted; order: as for `DRT(order=…)`, None for plain rays;
-        rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
-    normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
-    wavelengths, wavelength_weights: (W,) µm and shares of 1, that the kernels are summed over or have an axis of.
-    lens, fields, object_distances: of what and where, (2, F) and (D,) mm; parameters: of the model.
-    framed: whether the pixels were asked for; otherwise a figure shows the light itself, finely.
+    kernel: (D, F, rows, columns), integrated over pixels; summed over the wavelengths by their weights, or with an axis
+    of them, (D, F, W, rows, columns). grid: the pixels on the sensor, centre (2,) or (2, D, F) mm. energy: (D, F)
+    inside the window, of the light through the entrance pupil. error: (D, F) estimated relative L1 error of the kernel
+    against the limit of its model (a Gaussian's: relative error of σ); nan where it was not estimated.
+    docs/psf_error.md measures its reliability. centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the
+    distribution before pixel integration: of all its light; of waves of the light inside the window, because behind a
+    hard edge the second moment grows with the window without limit. nan with gradient 0 where no ray reaches the
+    sensor. ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of the rays of waves, or of
+    their geometric limit, else again centroid and covariance. residual: (D, F) error of the model itself, or None where
+    it has no estimate. arrived: (D, F) of independent rays, the energy on the whole sensor plane, which `energy` lacks
+    where it lies outside the window; the rest of 1 is vignetted or fails in the lens; else None. model: its name;
+    waves: whether its light is diffracted; order: as for `DRT(order=…)`, None for independent rays; rays: traced for
+    each kernel; reason: why `auto` chose the model, or a remark on convergence. normalised: "energy" (1 = all light
+    through the entrance pupil) or "window" (each kernel sums to 1). wavelengths, wavelength_weights: (W,) µm and shares
+    of 1, that the kernels are summed over or have an axis of. lens, fields, object_distances: (2, F) and (D,) mm;
+    parameters: of the model. framed: whether the pixels were specified; otherwise a figure shows the light itself,
+    finely sampled.
     """
-
-    FIGURE = "plotting.psf.psf_grid"
 
     kernel: Tensor
     grid: Grid
@@ -124,6 +119,12 @@ class Psf(Result):
     def wavelengths_summed(self) -> bool:
         """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
         return self.kernel.dim() == 4
+
+    def draw(self, **options):
+        """The kernels over object distance and field; options: as for `psf_models.figure.psf_grid`."""
+        from raytrace.psf_models.figure import psf_grid
+
+        return psf_grid(self, **options)
 
     def columns(self) -> dict[str, Tensor]:
         """A row for every kernel: mm, widths of the light before pixels."""
@@ -165,9 +166,7 @@ class Psf(Result):
         }
 
     def save(self, path: str | PathLike) -> None:
-        """Write the arrays (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], and what belongs
-        to it.
-        """
+        """Write the arrays (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], and its axes."""
         names = "energy", "error", "centroid", "covariance", "ray_centroid", "ray_covariance", "wavelengths"
         names = *names, "wavelength_weights", "wavelengths_summed", "model", "normalised"
         arrays = {name: getattr(self, name) for name in names}
@@ -178,19 +177,19 @@ class Psf(Result):
 
     def __str__(self) -> str:
         pitch = 1000 * float(self.grid.pitch)
-        said = [f"{self.model} PSF, {self.grid.columns} × {self.grid.rows} pixels of {pitch:g} µm, {self._colours()}"]
-        said += [self.reason] if self.reason else []
+        lines = [f"{self.model} PSF, {self.grid.columns} × {self.grid.rows} pixels of {pitch:g} µm, {self._colours()}"]
+        lines += [self.reason] if self.reason else []
         if self.waves:
-            said.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
-        own, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
+            lines.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
+        sigmas, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
         table = {
             ("object", "mm", 12): lambda at: f"{float(self.object_distances[at[0]]):g}",
             ("field", FIELD_UNITS[self.lens.fields.kind], 9): lambda at: name_of_field(self.fields[:, at[1]]),
             ("λ", "µm", 9): lambda at: f"{float(self.wavelengths[at[2]]):g}",
             ("centroid x", "mm", 12): lambda at: cell(float(self.centroid[0][at]), ".6f"),
             ("centroid y", "mm", 12): lambda at: cell(float(self.centroid[1][at]), ".6f"),
-            ("σ x", "µm", 9): lambda at: cell(float(own[0][at]), ".4f"),
-            ("σ y", "µm", 9): lambda at: cell(float(own[1][at]), ".4f"),
+            ("σ x", "µm", 9): lambda at: cell(float(sigmas[0][at]), ".4f"),
+            ("σ y", "µm", 9): lambda at: cell(float(sigmas[1][at]), ".4f"),
             ("rays' σ x", "µm", 9): lambda at: cell(float(rays[0][at]), ".4f"),
             ("rays' σ y", "µm", 9): lambda at: cell(float(rays[1][at]), ".4f"),
             ("energy", "window", 8): lambda at: f"{float(self.energy[at]):.4f}",
@@ -199,15 +198,15 @@ class Psf(Result):
         }
         left_out = ("λ",) * self.wavelengths_summed + ("rays' σ x", "rays' σ y") * (not self.waves)
         shown = {column: text for column, text in table.items() if column[0] not in left_out}
-        said += [" ".join(f"{column[k]:>{column[2]}}" for column in shown) for k in (0, 1)]
+        lines += [" ".join(f"{column[k]:>{column[2]}}" for column in shown) for k in (0, 1)]
         for at in np.ndindex(self.energy.shape):
-            said.append(" ".join(f"{text(at):>{width}}" for (_, _, width), text in shown.items()))
+            lines.append(" ".join(f"{text(at):>{width}}" for (_, _, width), text in shown.items()))
         if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
-            said.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
-        return "\n".join(said)
+            lines.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
+        return "\n".join(lines)
 
     def _colours(self) -> str:
-        """The wavelengths in words, and what was done with them."""
+        """The wavelengths in words, and whether they are summed."""
         named = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
         if len(self.wavelengths) == 1:
             return f"at {named} µm"
@@ -227,14 +226,14 @@ def _sigmas(covariance: Tensor) -> Tensor:
 
 
 def combined(parts: Sequence, join: Callable[[list[Tensor], int], Tensor]):
-    """One Kernels or Psf of several of a kind: `join(tensors, axes before those of the batch)` of all they have."""
+    """One Kernels or Psf of several of a kind: `join(tensors, axes before those of the batch)` of all their tensors."""
     names = [field.name for field in dataclasses.fields(parts[0]) if field.name in _BEFORE]
     names = [name for name in names if getattr(parts[0], name) is not None]
     tensors = {name: join([getattr(part, name) for part in parts], _BEFORE[name]) for name in names}
     return dataclasses.replace(parts[0], rays=max(part.rays for part in parts), **tensors)
 
 
-def moments(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+def centroid_and_covariance(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
     """Centroid (2, ...) and covariance (3, ...) of points (..., P), by shares that sum to 1 or are 0."""
     mean_x, mean_y = (share * x).sum(-1), (share * y).sum(-1)
     x, y = x - mean_x[..., None], y - mean_y[..., None]
@@ -252,58 +251,59 @@ def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tenso
     Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
     """
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
-    mean, apart = moments(*centroid, share)
+    mean, apart = centroid_and_covariance(*centroid, share)
     return mean, apart + (share * covariance).sum(-1)
 
 
-def polychromatic(found: Kernels, weights: Tensor | None, model: str) -> Psf:
-    """Sum over wavelengths by their weights, moments being those of the sum of the distributions; None keeps each."""
-    own, rays, waves = (found.centroid, found.covariance), found.ray_moments, found.ray_centroid is not None
-    kernel, energy, residual, arrived = found.kernel, found.energy, found.residual, found.arrived
+def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
+    """Sum over wavelengths by their weights, with the moments of the sum of the distributions; None keeps each."""
+    window_moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
+    waves = kernels.ray_centroid is not None
+    kernel, energy, residual, arrived = kernels.kernel, kernels.energy, kernels.residual, kernels.arrived
     if weights is not None:
         share = weights / weights.sum()
         kernel = (share[:, None, None] * kernel).sum(-3)
         residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
-        rays = mixture(torch.where(found.dark, 0.0, share), *rays)
-        # What lies inside a window counts by its light there.
-        own = mixture(share * energy, *own) if waves else rays
+        rays = mixture(torch.where(kernels.dark, 0.0, share), *rays)
+        # The light inside a window counts by its energy there.
+        window_moments = mixture(share * energy, *window_moments) if waves else rays
         energy = kernel.sum((-2, -1))
-    centre = found.grid.centre if found.grid.centre.dim() == 1 else found.grid.centre[..., 0]
+    centre = kernels.grid.centre if kernels.grid.centre.dim() == 1 else kernels.grid.centre[..., 0]
     return Psf(
         kernel=kernel,
-        grid=dataclasses.replace(found.grid, centre=centre),
+        grid=dataclasses.replace(kernels.grid, centre=centre),
         energy=energy,
         error=torch.full_like(energy.detach(), torch.nan),
-        centroid=own[0],
-        covariance=own[1],
+        centroid=window_moments[0],
+        covariance=window_moments[1],
         ray_centroid=rays[0],
         ray_covariance=rays[1],
         residual=residual,
         arrived=arrived,
         model=model,
         waves=waves,
-        rays=found.rays,
+        rays=kernels.rays,
     )
 
 
-def without_dark(found: Psf, empty: str = "nan") -> Psf:
+def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
     """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
-    rays = found.ray_centroid, found.ray_covariance
-    dark = _is_dark(found.kernel, *rays, found.rays, of_waves=found.waves)
+    rays = psfs.ray_centroid, psfs.ray_covariance
+    dark = _is_dark(psfs.kernel, *rays, psfs.rays, of_waves=psfs.waves)
     if empty == "error" and bool(dark.any()):
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
         raise EmptyPsf(
             f"no ray reaches the sensor in {int(dark.sum())} of {dark.numel()} PSFs, those of index {places}"
         )
     names = "centroid", "covariance", "ray_centroid", "ray_covariance"
-    lit = where_lit(~dark, *(getattr(found, name) for name in names), empty=empty)
-    return dataclasses.replace(found, **dict(zip(names, lit, strict=True)))
+    lit = where_lit(~dark, *(getattr(psfs, name) for name in names), empty=empty)
+    return dataclasses.replace(psfs, **dict(zip(names, lit, strict=True)))
 
 
 def _is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
-    """Which kernels (..., rows, columns) no ray reaches, by their light and the moments of their rays, all exactly 0.
+    """Which kernels (..., rows, columns) no ray reaches: their light and the moments of their rays are all exactly 0.
 
-    Light beside the window is not lost: it has a place. of_waves: whose reference, the chief ray, has one in any case.
+    Light outside the window has a centroid. of_waves: whose reference, the chief ray, has one in any case.
     """
     empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
     return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)

@@ -54,7 +54,7 @@ class Waves:
     """Plane waves that meet at the sensor: (D, F, W, P) of one field, ready to be summed.
 
     amplitude: √(E Ω), 0 where no light comes; wavefront: its OPD, directions and centre.
-    symmetry: "round": each ray stands for its ring; "mirror": for itself and its image in x; "none".
+    symmetry: "round": each ray represents its ring; "mirror": itself and its image in x; "none".
     """
 
     amplitude: Tensor
@@ -63,29 +63,36 @@ class Waves:
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
-    """Kernels of the wave model; a kernel whose light is blocked altogether is 0 with gradient 0.
+    """Kernels of the wave model; a kernel whose light is vignetted altogether is 0 with gradient 0.
 
-    order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error.
-    centroid and covariance are those of the light inside the window. Those of the rays are
-    given beside them: the mean of the whole wave is theirs (Ehrenfest), its second moment does not exist behind a hard
-    edge. residual: size of the terms that Debye's integral leaves out.
-    Raises ValueError where the window or the blur would need too many rays.
+    order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error. centroid and covariance
+    are those of the light inside the window, ray_centroid and ray_covariance those of the rays: the mean of the whole
+    wave is theirs (Ehrenfest), its second moment does not exist behind a hard edge. residual: size of the terms that
+    Debye's integral neglects. Raises ValueError where the window or the blur would need too many rays.
     """
-    fields = [_field_kernels(one_field(scene, f), one_field_grid(grid, f), order) for f in range(scene.shape[1])]
-    found = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
-    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
+    return by_field(scene, grid, lambda part, window: _field_kernels(part, window, order))
 
 
-def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
-    """Waves of one field, sampled for points up to `reach` mm from the chief ray's point.
+def by_field(scene: Scene, grid: Grid, compute: Callable[[Scene, Grid], Kernels]) -> Kernels:
+    """Kernels field by field, in double precision: in single precision the OPD itself is known to 1/400 wave only."""
+    fields = []
+    for f in range(scene.shape[1]):
+        centre = grid.centre
+        if centre.dim() > 1 and centre.shape[2] > 1:
+            centre = centre[:, :, f : f + 1]
+        window = to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)
+        fields.append(compute(one_field(scene, f), window))
+    merged = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
+    return dataclasses.replace(to(merged, dtype=grid.pitch.dtype), grid=grid)
+
+
+def waves(scene: Scene, reach: Tensor | float, *, order: int = 0, probe: Wavefront | None = None) -> Waves:
+    """Waves of one field, sampled for points up to `reach` mm from the chief ray's point; probe: of `probe_of`.
 
     The rays are Gauss rings over the pupil; where it is vignetted, over the clear part of every arm. One arm is enough
     on the axis of a round lens, half the arms for a field in the y-z plane.
     """
-    return _waves(scene, _probe(scene), reach, order)
-
-
-def _waves(scene: Scene, probe: Wavefront, reach: Tensor | float, order: int) -> Waves:
+    probe = probe_of(scene) if probe is None else probe
     fold = symmetry(scene)
     pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach, scene.largest), order)
     front = wavefront_of(scene, pupil, weights)
@@ -136,35 +143,56 @@ def phase_along_radius(
 
 def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
     """Kernels (D, 1, W, rows, columns) of one field."""
-    probe = _probe(scene)
-    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
-    local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float(scene.largest((half_spread(probe) * probe.index / probe.wavelength).max()))
-    is_round = symmetry(scene) == "round" and is_centred(grid, scene)
-    if is_round:
-        # One radius tells all: as a row of points, without pixels.
-        x, _ = radii_of_waves(grid, cutoff, order)
-        y, corner = torch.zeros_like(x[:1]), x.detach().max()
-    else:
-        nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
-        afford_sensor("the wave PSF", scene, grid, nodes)
-        x, y, weight = sub_pixels(local, nodes)
-        corner = scene.largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
-    light = _waves(scene, probe, corner, order)
-    U = amplitude(light, x, y)
-    intensity = U.real**2 + U.imag**2
-    if is_round:
-        kernel, centroid, covariance = light_of_radii(grid, cutoff, order, intensity[..., 0, :])
-    else:
-        kernel = integrate(intensity, weight, grid.pitch)
-        centroid, covariance = window_moments(intensity, x, y, weight, grid.pitch)
-        centroid = centroid + probe.centre[:2]
-    residual = _debye_residual(light.wavefront, probe, corner)
+    probe = probe_of(scene)
+    points = sensor_points(scene, probe, grid, order, is_round=symmetry(scene) == "round")
+    light = waves(scene, points.corner, order=order, probe=probe)
+    kernel, centroid, covariance = points.integrated(light, probe)
+    residual = _debye_residual(light.wavefront, probe, points.corner)
     return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1], residual, *_moments(light))
 
 
-def _probe(scene: Scene) -> Wavefront:
-    """A few hundred rays that find the blur, the map of directions and so the sampling."""
+@dataclasses.dataclass(frozen=True)
+class SensorPoints:
+    """Points of the sensor at which waves are summed: radii if they are round, else the nodes of the pixels.
+
+    x, y: mm from the chief ray's point; weight: of the nodes of a pixel, None for radii; corner: largest distance, mm.
+    """
+
+    grid: Grid
+    cutoff: float
+    order: int
+    x: Tensor
+    y: Tensor
+    weight: Tensor | None
+    corner: Tensor
+
+    def integrated(self, light: Waves, probe: Wavefront) -> tuple[Tensor, Tensor, Tensor]:
+        """Kernel, and centroid and covariance of the light inside the window."""
+        U = amplitude(light, self.x, self.y)
+        intensity = U.real**2 + U.imag**2
+        if self.weight is None:
+            return light_of_radii(self.grid, self.cutoff, self.order, intensity[..., 0, :])
+        kernel = integrate(intensity, self.weight, self.grid.pitch)
+        centroid, covariance = window_moments(intensity, self.x, self.y, self.weight, self.grid.pitch)
+        return kernel, centroid + probe.centre[:2], covariance
+
+
+def sensor_points(scene: Scene, probe: Wavefront, grid: Grid, order: int, *, is_round: bool) -> SensorPoints:
+    """The points of one field; is_round: whether the light is, so that one radius is enough in a centred window."""
+    cutoff = 2e3 * float(scene.largest((half_spread(probe) * probe.index / probe.wavelength).max()))
+    if is_round and is_centred(grid, scene):
+        x, _ = radii_of_waves(grid, cutoff, order)
+        return SensorPoints(grid, cutoff, order, x, torch.zeros_like(x[:1]), None, x.detach().max())
+    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
+    nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
+    afford_sensor("the wave PSF", scene, grid, nodes)
+    x, y, weight = sub_pixels(Grid(grid.pitch, grid.rows, grid.columns, centre), nodes)
+    corner = scene.largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
+    return SensorPoints(grid, cutoff, order, x, y, weight, corner)
+
+
+def probe_of(scene: Scene) -> Wavefront:
+    """A few hundred rays that determine the blur, the map of directions and so the sampling."""
     points, weights = gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
     return wavefront_of(scene, points, weights)
 
@@ -187,10 +215,10 @@ def _moments(light: Waves) -> tuple[Tensor, Tensor]:
 
 
 def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tensor:
-    """Relative L1 error (...) by what |q - p| - R leaves out beside L x + M y, π n (s·p)²/(|R| λ) of phase.
+    """Relative L1 error (...) of neglecting in |q - p| - R the term beyond L x + M y, π n (s·p)²/(|R| λ) of phase.
 
     Over the window or the blur b, and directions up to s, the mean of (s·p)² is b² s²/8; a fifth allows for light that
-    gathers at the rim. Where that turns many times it only moves rays, by up to b² s/|R|, which changes densities by
+    gathers at the rim. Where the phase is large it only moves rays, by up to b² s/|R|, which changes densities by
     up to 6 b s/|R|. Against sums of wavelets on the exit pupil it is 1 to 10 times the true error out of focus.
     """
     with torch.no_grad():
@@ -267,9 +295,9 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
 
 
 def _strehl(scene: Scene, order: int) -> Tensor:
-    probe = _probe(scene)
+    probe = probe_of(scene)
     spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
-    light = _waves(scene, probe, 20 * spacing.max(), order + 1)
+    light = waves(scene, 20 * spacing.max(), order=order + 1, probe=probe)
     front = light.wavefront
     with torch.no_grad():
         x, y = _moments(light)[0] - front.centre[:2]
@@ -287,13 +315,5 @@ def _strehl(scene: Scene, order: int) -> Tensor:
 
 
 def one_field(scene: Scene, f: int) -> Scene:
-    """One field of a scene in double precision: in single precision the OPD itself is known to 1/400 wave only."""
+    """One field of a scene, in double precision."""
     return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
-
-
-def one_field_grid(grid: Grid, f: int) -> Grid:
-    """The windows of one field, in double precision."""
-    centre = grid.centre
-    if centre.dim() > 1 and centre.shape[2] > 1:
-        centre = centre[:, :, f : f + 1]
-    return to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)

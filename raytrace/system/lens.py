@@ -16,18 +16,65 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import check_unit, check_wavelengths, refractive_index
-from raytrace.maths.result import lent
 from raytrace.maths.value import check_precision, value
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
-from raytrace.system.conditions import APERTURE_KINDS as APERTURE_KINDS
-from raytrace.system.conditions import FIELD_UNITS as FIELD_UNITS
-from raytrace.system.conditions import RAY_AIMING, Fields, SystemAperture
 from raytrace.system.configurations import Operand
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import both_spellings, calling_level, did_you_mean
+
+#: Units of a field point by the kind of field.
+FIELD_UNITS = {
+    "angle": "degrees",
+    "object_height": "mm",
+    "paraxial_image_height": "mm",
+    "real_image_height": "mm",
+}
+
+#: How rays find the stop. "auto" is that of a lens, or of a file, that specifies none.
+RAY_AIMING = {
+    "auto": "real where the axis bends in front of the stop, or the stop is off it; else off",
+    "off": "through points of the paraxial entrance pupil",
+    "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
+    "real": "to points of the stop, whose radius is that of the real marginal ray",
+}
+
+#: What the number of a system aperture means.
+APERTURE_KINDS = {
+    "entrance_pupil_diameter": "mm",
+    "image_f_number": "EFL / entrance pupil diameter",
+    "paraxial_working_f_number": "paraxial working F/#",
+    "object_na": "n sin θ of the marginal ray at the object",
+    "object_cone_angle": "degrees, half angle of the marginal ray at the object",
+    "float_by_stop": "mm, semi-diameter of the stop",
+}
+
+
+@value
+class SystemAperture:
+    """The size of the beam: a kind of APERTURE_KINDS and its number."""
+
+    kind: str
+    value: Tensor
+
+
+@value
+class Fields:
+    """Field points of one kind (a key of FIELD_UNITS), their weights and vignetting factors.
+
+    x, y, weight: (F,) in degrees or mm.
+    vignetting: (5, F): decentre VDX, VDY, compression VCX, VCY (pupil fractions) and angle VAN (degrees), or None.
+    telecentric: chief rays parallel to the axis in object space.
+    """
+
+    kind: str
+    x: Tensor
+    y: Tensor
+    weight: Tensor
+    vignetting: Tensor | None = None
+    telecentric: bool = False
 
 
 @value
@@ -74,8 +121,15 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
-    __str__ = lent("tracing.lens_report.text")
-    _repr_html_ = lent("plotting.notebook.page")
+    def __str__(self) -> str:
+        from raytrace.tracing.lens_report import text
+
+        return text(self)
+
+    def _repr_html_(self) -> str:
+        from raytrace.analysis.layout import page
+
+        return page(self)
 
     @both_spellings
     def at(
@@ -306,6 +360,22 @@ def name_of_field(field: Tensor) -> str:
     """A field point (2,) in words: its y alone on the axis of x."""
     x, y = field.tolist()
     return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
+def field_label(lens: Lens, field: Sequence[float]) -> str:
+    """A field point in a figure: `10°`, `(3, 4)°`, `5 mm`; its y alone where x is 0."""
+    x, y = (float(component) + 0.0 for component in field)
+    point = f"{y:.6g}" if x == 0 else f"({x:.6g}, {y:.6g})"
+    return point.replace("-", "−") + ("°" if lens.fields.kind == "angle" else " mm")
+
+
+def field_title(lens: Lens) -> str:
+    """The kind of field of this lens, in a figure."""
+    return (
+        "Image height"
+        if lens.fields.kind == "real_image_height"
+        else ("Field angle" if lens.fields.kind == "angle" else lens.fields.kind.replace("_", " ").capitalize())
+    )
 
 
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:

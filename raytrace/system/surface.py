@@ -16,7 +16,7 @@ from raytrace.materials.environment import Environment
 from raytrace.materials.glass import AIR, Glass
 from raytrace.maths.value import value
 from raytrace.system.apertures import Aperture
-from raytrace.system.phases import Phase, kind_of
+from raytrace.system.phases import Phase, kind_of, power_of
 from raytrace.system.poses import Gap, Pose, Turn
 from raytrace.system.sag_terms import Sag
 from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, SagTerms, relief, sag_and_derivatives
@@ -183,3 +183,34 @@ def freeform_sag(surface: Surface, x: Tensor, y: Tensor, highest: int) -> Sag:
     a = surface.coefficients
     c, k = (a.new_zeros(()) if number is None else number for number in (surface.curvature, surface.conic))
     return KINDS[surface.kind].form.sag(c, k, a, x, y, highest)
+
+
+# -- paraxial refraction and the y-nu trace: ω = n u of a slope u = dy/dz, n signed, negative towards -z ---------------
+
+
+def signed(surfaces: Sequence[Surface], indices: Sequence) -> list:
+    """Indices made negative where light travels towards -z; indices: before and behind the surfaces, one more."""
+    side, result = 1, [indices[0]]
+    for surface, n in zip(surfaces, indices[1:], strict=True):
+        side = -side if surface.is_mirror else side
+        result.append(side * n)
+    return result
+
+
+def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor | None = None) -> Tensor:
+    """Power (...) in 1/mm of a surface between signed indices (...), by its section along y; wavelength: of a phase."""
+    refractive = vertex_curvature(surface) * (behind - before)
+    return refractive if surface.phase is None else refractive + power_of(surface.phase, wavelength)[1]
+
+
+def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
+    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
+
+    powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
+    """
+    rays = [(y, omega)]
+    for k, strength in enumerate(powers):
+        omega = omega - strength * y
+        y = y + gaps[k] * omega if k < len(gaps) else y
+        rays.append((y, omega))
+    return rays

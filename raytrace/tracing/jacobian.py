@@ -1,8 +1,7 @@
-"""Jacobian: how every hit moves with every variable of the lens, in one forward pass over the rays.
+"""Jacobian: derivatives of every hit by every variable of the lens, in one forward pass over the rays.
 
-A gradient goes backward, from one merit to all variables. The Jacobian has as many rows as there are rays: it goes
-forward, each change through the surfaces behind it, all of them while a block of rays is in the cache. Least squares
-(Gauss-Newton, Levenberg-Marquardt) live on it.
+For least squares (Gauss-Newton, Levenberg-Marquardt): all variables go through the surfaces behind them while a block
+of rays is in the cache.
 """
 
 from collections.abc import Sequence
@@ -12,9 +11,7 @@ from torch import Tensor
 
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
-from raytrace.tracing.compiled.library import uses_compiled
-from raytrace.tracing.compiled.run import Pushed, Task, forward, push, push_everywhere, task_of
-from raytrace.tracing.compiled.structure import is_expressible, with_numbers
+from raytrace.tracing.compiled import Pushed, Task, forward, is_expressible, push, task_of, uses_compiled, with_numbers
 from raytrace.tracing.trace import trace_surfaces
 
 
@@ -28,11 +25,10 @@ def hit_jacobian(
 ) -> Tensor:
     """∂(x, y)/∂v (V, 2, ...) of the hits on the last surface by every entry of the variables, in their order.
 
-    variables: tensors that require a gradient and that numbers of the surfaces or indices were computed from, or are;
-    V counts all their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0]
-    held fixed. Rays that are lost do not move. Raises ValueError for surfaces that the compiled trace does not know
-    (height maps, more than 16 terms), and for numbers of a lens that differ from ray to ray
-    of the last axis.
+    variables: tensors that require a gradient, which numbers of the surfaces or indices are or depend on; V counts all
+    their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0] held fixed.
+    Failed rays have derivatives 0. Raises ValueError for surfaces that the compiled trace does not support (height
+    maps, more than 16 terms), and for numbers of a lens that vary along the last axis of the rays.
     """
     known = all(map(is_expressible, surfaces))
     task = task_of(surfaces, rays, indices=indices, wavelength=wavelength) if known else None
@@ -41,18 +37,14 @@ def hit_jacobian(
             "no Jacobian for height maps, more than 16 terms, numbers of another dtype than "
             "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
         )
-    return pushed(surfaces, task, _changes(task.given[3], variables)).by_position[:2].transpose(0, 1)
+    return pushed(surfaces, task, _changes(task.inputs[3], variables)).by_position[:2].transpose(0, 1)
 
 
 def pushed(
     surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
 ) -> Pushed:
-    """The rays behind the last surface and how they change, by the engine that is chosen; arguments as for `run.push`.
-
-    surfaces: those that the task was made of.
-    """
-    rays = Rays(*task.given[:2], task.valid, task.given[2])
-    if uses_compiled(rays, changes, len(surfaces)):
+    """`compiled.push` by the engine that is chosen; surfaces: those that the task was made of."""
+    if _is_compiled(surfaces, task):
         return push(task, changes, start)
     return _pushed_by_torch(surfaces, task, changes, start)
 
@@ -60,17 +52,18 @@ def pushed(
 def pushed_everywhere(
     surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
 ) -> Pushed | None:
-    """`run.push_everywhere` where the compiled trace carries these rays; None where torch has to."""
-    rays = Rays(*task.given[:2], task.valid, task.given[2])
-    return push_everywhere(task, changes, start) if uses_compiled(rays, task.given[3], len(surfaces)) else None
+    """`compiled.push` behind every row where the compiled trace carries these rays; None where torch has to."""
+    return push(task, changes, start, everywhere=True) if _is_compiled(surfaces, task) else None
 
 
 def ends(surfaces: Sequence[Surface], task: Task) -> Rays:
     """The rays behind the last surface alone, by the engine that is chosen."""
-    position, direction, opl, table = task.given
-    if uses_compiled(Rays(position, direction, task.valid, opl), table, len(surfaces)):
-        return forward(task)
-    return _behind(surfaces, task, position, direction, opl, table)
+    return forward(task) if _is_compiled(surfaces, task) else _behind(surfaces, task, *task.inputs)
+
+
+def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
+    position, direction, opl, table = task.inputs
+    return uses_compiled(Rays(position, direction, task.valid, opl), table, len(surfaces))
 
 
 def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
@@ -94,29 +87,27 @@ def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
 
 
 def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
-    def behind(position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor) -> tuple:
-        end = _behind(surfaces, task, position, direction, opl, table)
-        return (end.position, end.direction, *([] if opl is None else [end.opl])), end.valid
+    *rays, table = (part.detach() for part in task.inputs if part is not None)
+    traces_path = len(rays) == 3
 
-    *rays, table = (None if part is None else part.detach() for part in task.given)
-    found = []
+    def behind(position: Tensor, direction: Tensor, *others: Tensor) -> tuple:
+        end = _behind(surfaces, task, position, direction, *(others if traces_path else (None, *others)))
+        return (end.position, end.direction, *([end.opl] if traces_path else [])), end.valid
+
+    slopes = []
     for number, change in enumerate(changes):
         steps = [
-            None if part is None else torch.zeros_like(part) if start is None else start[k].select(int(k < 2), number)
+            torch.zeros_like(part) if start is None else start[k].select(int(k < 2), number)
             for k, part in enumerate(rays)
         ]
-        given = [(part, step) for part, step in zip((*rays, table), (*steps, change), strict=True) if part is not None]
-        without = rays[2] is None
-        function = (lambda p, d, t: behind(p, d, None, t)) if without else behind
-        found.append(torch.func.jvp(function, *map(tuple, zip(*given, strict=True)), has_aux=True))
-    (ends, _, valid), by = found[0], [torch.stack(parts) for parts in zip(*(f[1] for f in found), strict=True)]
-    position, direction, *opl = ends
+        ends, slope, valid = torch.func.jvp(behind, (*rays, table), (*steps, change), has_aux=True)
+        slopes.append(slope)
+    by_position, by_direction, *by_opl = (torch.stack(parts) for parts in zip(*slopes, strict=True))
     return Pushed(
-        position,
-        direction,
-        opl[0] if opl else None,
+        *ends[:2],
+        ends[2] if traces_path else None,
         valid,
-        by[0].transpose(0, 1),
-        by[1].transpose(0, 1),
-        by[2] if opl else None,
+        by_position.transpose(0, 1),
+        by_direction.transpose(0, 1),
+        by_opl[0] if traces_path else None,
     )

@@ -15,7 +15,7 @@ from raytrace.materials.glass import label
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.system.configurations import count
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
@@ -255,78 +255,12 @@ class Info(Result):
         return "\n".join(lines)
 
 
-#: From where a lens is looked at.
-VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
-
-
-#: All configurations of a lens, drawn together.
-ALL = "all"
-
-
-@value
-class Layout(Result):
-    """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
-
-    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
-    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
-    """
-
-    lens: Lens
-    fields: Tensor
-    rays: int = 7
-    view: str = "yz"
-    wavelengths: Tensor | None = None
-    configuration: str | None = None
-    has_fields: bool = True
-
-    FIGURE = "plotting.layout.layout"
-
-    def document(self) -> dict:
-        return {"fields": [numbers(point) for point in self.fields.unbind(1)]}
-
-    def __str__(self) -> str:
-        points = ", ".join(map(name_of_field, self.fields.unbind(1)))
-        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
-
-
 def info(lens: Lens) -> Info:
     """First-order data and prescription; what `print(lens)` shows. Warns UnfilledStop, and Unbuildable of a lens that
     cannot be made."""
     warn_of_defects(lens)
     warn_of_filling(lens, field_points(None, like=lens))
     return Info(lens)
-
-
-def layout(
-    lens: Lens,
-    *,
-    fields: Tensor | Sequence | None = None,
-    rays: int = 7,
-    view: str = "yz",
-    wavelengths: Tensor | Sequence[float] | None = None,
-    configuration: int | str | None = None,
-) -> Layout:
-    """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
-
-    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
-    in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
-    coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
-    configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made. Raises ValueError for a view or a
-    configuration that there is not.
-    """
-    if view not in VIEWS:
-        raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
-    if configuration == ALL and view == "3d":
-        raise ValueError("`view=3d`: shows one configuration; `configuration=all` is drawn from the side or from above")
-    if configuration not in (None, ALL):
-        lens = lens.configuration(configuration)
-    chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
-    for one in lens.configurations if configuration == ALL else (lens,):
-        warn_of_defects(one)
-    every = ALL if configuration == ALL else None
-    points = field_points(fields, like=lens)
-    warn_of_filling(lens, points)
-    return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
 
 def text(lens: Lens) -> str:

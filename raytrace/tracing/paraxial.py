@@ -12,8 +12,7 @@ from torch import Tensor
 from raytrace.maths.dual import quotient, select, value_of
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens
-from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
+from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu
 from raytrace.tracing.trace import media
 
 
@@ -59,28 +58,6 @@ class FirstOrder:
     petzval_radius: Tensor
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
-
-
-def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tensor]:
-    """Indices made negative where light travels towards -z; arguments and order as for `trace.steps`."""
-    side, result = 1, [indices[0]]
-    for surface, n in zip(surfaces, indices[1:], strict=True):
-        side = -side if surface.is_mirror else side
-        result.append(side * n)
-    return result
-
-
-def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
-    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
-
-    powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
-    """
-    rays = [(y, omega)]
-    for k, power in enumerate(powers):
-        omega = omega - power * y
-        y = y + gaps[k] * omega if k < len(gaps) else y
-        rays.append((y, omega))
-    return rays
 
 
 def brackets(powers: Sequence, gaps: Sequence) -> tuple:
@@ -225,10 +202,13 @@ def system_matrix(
     return tuple(one * part for part in brackets(powers, gaps))
 
 
-def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor | None = None) -> Tensor:
-    """Power (...) in 1/mm of a surface between signed indices (...), by its section along y."""
-    found = vertex_curvature(surface) * (behind - before)
-    return found if surface.phase is None else found + power_of(surface.phase, wavelength)[1]
+def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
+    """The system matrices of a lens; n: signed indices (...) from the object's to that before the image."""
+    surfaces, stop = lens.surfaces[1:-1], lens.stop - 1
+    # The stop seen from the front (transfer to its vertex) and from the back.
+    A1, B1, _, _ = system_matrix(surfaces[:stop], n[: stop + 1], wavelength, to_next=True)
+    _, B2, _, D2 = system_matrix(surfaces[stop:], n[stop:], wavelength)
+    return Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n[0], n[-1])
 
 
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
@@ -239,12 +219,8 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
-    n_object, n_image = n[0], n[-1]
-    # The stop seen from the front (transfer to its vertex) and from the back.
-    before, behind = surfaces[: lens.stop - 1], surfaces[lens.stop - 1 :]
-    A1, B1, _, _ = system_matrix(before, n[: lens.stop], wavelength, to_next=True)
-    _, B2, _, D2 = system_matrix(behind, n[lens.stop - 1 :], wavelength)
-    data = Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n_object, n_image)
+    data = gaussian(lens, n, wavelength)
+    n_object, n_image = data.n_object, data.n_image
     A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
     vergence = n_object / object_distance_of(lens)  # 0 for an object at infinity
     kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
@@ -262,7 +238,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         entrance_pupil_diameter=diameter,
         exit_pupil_position=data.exit_pupil_distance - surfaces[-1].thickness,
         exit_pupil_diameter=diameter * data.pupil_magnification,
-        stop_height=0.5 * diameter * A1,
+        stop_height=0.5 * diameter * data.front[0],
         f_number=focal_length.abs() / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=data.image_distance(vergence),

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from raytrace.files import write_atomically
-from raytrace.maths.result import Result, called
+from raytrace.io.ray_tables import read_rays
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
@@ -157,7 +158,7 @@ def trace(
         if object_distances is not None or fields is not None:
             told = "`object_distances` and `fields` change nothing: the rays of a table begin where it says"
             warnings.warn(told, ChangesNothing, stacklevel=calling_level())
-        begun = rays if isinstance(rays, Rays) else called("io.ray_tables.read_rays")(rays, lens)
+        begun = rays if isinstance(rays, Rays) else read_rays(rays, lens)
     if begun.wavelength is None:
         begun = dataclasses.replace(begun, wavelength=_chosen(lens, wavelengths).squeeze())
     end = trace_lens(lens, begun, begun.wavelength)

@@ -23,7 +23,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_searched
 from raytrace.tracing.aiming import aiming_of
-from raytrace.tracing.compiled.library import WORTH_COMPILING, prepare
+from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 from raytrace.tracing.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.tracing.spot import where_lit
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces

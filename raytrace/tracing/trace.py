@@ -23,9 +23,7 @@ from raytrace.system.phases import IdealLens, power_of
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
-from raytrace.tracing.compiled.library import uses_compiled
-from raytrace.tracing.compiled.run import trace_compiled
-from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.compiled import is_expressible, trace_compiled, uses_compiled
 from raytrace.tracing.refraction import deflect
 
 

@@ -1,1 +1,1 @@
-"""Sampled waves: thin elements given by their height, how light spreads behind them, and what a camera makes of it."""
+"""Wave optics: thin phase elements, the propagation of light behind them, and their PSFs."""

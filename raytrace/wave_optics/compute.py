@@ -1,13 +1,14 @@
-"""The wave camera as one call: an element, a sensor behind it, and its PSFs over depth and colour.
+"""PSFs of thin elements over depth and wavelength, integrated over the pixels of a sensor.
 
-PSFs of a wave scene: depth × wavelength, integrated over the pixels of the sensor, by the engine that fits."""
+`wave_psf` is the public call, `psf` that of a `WaveScene`, by the engine that `wave_optics.plan` chooses.
+"""
 
 import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +22,12 @@ from raytrace.maths.grid import Grid, centres, grid
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, height_range
+from raytrace.wave_optics.element import Element, EvenPowers
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
+from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture
@@ -35,15 +38,13 @@ _KEPT = 8  # sums that a memo keeps
 
 @value
 class ElementPsf(Result):
-    """PSFs of an element for points on the axis, over depth and colour.
+    """PSFs of an element for points on the axis, over depth and wavelength.
 
-    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
-    was computed, with the predicted error, relative L2 of the worst kernel; element: its name.
+    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: the
+    sampling, with the predicted error, relative L2 of the worst kernel; element: its name.
     axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
-    None where it was not computed, or is a pixel of the window.
+    None where it is a pixel of the window.
     """
-
-    FIGURE: ClassVar[str] = "plotting.wave.element_figure"
 
     kernel: Tensor
     scene: WaveScene
@@ -82,18 +83,16 @@ class ElementPsf(Result):
 
     @property
     def peak(self) -> Tensor:
-        """(D, W): the most light in one pixel, of those of the window and one centred on the axis.
-
-        Light that is brightest on the axis has the same peak in windows of an even and of an odd number of pixels.
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis, so that windows of
+        an even and of an odd number of pixels have the same peak.
         """
         brightest = self.kernel.amax((-2, -1))
         return brightest if self.axial is None else torch.maximum(brightest, self.axial)
 
     @property
     def half_energy_radius(self) -> Tensor:
-        """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
-
-        Pixels count by the distance of their centres: good to half a pixel.
+        """(D, W) mm about the axis that holds half of all light through the aperture, to half a pixel; inf where the
+        window does not hold it.
         """
         x, y = centres(self.grid)
         distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
@@ -128,80 +127,58 @@ class ElementPsf(Result):
         return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
 
     def __str__(self) -> str:
-        return "\n".join(
-            [
-                self.title,
-                *map(_heights, self.scene.elements),
-                f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
-                f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
-                f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
-                f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
-                *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
-            ]
-        )
+        lines = [self.title]
+        for element in self.scene.elements:
+            low, high = height_range(element)
+            material = element.glass.name or "constant index"
+            lines.append(f"{element.kind.words} of {material}, heights over {1e3 * (high - low):.4g} µm")
+        lines += [
+            f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
+            f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
+            f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
+            f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
+        ]
+        for row in rows(self.columns()):
+            depth, wavelength, energy, peak, radius = map(number, row.values())
+            half = "–" if radius is None else f"{1e3 * radius:.2f}"
+            place = object_text(math.inf if depth is None else depth)
+            lines.append(f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}")
+        return "\n".join(lines)
+
+    def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
+        """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
+        if what == "heights":
+            return figures.height_figure(self.scene.elements, title=self.title)
+        if what == "caustic":
+            return figures.caustic_figure(self, *caustic(self.scene, **({"progress": progress} if progress else {})))
+        if what not in ("kernels", "encircled"):
+            raise ValueError(f"no figure {what!r}; expected one of kernels, heights, caustic, encircled")
+        return figures.psf_figure(self) if what == "kernels" else figures.encircled_figure(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
+        """Write the arrays, psf[depth, wavelength, y, x] and its axes, as .npz."""
         if Path(path).suffix.lower() != ".npz":
             raise ValueError(f"{path}: expected a name that ends in .npz")
-        arrays = {
-            "psf": self.kernel.detach().numpy(),
-            "pixel_pitch": float(self.pitch),
-            "centre": self.grid.centre.detach().numpy(),
-            "energy": self.energy.detach().numpy(),
-            "depths": self.depths.detach().numpy(),
-            "wavelengths": self.wavelengths.detach().numpy(),
-            "engine": self.plan.engine,
-            "samples": self.plan.samples,
-            "error": self.plan.error,
-            "element": self.element,
-        }
+        tensors = {"psf": self.kernel, "centre": self.grid.centre, "energy": self.energy}
+        tensors |= {"depths": self.depths, "wavelengths": self.wavelengths}
+        arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
+        arrays |= {"pixel_pitch": float(self.pitch), "element": self.element}
+        arrays |= {name: getattr(self.plan, name) for name in ("engine", "samples", "error")}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def _heights(element: Element) -> str:
-    low, high = height_range(element)
-    return f"{element.kind.words} of {element.glass.name or 'constant index'}, heights over {1e3 * (high - low):.4g} µm"
-
-
-def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:
-    half = "–" if half_energy_radius is None else f"{1e3 * half_energy_radius:.2f}"
-    place = object_text(math.inf if depth is None else depth)
-    return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
-
-
-def psf(
-    scene: WaveScene,
-    *,
-    engine: str = "auto",
-    samples: int | None = None,
-    nodes: int | None = None,
-    tol: float = 1e-3,
-    pad: float = 2.0,
-    band_limit: bool = True,
-    plan: Plan | None = None,
-    memo: Memo | None = None,
-) -> ElementPsf:
+def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, **sampling) -> ElementPsf:
     """PSFs of a scene, differentiable in every number of it.
 
-    engine, samples, nodes, tol, pad, band_limit: as `plan.plan` takes them. plan: of an earlier call, instead of them:
-    for loops, nothing is estimated. memo: sums that do not depend on the heights, which are not made again while the
-    rest of the scene stays as it is.
-    Raises what `plan.plan` raises.
+    sampling: engine, samples, nodes, tol, pad, band_limit as `plan.plan` takes them, and its errors. plan: of an
+    earlier call, instead of them: for loops, nothing is estimated. memo: sums that do not depend on the heights, reused
+    while the rest of the scene stays as it is.
     """
-    if plan is None:
-        plan = planning.plan(
-            scene, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
-        )
-    return ElementPsf(_engine_kernels(scene, plan, memo), scene, plan)
-
-
-def _engine_kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
-    engine = planning.ENGINES[plan.engine]
-    if engine.prepare is None:
-        return engine.kernels(scene, None, plan)
-    sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
-    return engine.kernels(scene, sums, plan)
+    plan = planning.plan(scene, **sampling) if plan is None else plan
+    engine, sums = planning.ENGINES[plan.engine], None
+    if engine.prepare is not None:
+        sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
+    return ElementPsf(engine.kernels(scene, sums, plan), scene, plan)
 
 
 def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
@@ -222,21 +199,20 @@ def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
         free = element.numbers
         # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
         jumps = isinstance(profile, EvenPowers) and element.period is not None
-        held = [free.detach()] if jumps else []
-        parts = [element.radius, getattr(profile, "pitch", None), element.period]
-        leaves += [t for t in (*parts, *held) if t is not None]
-        own = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
-        structure = (structure, *own)
+        parts = [element.radius, getattr(profile, "pitch", None), element.period, free.detach() if jumps else None]
+        leaves += [t for t in parts if t is not None]
+        kind = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
+        structure = (structure, *kind)
     return leaves, structure
 
 
 COLOURS = (0.46, 0.55, 0.64)
 _DESIGN = 0.55  # µm
-_PIECE = 1e9  # bytes: what would take more is computed kernel by kernel
+_CHUNK = 1e9  # bytes: beyond, kernels are computed one by one
 _RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
 _PLANES, _RANGE, _ACROSS = 121, (0.8, 1.2), 0.05  # of a caustic: over the sensor distance, and of the aperture
 
-#: Shows how far a loop has come: (what is gone through, its unit) -> the same.
+#: Shows the progress of a loop: (its items, their unit) -> the items.
 Progress = Callable[[Sequence, str], Iterable]
 
 
@@ -269,27 +245,33 @@ def wave_psf(
 ) -> ElementPsf:
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
-    element, and all up to catalog: as for `elements`; or one that was made already, in whose numbers the kernels are
-    differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around the axis.
-    engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
-    What would take too much memory at once is computed kernel by kernel.
-    Raises ValueError for what makes no sense together, budget.OverBudget where one kernel alone would take too much.
+    element, and all up to catalog: as for `elements`; or an `Element`, or several in contact, in whose numbers the
+    kernels are differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around
+    the axis. engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
+    Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
+    each other, budget.OverBudget where one kernel alone would take too much.
     """
-    made = _made(element)
-    parts = made or elements(
-        element,
-        aperture=aperture,
-        sensor=sensor,
-        focus=focus,
-        design_wavelength=design_wavelength,
-        levels=levels,
-        exact=exact,
-        glass=glass,
-        index=index,
-        wavelengths=wavelengths,
-        pitch=pitch,
-        span=span,
-        catalog=catalog,
+    is_made = not isinstance(element, str | os.PathLike)
+    parts = (
+        (element,)
+        if isinstance(element, Element)
+        else tuple(element)
+        if is_made
+        else elements(
+            element,
+            aperture=aperture,
+            sensor=sensor,
+            focus=focus,
+            design_wavelength=design_wavelength,
+            levels=levels,
+            exact=exact,
+            glass=glass,
+            index=index,
+            wavelengths=wavelengths,
+            pitch=pitch,
+            span=span,
+            catalog=catalog,
+        )
     )
     _check_colours(parts, wavelengths)
     scene = WaveScene(
@@ -301,7 +283,7 @@ def wave_psf(
         exact=exact,
     )
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
-    name = str(element) if not made else " + ".join(part.kind.words for part in parts)
+    name = " + ".join(part.kind.words for part in parts) if is_made else str(element)
     kernel, axial = _kernels(scene, chosen, progress), None
     if size % 2 == 0:  # a corner of four pixels lies on the axis
         axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
@@ -324,19 +306,18 @@ def elements(
     span: Sequence[float] | None = None,
     catalog: Sequence[str | os.PathLike] = (),
 ) -> tuple[Element, ...]:
-    """The elements in contact that have a name, one of `wave_optics.designs.BASELINES`, or that of a file of heights.
+    """The elements in contact of a name, one of `wave_optics.designs.BASELINES`, or of a file of heights.
 
-    aperture: diameter, mm. Of a named one sensor, focus: mm, the distances that it is made for; design_wavelength: µm,
-    0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file what `read_element` takes; index:
+    aperture: diameter, mm. Of a named element sensor, focus: mm, the distances of its design; design_wavelength: µm,
+    0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file as for `read_element`; index:
     its refractive indices at `wavelengths` instead of a glass.
-    Raises ValueError for options that do not belong together, and what `read_element` raises.
+    Raises ValueError for options that do not belong together, and the errors of `read_element`.
     """
     name = str(element)
-    of_files = {"glass": glass, "index": index, "pitch": pitch, "span": span}
     if name in BASELINES:
-        for option, given in of_files.items():
-            if given is not None:
-                raise ValueError(f"`{option}` belongs to a height map; the element {name} has its own")
+        for option, number in {"glass": glass, "index": index, "pitch": pitch, "span": span}.items():
+            if number is not None:
+                raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
             raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
         made_for = aim(
@@ -350,7 +331,7 @@ def elements(
         )
     if index is not None:
         if glass:
-            raise ValueError("`glass` and `index` both name the material: give one of them")
+            raise ValueError("`glass` and `index` exclude each other: both specify the material")
         try:
             glass = from_table(wavelengths, index)
         except ValueError as error:
@@ -360,15 +341,8 @@ def elements(
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
 
 
-def _made(element) -> tuple[Element, ...]:
-    """Elements that were made already; none of a name."""
-    if isinstance(element, Element):
-        return (element,)
-    return () if isinstance(element, str | os.PathLike) else tuple(element)
-
-
 def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
-    """Raises ValueError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
+    """Raise ValueError for a wavelength (µm) outside the range of a material's data: thin elements depend on n - 1."""
     for glass in {id(element.glass.coefficients): element.glass for element in parts}.values():
         check_unit(torch.tensor(wavelengths), [glass])
         if glass.formula == "constant":
@@ -377,29 +351,26 @@ def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> No
         outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
         if outside:
             listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
-            raise ValueError(f"{glass.name or 'the material'} is known from {low:g} to {high:g} µm, not at {listed} µm")
+            name = glass.name or "the material"
+            raise ValueError(f"{name} has indices from {low:g} to {high:g} µm, none at {listed} µm")
         check_wavelengths(glass, wavelengths)
 
 
 def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
     """All kernels at once, or one after the other where that would take too much memory."""
     D, W = len(scene.depths), len(scene.wavelengths)
-    whole = chosen.memory < min(_PIECE, allowed_bytes())
+    whole = chosen.memory < min(_CHUNK, allowed_bytes())
     helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
     if whole:
         return psf(scene, plan=chosen).kernel
-    parts = [(d, w) for d in range(D) for w in range(W)]
-    found = [
-        psf(
-            dataclasses.replace(scene, depths=scene.depths[d : d + 1], wavelengths=scene.wavelengths[w : w + 1]),
-            plan=chosen,
-        ).kernel
-        for d, w in progress(parts, "kernel")
-    ]
-    return torch.cat(found).reshape(D, W, *scene.grid.shape)
+    kernels = []
+    for d, w in progress([(d, w) for d in range(D) for w in range(W)], "kernel"):
+        point = {"depths": scene.depths[d : d + 1], "wavelengths": scene.wavelengths[w : w + 1]}
+        kernels.append(psf(dataclasses.replace(scene, **point), plan=chosen).kernel)
+    return torch.cat(kernels).reshape(D, W, *scene.grid.shape)
 
 
 @torch.no_grad()
@@ -415,7 +386,7 @@ def caustic(
     """The caustic of a scene: light per mm² (D, W, Z, columns), 1 = all through the aperture, on y = 0 from -half to
     half mm; its distances (Z,) mm; and half.
 
-    distances: from element to plane, by default from four fifths of the sensor distance to six fifths; half: by default
+    distances: from element to plane, by default from four fifths to six fifths of the sensor distance; half: by default
     a tenth of the radius. Pixels and sensor do not count. Light is the mean over squares 2·half/columns wide.
     """
     z = scene.sensor_distance

@@ -1,8 +1,8 @@
-"""Designs: the named elements that a learned one has to beat, all for the same camera.
+"""Designs: named elements for the same camera, to which a learned element is compared.
 
-`BASELINES` lists them by name; each takes an `Aim` (and its own options) and gives the elements in contact. Smooth ones
-are of PMMA, diamond-turned in features of 3.69 µm; diffractive ones of fused silica, etched in rings of 2 µm and
-wrapped at the design wavelength. A wrapped lens of power φ has the power φ λ/λ₀, a smooth one φ (n(λ) - 1)/(n₀ - 1).
+`BASELINES` lists them by name; each takes an `Aim` and options and gives the elements in contact. Smooth ones are of
+PMMA, diamond-turned in features of 3.69 µm; diffractive ones of fused silica, etched in rings of 2 µm and wrapped at
+the design wavelength. A wrapped lens of power φ has the power φ λ/λ₀, a smooth one φ (n(λ) - 1)/(n₀ - 1).
 """
 
 import inspect
@@ -19,19 +19,8 @@ from raytrace.materials.glass import Glass, constant, index
 from raytrace.maths.numerics import polynomial
 from raytrace.maths.value import value
 from raytrace.maths.zernike import noll, norm
-from raytrace.wave_optics.element import (
-    ETCHED,
-    TURNED,
-    Element,
-    EvenPowers,
-    Rings,
-    Zernike,
-    as_rings,
-    fabricated_height,
-    features,
-    period,
-    wrapped,
-)
+from raytrace.wave_optics.element import ETCHED, TURNED, Element, EvenPowers, Rings, Zernike, fabricated_height, period
+from raytrace.wave_optics.fabrication import as_rings, features, wrapped
 
 #: How steep a sphere may be, (R/z)², for its series to be worth summing.
 _STEEPEST = 0.8
@@ -44,7 +33,7 @@ Encircled = Callable[[Element], Tensor]
 
 @value
 class Aim:
-    """What an element is to do: bring a point on the axis to the sensor, through an aperture, at one wavelength.
+    """Design conditions of an element: object and image point on the axis, aperture and wavelength.
 
     radius: of the aperture, mm; sensor, focus: distances of the sensor and of the point, mm (focus may be infinite);
     wavelength: of the design, µm. exact: true spheres instead of their parabolas.
@@ -71,8 +60,8 @@ def aim(
         if not number > 0 or (name != "focus" and not number < math.inf):
             unit = "µm" if name == "wavelength" else "mm"
             raise ValueError(f"the {name} is {float(number):g} {unit}; expected a positive number")
-    found = (n if isinstance(n, Tensor) else torch.tensor(n, dtype=torch.float64) for n in numbers.values())
-    return Aim(*found, exact=exact)
+    tensors = (n if isinstance(n, Tensor) else torch.tensor(n, dtype=torch.float64) for n in numbers.values())
+    return Aim(*tensors, exact=exact)
 
 
 def converging(aim: Aim, focus: Tensor | None = None) -> Tensor:
@@ -86,20 +75,17 @@ def converging(aim: Aim, focus: Tensor | None = None) -> Tensor:
     vergences = 1 / torch.stack([aim.focus if focus is None else focus.to(aim.sensor), aim.sensor])
     if not aim.exact:
         return -0.5 * vergences.sum(0, keepdim=True)
-    k = torch.arange(1, _terms(aim.radius, vergences) + 1).to(vergences)
-    binomial = torch.cumprod((1.5 - k) / k, 0)
-    return -(binomial * vergences[:, None] ** (2 * k - 1)).sum(0)
-
-
-def _terms(radius: Tensor, vergences: Tensor) -> int:
-    steepness = float((radius * vergences.max()).detach()) ** 2
+    steepness = float((aim.radius * vergences.max()).detach()) ** 2
     if steepness > _STEEPEST:
         nearest = float(1 / vergences.detach().max())
         raise ValueError(
-            f"a sphere around a point {nearest:g} mm away is too steep over an aperture of {float(radius):g} mm: "
+            f"a sphere around a point {nearest:g} mm away is too steep over an aperture of {float(aim.radius):g} mm: "
             f"expected at least {1 / math.sqrt(_STEEPEST):.2f} radii, or the paraxial form (exact=False)"
         )
-    return max(2, math.ceil(math.log(1e-13) / math.log(steepness)))
+    terms = max(2, math.ceil(math.log(1e-13) / math.log(steepness)))
+    k = torch.arange(1, terms + 1).to(vergences)
+    binomial = torch.cumprod((1.5 - k) / k, 0)
+    return -(binomial * vergences[:, None] ** (2 * k - 1)).sum(0)
 
 
 def ideal(aim: Aim) -> tuple[Element, ...]:
@@ -128,7 +114,7 @@ def multifocal(
 
 
 def multifocal_refractive(aim: Aim, *, foci: Sequence[float] = FOCI, pitch: float = TURNED) -> tuple[Element, ...]:
-    """The same of PMMA, not wrapped: a smooth lens for the focus of the aim, and in rings what the annuli differ by.
+    """The same of PMMA, not wrapped: a smooth lens for the focus of the aim, and in rings the difference of the annuli.
 
     The whole in rings would lose light: 3.69 µm rings of an f/7 lens are half a wave of slope at the rim.
     """
@@ -157,7 +143,7 @@ def hybrid(
 
         φ_r + φ_d = φ,   φ_r/V_r + φ_d/V_d = 0,   V_r = (n₀ - 1)/(n₁ - n₂),   V_d = λ₀/(λ₁ - λ₂)
 
-    The lens bears what true spheres need beyond parabolas. Stone and George, Appl. Opt. 27, 2960 (1988).
+    The lens has the terms of true spheres beyond parabolas. Stone and George, Appl. Opt. 27, 2960 (1988).
     """
     smooth, etched = find_glass("PMMA"), find_glass("F_SILICA")
     first, last = torch.tensor(ends, dtype=torch.float64).to(aim.wavelength)
@@ -183,12 +169,12 @@ def achromat(
 ) -> tuple[Element, ...]:
     """The diffractive achromat: rings of fused silica, heights within one wave, that maximise Σ_λ log E_λ(spot).
 
-    After Peng, Fu, Heide and Heidrich, ACM Trans. Graph. 35, 31 (2016), who search greedily for equal spectra; here the
-    product of the encircled energies is raised along its gradient.
+    After Peng, Fu, Heide and Heidrich, ACM Trans. Graph. 35, 31 (2016), with a gradient ascent of the product of
+    encircled energies instead of their greedy search for equal spectra.
 
     wavelengths: µm; spot: radius of the circle, mm; pitch: of the rings, mm; rate: of Adam, on the logit of the height;
-    encircled: the engine that gives E, by default `encircled_energy`. Starts from the rings that suit the lenses of all
-    wavelengths at once. The same numbers give the same rings.
+    encircled: the engine that gives E, by default `encircled_energy`. Starts from the rings whose phases agree best
+    with the lenses of all wavelengths. The same numbers give the same rings.
     """
     glass = find_glass("F_SILICA")
     colours = torch.tensor(wavelengths, dtype=torch.float64, device=aim.radius.device)
@@ -218,8 +204,8 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
         U(ρ) = (2π/λz) Σ_rings e^(ik (n - 1) h) ∫ e^(ik e(r)) J0(2πρr/λz) r dr,   E = ∫ |U|² 2πρ dρ / πR²
 
     with e(r) the path from the point and to the sensor. The integral over a ring, in `inner` parts of constant e(r),
-    does not know the heights: it is done once, and E is a sum of squares of linear forms. The circle is integrated by
-    Gauss's rule of 32 points. Exact in the parabolic approximation. wavelengths: (W,) µm.
+    does not depend on the heights: it is done once, and E is a sum of squares of linear forms. The circle is integrated
+    by a Gauss rule of 32 points. Exact in the parabolic approximation. wavelengths: (W,) µm.
     """
     wavelengths, radius = wavelengths.double(), aim.radius.detach().double()
     count = features(radius, torch.tensor(pitch, dtype=torch.float64))
@@ -231,7 +217,7 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
     forms = []
     for wavelength in 1e-3 * wavelengths:
         rate = 2 * math.pi * rho[:, None] / (wavelength * aim.sensor.detach().double())
-        # The kernel depends on no variable, so that bessel_j1, which has no derivative, may stand here.
+        # Independent of all variables, so that torch's bessel_j1, which has no derivative, is enough.
         rings = torch.diff(edges * torch.special.bessel_j1(rate * edges) / rate, dim=1)
         phased = rings * torch.polar(torch.ones_like(excess), 2 * math.pi / wavelength * excess)
         scale = rate * torch.sqrt(2 * weights / rho)[:, None] / radius
@@ -263,7 +249,7 @@ def _phase(glass: Glass, wavelengths: Tensor) -> Tensor:
     return (2 * math.pi / (1e-3 * wavelengths) * (index(glass, wavelengths) - 1))[:, None]
 
 
-#: Name -> (aim, options of its own) -> elements in contact.
+#: Name -> (aim, options) -> elements in contact.
 BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {
     "ideal": ideal,
     "singlet": singlet,
@@ -277,18 +263,18 @@ BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {
 }
 
 
-#: Those that may be made in steps of a wave.
+#: Those that can have steps of a wave.
 STEPPED = tuple(name for name, design in BASELINES.items() if "levels" in inspect.signature(design).parameters)
 
 
 def baseline(name: str, aim: Aim, **options) -> tuple[Element, ...]:
-    """The baseline of a name. Raises ValueError for a name that is none, TypeError for an option it does not have."""
+    """The baseline of a name. Raises ValueError for an unknown name, TypeError for an unknown option."""
     if name not in BASELINES:
         raise ValueError(f"no baseline is called {name!r}; expected one of {', '.join(BASELINES)}")
     return BASELINES[name](aim, **options)
 
 
-# -- parts of them ---------------------------------------------------------------------------------------------------
+# -- parts -----------------------------------------------------------------------------------------------------------
 
 
 def _lens(aim: Aim, glass: Glass) -> Element:
@@ -301,7 +287,7 @@ def _smooth(aim: Aim, glass: Glass, path: Tensor) -> Element:
 
 
 def _annuli(aim: Aim, foci: Sequence[float], glass: Glass, *, pitch: float, less: Tensor | None) -> Rings:
-    """Rings of which annulus k of equal area is a lens for foci[k]; `less`: the focus of a lens to be left out."""
+    """Rings of which annulus k of equal area is a lens for foci[k]; `less`: the focus of a lens to subtract."""
     wide = torch.tensor(pitch, dtype=torch.float64).to(aim.radius)
     r2 = ((torch.arange(features(aim.radius, wide)).to(wide) + 0.5) * wide) ** 2
     annulus = (len(foci) * r2 / aim.radius.detach() ** 2).long().clamp(max=len(foci) - 1)

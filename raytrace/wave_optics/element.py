@@ -1,11 +1,12 @@
-"""Element: a thin phase element, its height over the aperture, as it is designed and as it is fabricated.
+"""Thin phase elements, given by their height over the aperture, as designed and as fabricated.
 
     path(x, y, λ) = (n(λ) - 1) h(x, y)
 
-beside air. Thicker is later: a converging element is thickest on its axis.
+relative to air. A thicker part delays light: a converging element is thickest on its axis.
 
-Free heights are pixels or rings, flat each; smooth ones Zernike polynomials or even powers of the radius; KINDS says
-all that the package needs to know of each. Elements in contact add their paths. Gradients pass everything here.
+Free heights are pixels or rings (a rotationally symmetric height profile), flat each; smooth ones Zernike polynomials
+or even powers of the radius; KINDS has a row for each. Elements in contact add their paths. Everything is
+differentiable.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
 from raytrace.maths.zernike import noll, polynomials
 
-#: Sizes of features, mm: what diamond turning makes of PMMA, and etching of fused silica.
+#: Sizes of features, mm: diamond turning of PMMA, and etching of fused silica.
 TURNED, ETCHED = 3.69e-3, 2e-3
 
 
@@ -34,7 +35,7 @@ class Pixels:
 
 @value
 class Rings:
-    """Heights (R,) mm of rings: ring k from radius k·pitch to (k + 1)·pitch mm."""
+    """Rotationally symmetric heights (R,) mm: ring k from radius k·pitch to (k + 1)·pitch mm."""
 
     heights: Tensor
     pitch: Tensor
@@ -86,8 +87,8 @@ def _even_powers(profile: EvenPowers, x: Tensor, y: Tensor, radius: Tensor) -> T
 class Kind(NamedTuple):
     """A kind of profile.
 
-    words: for people; numbers: its field that holds what can be learned; height: (profile, x, y, radius of the aperture
-    in mm) -> mm before it is wrapped or stepped; is_radial: whether it depends on the distance from the axis alone;
+    words: its name in reports; numbers: its field of free numbers; height: (profile, x, y, radius of the aperture in
+    mm) -> mm before it is wrapped or stepped; is_radial: whether it depends on the distance from the axis alone;
     is_flat: whether it has features of one pitch, flat each, with steps between them.
     """
 
@@ -110,10 +111,10 @@ KINDS = {
 class Element:
     """A profile in a round aperture.
 
-    radius: of the aperture, mm; glass: its material (`glass.constant(2.0)` makes a path of the same mm at every
-    wavelength). period: height in mm that is as good as none at the design wavelength, λ₀/(n₀ - 1): the height is taken
-    modulo it, None leaves it whole. levels: how many equal steps of a period can be made, 0 for any height; gradients
-    pass the steps as if they were not there.
+    radius: of the aperture, mm; glass: its material (`glass.constant(2.0)` gives the same path in mm at every
+    wavelength). period: height in mm that adds a whole wave at the design wavelength, λ₀/(n₀ - 1): the height is taken
+    modulo it, None leaves it whole. levels: number of equal steps of a period, 0 for any height; gradients ignore the
+    steps.
     """
 
     profile: Profile
@@ -128,7 +129,7 @@ class Element:
 
     @property
     def numbers(self) -> Tensor:
-        """Heights or coefficients: what can be learned."""
+        """Heights or coefficients."""
         return getattr(self.profile, self.kind.numbers)
 
     def with_numbers(self, numbers: Tensor) -> "Element":
@@ -142,7 +143,7 @@ def is_radial(element: Element) -> bool:
 
 
 def is_flat(element: Element) -> bool:
-    """Whether the height is that of features, flat each."""
+    """Whether the height has features, flat each."""
     return element.kind.is_flat
 
 
@@ -172,7 +173,7 @@ def fabricated_height(height: Tensor, period: Tensor | None, levels: int = 0) ->
     """Heights modulo a period, and lowered to the step below: floor(h/H·L)·H/L. The gradient is that of the height."""
     if period is None:
         return height
-    # A height at a step to rounding is that step: sixteen levels read from a file stay as they are.
+    # A height at a step to rounding is that step: sixteen levels read from a file do not change.
     slack = 1e-4 / levels if levels else 0.0
     wrapped = height - period * torch.floor((height / period).detach() + slack)
     if not levels:
@@ -189,7 +190,7 @@ def period(glass: Glass, wavelength: Tensor | float) -> Tensor:
 
 
 def excess_index(element: Element, wavelengths: Tensor, like: Tensor) -> Tensor:
-    """n - 1 (W,) at wavelengths (W,) µm, of the kind of `like`."""
+    """n - 1 (W,) at wavelengths (W,) µm, in the dtype and on the device of `like`."""
     return index(element.glass, wavelengths).to(like) - 1
 
 
@@ -200,90 +201,3 @@ def path(elements: Sequence[Element], x: Tensor, y: Tensor, wavelengths: Tensor)
         excess = excess_index(element, wavelengths, x)
         total = total + excess.reshape(-1, *[1] * x.ndim) * height(element, x, y)
     return total
-
-
-# -- as it is fabricated -----------------------------------------------------------------------------------------------
-
-
-def as_rings(element: Element, pitch: float | Tensor) -> Element:
-    """A radial element with the height at the middle of every ring of `pitch` mm, flat over the ring.
-
-    Period and levels stay those of the element. Raises ValueError for an element that is not radial.
-    """
-    if not is_radial(element):
-        kind = type(element.profile).__name__
-        raise ValueError(f"a profile of {kind} is not radial, and rings cannot hold it; use as_pixels")
-    pitch = torch.as_tensor(pitch, dtype=element.radius.dtype, device=element.radius.device)
-    r = (torch.arange(features(element.radius, pitch)).to(pitch) + 0.5) * pitch
-    return dataclasses.replace(element, profile=Rings(designed_height(element, r, torch.zeros_like(r)), pitch))
-
-
-def as_pixels(element: Element, pitch: float | Tensor) -> Element:
-    """An element with the height at the middle of every square of `pitch` mm around the axis, flat over the square.
-
-    Period and levels stay those of the element. Beyond the aperture the profile is continued.
-    """
-    pitch = torch.as_tensor(pitch, dtype=element.radius.dtype, device=element.radius.device)
-    count = features(2 * element.radius, pitch)
-    x = (torch.arange(count).to(pitch) - 0.5 * (count - 1)) * pitch
-    y, x = torch.meshgrid(x, x, indexing="ij")
-    return dataclasses.replace(element, profile=Pixels(designed_height(element, x, y), pitch))
-
-
-def features(length: Tensor, pitch: Tensor) -> int:
-    """How many features of `pitch` mm cover `length` mm; one is not added for what rounding leaves."""
-    return int(torch.ceil((length / pitch).detach() * (1 - 1e-6)))
-
-
-def wrapped(element: Element, wavelength: float | Tensor, *, levels: int = 0) -> Element:
-    """The element with its height modulo one wave of `wavelength` µm, in `levels` equal steps (0: any height).
-
-    Neutral at that wavelength alone. A kinoform of L levels keeps sinc²(1/L) of its light (Goodman and Silvestri,
-    IBM J. Res. Dev. 14, 478, 1970).
-    """
-    return dataclasses.replace(element, period=period(element.glass, wavelength).to(element.radius), levels=levels)
-
-
-def fabricated(element: Element) -> Element:
-    """The element with the heights (rows, columns) or (R,) mm of its pixels or rings wrapped and stepped: as light sees
-    them, and as `write_element` writes them.
-
-    Raises ValueError for a smooth profile, which has no features.
-    """
-    if not is_flat(element):
-        kind = type(element.profile).__name__
-        raise ValueError(f"a profile of {kind} has no features to be fabricated; use as_rings or as_pixels first")
-    heights = fabricated_height(element.numbers, element.period, element.levels)
-    return dataclasses.replace(element.with_numbers(heights), period=None, levels=0)
-
-
-def with_tolerance(element: Element, tolerance: float | Tensor, *, generator: torch.Generator | None = None) -> Element:
-    """The element as fabricated, but each ring or pixel off by a uniform draw of ± `tolerance` mm.
-
-    The same generator state gives the same errors. Raises ValueError for a smooth profile, which has no features.
-    """
-    made = fabricated(element)
-    heights = made.numbers
-    draw = torch.rand(heights.shape, generator=generator, dtype=heights.dtype, device=heights.device)
-    return made.with_numbers(heights + tolerance * (2 * draw - 1))
-
-
-@torch.no_grad()
-def height_range(element: Element) -> tuple[float, float]:
-    """The smallest and the largest height in mm inside the aperture, wrapped and stepped.
-
-    Of pixels and rings exact; of a smooth profile from 4,097 points of a radius, or of 513 × 513 of the square around.
-    """
-    radius, kind = element.radius, element.kind
-    if isinstance(element.profile, Rings):
-        heights = fabricated(element).numbers[: features(radius, element.profile.pitch)]
-        return float(heights.min()) + 0.0, float(heights.max()) + 0.0
-    if isinstance(element.profile, Pixels):
-        step = element.profile.pitch
-        y, x = ((torch.arange(n).to(radius) - 0.5 * (n - 1)) * step for n in element.numbers.shape)
-    else:
-        x = radius * torch.linspace(0 if kind.is_radial else -1, 1, 4097 if kind.is_radial else 513).to(radius)
-        y = torch.zeros_like(x[:1]) if kind.is_radial else x
-    y, x = torch.meshgrid(y, x, indexing="ij")
-    heights = height(element, x, y)[torch.hypot(x, y) <= radius * (1 + 1e-6)]
-    return float(heights.min()) + 0.0, float(heights.max()) + 0.0

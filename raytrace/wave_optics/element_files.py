@@ -1,8 +1,7 @@
-"""An element in files: its heights, and beside them what else belongs to it: heights.npy has heights.npy.json.
+"""Files of an element: its heights, as heights.npy, and a label with its other data, heights.npy.json.
 
-Heights are a lens only in their material: the same heights in another glass bend light by another n - 1. The label
-holds the whole glass, so that it needs no catalog, the wavelength that the heights were made for, and their size.
-A smooth element is a few coefficients: it stands in its label alone, smooth.json.
+Heights are a lens only with their material. The label holds the whole glass, so that it needs no catalog, the design
+wavelength and the size. A smooth element is a few coefficients: all of it is in its label, smooth.json.
 """
 
 import dataclasses
@@ -15,13 +14,13 @@ import torch
 
 from raytrace.files import read_bytes, write_json
 from raytrace.materials.catalogs import find_glass
-from raytrace.materials.formulas import FORMULAS
-from raytrace.materials.glass import Glass
+from raytrace.materials.glass import FORMULAS, Glass
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat
+from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
-#: Suffix of smooth elements, and their profiles by the name that they have there.
+#: Suffix of smooth elements, and their profiles by their name in the file.
 SMOOTH = ".json"
 _PROFILES = {"even powers of r, mm^(1 - 2k)": EvenPowers, "Noll's polynomials, mm RMS": Zernike}
 
@@ -47,20 +46,20 @@ class Label:
 
 def write_element(element: Element, path: str | os.PathLike, *, design_wavelength: float) -> tuple[Path, Path]:
     """Write the heights of an element in the format of the suffix, and its label next to them; both paths. A smooth
-    element's name ends in .json: it is its own label.
+    element's name ends in .json: it is its shape label.
 
-    Heights are those of `fabricated`: modulo the period, in steps, as light sees them; the file has no period. The
-    label has their range in the aperture, mm. Raises HeightMapError for what the format cannot hold.
+    Heights are those of `fabricated`: modulo the period, in steps; the file has no period. The label has their range in
+    the aperture, mm. Raises HeightMapError for data that the format cannot hold.
     """
     path, glass = Path(path), element.glass
     if is_flat(element) or path.suffix.lower() != SMOOTH:
         write_heights((fabricated(element) if is_flat(element) else element).profile, path)
-        own = {"pitch": float(element.profile.pitch.detach())}
+        shape = {"pitch": float(element.profile.pitch.detach())}
     elif element.period is not None:
-        raise HeightMapError("a smooth profile that is wrapped is no smooth one; take as_rings or as_pixels", str(path))
+        raise HeightMapError("a wrapped profile is not smooth; take as_rings or as_pixels", str(path))
     else:
         name = next(name for name, kind in _PROFILES.items() if isinstance(element.profile, kind))
-        own = {"profile": name, "coefficients_of_profile": element.numbers.detach().tolist()}
+        shape = {"profile": name, "coefficients_of_profile": element.numbers.detach().tolist()}
     document = {
         "material": glass.name,
         "catalog": glass.catalog,
@@ -70,7 +69,7 @@ def write_element(element: Element, path: str | os.PathLike, *, design_wavelengt
         "design_wavelength": design_wavelength,
         "aperture": 2 * float(element.radius.detach()),
         "height_range": height_range(element),
-        **own,
+        **shape,
     }
     write_json(_label_of(path), document)
     return path, _label_of(path)
@@ -89,11 +88,10 @@ def read_element(
 ) -> Element:
     """The element of a file of heights, or of a smooth one, in an aperture of so many mm.
 
-    glass: its material, by default that of its label; a name is looked up, first in the catalogs (.agf) given. pitch,
-    span: mm, of a file that does not say them (`read_heights`), nor its label. design_wavelength (µm), levels: the
-    heights are wrapped there, in so many steps, if either is given.
-    Raises HeightMapError for a file that cannot be read, ValueError for heights that do not fill the aperture or whose
-    material or design wavelength nobody knows.
+    glass: its material, by default that of its label; a name is looked up, first in the catalogs (.agf) of `catalog`.
+    pitch, span: mm, of a file without them (`read_heights`) and without a label. design_wavelength (µm), levels: the
+    heights are wrapped there, in so many steps, if either is given. Raises HeightMapError for a file that cannot be
+    read, ValueError for heights that do not fill the aperture or without material or design wavelength.
     """
     label = read_label(path)
     if isinstance(glass, str):
@@ -106,14 +104,14 @@ def read_element(
         return element
     design = design_wavelength or (label and label.design_wavelength)
     if not design:
-        raise ValueError(f"{path}: does not say what it was made for; give `design_wavelength`")
+        raise ValueError(f"{path}: has no design wavelength; give `design_wavelength`")
     return wrapped(element, design, levels=levels)
 
 
 def _smooth(file: str, label: Label | None, aperture: float, glass: Glass | None, *of_heights) -> Element:
     if label is None or label.profile is None:
         raise HeightMapError("is no smooth element: expected the coefficients of one", file)
-    if any(given is not None for given in of_heights):
+    if any(number is not None for number in of_heights):
         raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
     fixed = isinstance(label.profile, Zernike)
     if aperture > label.aperture * (1 + 1e-9) or (fixed and aperture < label.aperture * (1 - 1e-9)):
@@ -126,7 +124,7 @@ def _flat(path, label: Label | None, aperture: float, glass: Glass | None, pitch
     profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
     across = min(counts) * float(profile.pitch)
-    # What is cut to whole features may miss the rim by one of them.
+    # Heights cut to whole features may miss the rim by one feature.
     if across + 2 * float(profile.pitch) < aperture:
         raise ValueError(
             f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
@@ -134,36 +132,36 @@ def _flat(path, label: Label | None, aperture: float, glass: Glass | None, pitch
         )
     if glass is None and label is None:
         raise ValueError(
-            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass=NAME`, as "
-            "PMMA, or `index=N` for each wavelength where that is taken"
+            f"{path}: has no material (there is no {_label_of(path).name}); give `glass=NAME`, as PMMA, or `index=N` "
+            "for each wavelength"
         )
     return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
 
 
 def read_label(path: str | os.PathLike) -> Label | None:
-    """The label of a height map, None where there is none. Raises HeightMapError for one that cannot be read."""
+    """The label of a height map, None if there is none. Raises HeightMapError for one that cannot be read."""
     file = _label_of(path)
     if not file.exists():
         return None
     try:
-        found = _label(parsed(read_bytes(file, _MOST)))
+        label = _label(parsed(read_bytes(file, _MOST)))
     except (OSError, Unfit) as error:
         line = error.line or None if isinstance(error, Unfit) else None
         raise HeightMapError(f"is no label of a height map ({error}); remove it", str(file), line) from error
-    sizes = ("design_wavelength", "aperture", *([] if "profile" in found else ["pitch"]))
-    span = found["wavelength_range"]
+    sizes = ("design_wavelength", "aperture", *([] if "profile" in label else ["pitch"]))
+    span = label["wavelength_range"]
     glass = Glass(
-        found["material"],
-        found["formula"],
-        torch.tensor(found["coefficients"], dtype=torch.float64),
-        found["catalog"],
+        label["material"],
+        label["formula"],
+        torch.tensor(label["coefficients"], dtype=torch.float64),
+        label["catalog"],
         wavelength_range=None if span is None else tuple(span),
     )
     profile = None
-    if "profile" in found:
-        coefficients = torch.tensor(found["coefficients_of_profile"], dtype=torch.float64)
-        profile = _PROFILES[found["profile"]](coefficients)
-    return Label(glass, **{name: found[name] for name in sizes}, profile=profile)
+    if "profile" in label:
+        coefficients = torch.tensor(label["coefficients_of_profile"], dtype=torch.float64)
+        profile = _PROFILES[label["profile"]](coefficients)
+    return Label(glass, **{name: label[name] for name in sizes}, profile=profile)
 
 
 _ABOVE_0 = number(math.ulp(0.0))
@@ -184,13 +182,13 @@ _SMOOTH = record(_GLASS | _PROFILE, _INFORMATION)
 
 def _label(value: object) -> dict:
     """A label as JSON has it. Raises Unfit."""
-    found = (_SMOOTH if isinstance(value, dict) and "profile" in value else _OF_HEIGHTS)(value)
-    count, span = FORMULAS[found["formula"]].count, found["wavelength_range"]
-    if len(found["coefficients"]) != count:
-        raise Unfit(f"coefficients: found a list of {len(found['coefficients'])}, expected {count} of them")
+    label = (_SMOOTH if isinstance(value, dict) and "profile" in value else _OF_HEIGHTS)(value)
+    count, span = FORMULAS[label["formula"]].count, label["wavelength_range"]
+    if len(label["coefficients"]) != count:
+        raise Unfit(f"coefficients: found a list of {len(label['coefficients'])}, expected {count} of them")
     if span is not None and not span[0] < span[1]:
         raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
-    return found
+    return label
 
 
 def _label_of(path: str | os.PathLike) -> Path:

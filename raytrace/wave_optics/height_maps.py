@@ -1,15 +1,15 @@
-"""Height maps as files: the suffix names the format; what is written comes back in mm.
+"""Height maps as files: the suffix selects the format; heights are in mm.
 
-| suffix        | holds                                                            | heights come back     |
+| suffix        | content                                                          | heights read back     |
 |---------------|------------------------------------------------------------------|-----------------------|
 | .npy          | the heights, then in a second array the pitch                    | bit for bit           |
 | .csv          | x, y, sag or r, sag of every pixel or ring, mm                   | bit for bit           |
 | .png, .tif(f) | 16-bit grey, scale and pitch in JSON as description              | to 1/131,070 of range |
 | .dat, .grd    | grid sag of Zemax OpticStudio, pixels only, at least 5 × 5       | bit for bit           |
 
-Steps of a quantised element, up to 256, come back bit for bit from every format. Rows of pictures and of grid sags run
-from the largest y down, as one sees them; those of `Pixels` and of the other files from the smallest y up. A sag is the
-height: that of the rear face of a plate, light going towards +z. Glass, aperture and period are not in the files.
+Steps of a quantised element, up to 256, are read back bit for bit from every format. Rows of pictures and of grid sags
+run from the largest y down; those of `Pixels` and of the other files from the smallest y up. A sag is the height: that
+of the rear face of a plate, light going towards +z. Glass, aperture and period are not in the files.
 """
 
 import io
@@ -33,17 +33,17 @@ Map = Pixels | Rings
 
 #: The largest grey value of 16 bits.
 _WHITE = 65535
-#: At most so many different heights are listed in a picture's description, to come back exactly.
+#: At most so many different heights are listed in a picture's description, to be read back exactly.
 _LISTED = 256
 #: TIFF tag of the description.
 _DESCRIPTION = 270
-_NO_PITCH = "does not say its pitch; give pitch in mm"
+_NO_PITCH = "has no pitch; give pitch in mm"
 #: Length unit of a grid sag, in mm, by its flag.
 _UNITS = {0: 1.0, 1: 10.0, 2: 25.4, 3: 1000.0}
 
 
 class HeightMapError(ValueError):
-    """A height map that cannot be read or written, said in one line: where, what was found, what to do."""
+    """A height map that cannot be read or written; the message has file, line, defect and remedy."""
 
     def __init__(self, message: str, file: str, line: int | None = None):
         place = file if line is None else f"{file}:{line}"
@@ -52,7 +52,7 @@ class HeightMapError(ValueError):
 
 
 class Known(NamedTuple):
-    """What the reader of a file was told: pitch mm, and the heights mm of black and white. None: the file must say."""
+    """Data of a file without description: pitch mm, and the heights mm of black and white."""
 
     pitch: float | None = None
     span: tuple[float, float] | None = None
@@ -68,10 +68,11 @@ class Format(NamedTuple):
 def read_heights(
     path: str | os.PathLike, *, pitch: float | None = None, span: tuple[float, float] | None = None
 ) -> Map:
-    """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings where it holds rings.
+    """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings of a rotationally symmetric
+    one.
 
-    pitch: mm, for a file that does not say it; span: heights mm of grey 0 and 65535, for a picture that does not say.
-    Raises HeightMapError naming file and line.
+    pitch: mm, for a file without it; span: heights mm of grey 0 and 65535, for a picture without description. Raises
+    HeightMapError with file and line.
     """
     file = str(path)
     form = _format(file)
@@ -81,15 +82,15 @@ def read_heights(
         raise HeightMapError(f"cannot be read: {error.strerror or error}", file) from error
     if not content:
         raise HeightMapError("is empty", file)
-    found = form.read(content, file, Known(pitch, span))
-    _check(found, file)
-    return found
+    profile = form.read(content, file, Known(pitch, span))
+    _check(profile, file)
+    return profile
 
 
 def write_heights(profile: Map, path: str | os.PathLike) -> None:
     """Write a height map in the format of the suffix. The file is replaced as a whole or not at all.
 
-    Raises HeightMapError for what the format cannot hold and where the file cannot be written.
+    Raises HeightMapError for data that the format cannot hold and where the file cannot be written.
     """
     file = str(path)
     form = _format(file)
@@ -132,34 +133,25 @@ def _read_npy(content: bytes, file: str, known: Known) -> Map:
 # -- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _write_png(profile: Map, file: str) -> bytes:
-    grey, description = _grey(profile)
-    info = PngImagePlugin.PngInfo()
-    info.add_text("Description", description)
-    stream = io.BytesIO()
-    Image.fromarray(grey).save(stream, "PNG", pnginfo=info)
-    return stream.getvalue()
+def _write_picture(kind: str) -> Callable[[Map, str], bytes]:
+    """The writer of a kind of picture, "PNG" or "TIFF": 16-bit grey, the largest y on top, and a description."""
 
+    def write(profile: Map, file: str) -> bytes:
+        heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
+        low, high = float(heights.min()), float(heights.max())
+        scale = (high - low) / _WHITE
+        grey = np.zeros(heights.shape) if scale == 0 else np.rint((heights - low) / (high - low) * _WHITE)
+        description = {"unit": "mm", "offset": low, "scale": scale, "pitch": float(profile.pitch)}
+        description["profile"] = "rings" if isinstance(profile, Rings) else "pixels"
+        steps = np.unique(heights)
+        if len(steps) <= _LISTED and len(np.unique(grey)) == len(steps):
+            description["heights"] = steps.tolist()
+        stream, info, text = io.BytesIO(), PngImagePlugin.PngInfo(), json.dumps(description)
+        info.add_text("Description", text)
+        Image.fromarray(grey.astype(np.uint16)).save(stream, kind, pnginfo=info, tiffinfo={_DESCRIPTION: text})
+        return stream.getvalue()
 
-def _write_tiff(profile: Map, file: str) -> bytes:
-    grey, description = _grey(profile)
-    stream = io.BytesIO()
-    Image.fromarray(grey).save(stream, "TIFF", tiffinfo={_DESCRIPTION: description})
-    return stream.getvalue()
-
-
-def _grey(profile: Map) -> tuple[np.ndarray, str]:
-    """Grey values (rows, columns) of 16 bits, the largest y on top, and what they mean."""
-    heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
-    low, high = float(heights.min()), float(heights.max())
-    scale = (high - low) / _WHITE
-    grey = np.zeros(heights.shape) if scale == 0 else np.rint((heights - low) / (high - low) * _WHITE)
-    meaning = {"unit": "mm", "offset": low, "scale": scale, "pitch": float(profile.pitch)}
-    meaning["profile"] = "rings" if isinstance(profile, Rings) else "pixels"
-    steps = np.unique(heights)
-    if len(steps) <= _LISTED and len(np.unique(grey)) == len(steps):
-        meaning["heights"] = steps.tolist()
-    return grey.astype(np.uint16), json.dumps(meaning)
+    return write
 
 
 def _read_picture(content: bytes, file: str, known: Known) -> Map:
@@ -181,23 +173,23 @@ def _read_picture(content: bytes, file: str, known: Known) -> Map:
             raise HeightMapError(f"has {len(values)} grey values, but its description lists {count} heights", file)
         heights = np.array(meaning["heights"], np.float64)[place.reshape(grey.shape)]
     if meaning["profile"] == "rings" and len(heights) != 1:
-        raise HeightMapError(f"is said to hold rings, but has {len(heights)} rows", file)
+        raise HeightMapError(f"has a description of rings, but {len(heights)} rows", file)
     heights = heights[0] if meaning["profile"] == "rings" else heights[::-1]
     return _profile(heights, meaning["pitch"], file)
 
 
 def _meaning(text: str, file: str, known: Known) -> dict:
-    """The description of a picture; for one of another program, what the caller knows."""
+    """The description of a picture; for one without, the data that the caller gives."""
     try:
-        found = json.loads(text)
-        numbers = {key: float(found[key]) for key in ("offset", "scale", "pitch")}
-        listed = {"heights": [float(h) for h in found["heights"]]} if "heights" in found else {}
-        if found["profile"] not in ("rings", "pixels"):
-            raise KeyError(found["profile"])
-        return {"profile": found["profile"], **numbers, **listed}
+        description = json.loads(text)
+        numbers = {key: float(description[key]) for key in ("offset", "scale", "pitch")}
+        listed = {"heights": [float(h) for h in description["heights"]]} if "heights" in description else {}
+        if description["profile"] not in ("rings", "pixels"):
+            raise KeyError(description["profile"])
+        return {"profile": description["profile"], **numbers, **listed}
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if known.span is None:
-            message = "does not say which heights its grey values mean; give span (mm of black and white) and pitch"
+            message = "has no description of its grey values; give span (heights in mm of black and white) and pitch"
             raise HeightMapError(message, file) from error
     low, high = known.span
     return {"profile": "pixels", "offset": low, "scale": (high - low) / _WHITE, "pitch": known.pitch}
@@ -223,8 +215,8 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
     lines = _text(content, file).split("\n")
     head = [name.strip().lower().removesuffix("_mm") for name in lines[0].split(",")]
     if head not in (["r", "sag"], ["x", "y", "sag"]):
-        found = lines[0][:60]
-        raise HeightMapError(f"begins with {found!r}; expected the header x_mm,y_mm,sag_mm or r_mm,sag_mm", file, 1)
+        header = lines[0][:60]
+        raise HeightMapError(f"begins with {header!r}; expected the header x_mm,y_mm,sag_mm or r_mm,sag_mm", file, 1)
     table = _numbers(lines[1:], file, first=2, counts=(len(head),), separator=",")
     if not np.isfinite(table[:, :-1]).all():
         row = int(np.flatnonzero(~np.isfinite(table[:, :-1]).all(1))[0])
@@ -259,11 +251,11 @@ def _pitch_between(table: np.ndarray, rows: int, columns: int, known: Known, fil
     return pitch
 
 
-def _expect(found: np.ndarray, wanted: np.ndarray, pitch: float, name: str, file: str, lines: np.ndarray) -> None:
-    wrong = np.flatnonzero(~(np.abs(found - wanted) <= 1e-3 * abs(pitch)))
+def _expect(values: np.ndarray, wanted: np.ndarray, pitch: float, name: str, file: str, lines: np.ndarray) -> None:
+    wrong = np.flatnonzero(~(np.abs(values - wanted) <= 1e-3 * abs(pitch)))
     if len(wrong):
         k = wrong[0]
-        message = f"has {name} = {found[k]:g} mm; expected {wanted[k]:g} on an even grid around the axis, x first"
+        message = f"has {name} = {values[k]:g} mm; expected {wanted[k]:g} on an even grid around the axis, x first"
         raise HeightMapError(message, file, int(lines[k]))
 
 
@@ -287,10 +279,10 @@ def _write_grid(profile: Map, file: str) -> bytes:
 
 
 def _read_grid(content: bytes, file: str, known: Known) -> Map:
-    kept = [(k, line) for k, line in enumerate(_text(content, file).split("\n"), 1) if not line.startswith("!")]
-    if not kept:
+    lines = [(k, line) for k, line in enumerate(_text(content, file).split("\n"), 1) if not line.startswith("!")]
+    if not lines:
         raise HeightMapError("holds comments only; expected a grid sag", file)
-    first, head = kept[0]
+    first, head = lines[0]
     nx, ny, delx, dely, unit, *decentre = _numbers([head], file, first=first, counts=(5, 7), separator=None)[0].tolist()
     if unit not in _UNITS:
         raise HeightMapError(f"has the unit flag {unit:g}; expected 0 mm, 1 cm, 2 inch or 3 m", file, first)
@@ -299,23 +291,23 @@ def _read_grid(content: bytes, file: str, known: Known) -> Map:
             f"has steps of {delx:g}, {dely:g} and decentres {decentre}; only square grids around the axis are read"
         )
         raise HeightMapError(message, file, first)
-    if nx * ny != len(kept) - 1 or min(nx, ny) < 1 or nx % 1 or ny % 1:
-        raise HeightMapError(f"announces {nx:g} × {ny:g} points, but holds {len(kept) - 1}", file, first)
-    table = _numbers([line for _, line in kept[1:]], file, first=kept[1][0], counts=(1, 4, 5), separator=None)
+    if nx * ny != len(lines) - 1 or min(nx, ny) < 1 or nx % 1 or ny % 1:
+        raise HeightMapError(f"announces {nx:g} × {ny:g} points, but holds {len(lines) - 1}", file, first)
+    table = _numbers([line for _, line in lines[1:]], file, first=lines[1][0], counts=(1, 4, 5), separator=None)
     missing = table[:, 4] != 0 if table.shape[1] == 5 else np.zeros(len(table), bool)
     # Points without data count as none of the sag, as in the program that wrote them.
     heights = np.where(missing, 0.0, table[:, 0] * _UNITS[unit]).reshape(int(ny), int(nx))
     return _profile(heights[::-1], abs(delx) * _UNITS[unit], file)
 
 
-# -- what they share --------------------------------------------------------------------------------------------------
+# -- common parts -----------------------------------------------------------------------------------------------------
 
 #: The formats by suffix, in lower case.
 FORMATS = {
     ".npy": Format(_read_npy, _write_npy),
-    ".png": Format(_read_picture, _write_png),
-    ".tif": Format(_read_picture, _write_tiff),
-    ".tiff": Format(_read_picture, _write_tiff),
+    ".png": Format(_read_picture, _write_picture("PNG")),
+    ".tif": Format(_read_picture, _write_picture("TIFF")),
+    ".tiff": Format(_read_picture, _write_picture("TIFF")),
     ".csv": Format(_read_csv, _write_csv),
     ".dat": Format(_read_grid, _write_grid),
     ".grd": Format(_read_grid, _write_grid),
@@ -325,8 +317,8 @@ FORMATS = {
 def _format(file: str) -> Format:
     suffix = Path(file).suffix.lower()
     if suffix not in FORMATS:
-        found = f"the suffix {suffix!r} names no format" if suffix else "has no suffix to name its format"
-        raise HeightMapError(f"{found} of height maps; expected one of {', '.join(FORMATS)}", file)
+        defect = f"the suffix {suffix!r} is unknown" if suffix else "has no suffix"
+        raise HeightMapError(f"{defect}; expected a height map, one of {', '.join(FORMATS)}", file)
     return FORMATS[suffix]
 
 
@@ -343,7 +335,7 @@ def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Map:
 
 
 def _check(profile: Map, file: str) -> None:
-    """Refuse what is no height map: another number of axes, no points, numbers that are not finite, no pitch."""
+    """Refuse an invalid height map: wrong number of axes, no points, numbers that are not finite, no pitch."""
     heights, axes = profile.heights, 1 if isinstance(profile, Rings) else 2
     if heights.ndim != axes or not heights.numel():
         kind = "rings (R,)" if axes == 1 else "pixels (rows, columns)"
@@ -367,7 +359,7 @@ def _numbers(lines: list[str], file: str, *, first: int, counts: tuple[int, ...]
     """Numbers (lines, count) of lines that all hold the same count, one of `counts`. first: the number of lines[0]."""
     if not lines:
         raise HeightMapError("holds no points", file)
-    try:  # at once; where that fails, line by line to say where
+    try:  # at once; where that fails, line by line to find the line
         table = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
         if table.shape[0] == len(lines) and table.shape[1] in counts:
             return table

@@ -1,14 +1,14 @@
-"""Bridge: phase elements and traced lenses meet, both ways.
+"""Phase elements and traced lenses together.
 
     element_lens   a height map as a plano lens whose rays are traced: plane, glass, surface z = h(x, y)
     hybrid_psf     a lens whose stop carries elements: the traced wavefront plus their path
 
         U(x, y) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi [W_j + Σ_e (n_e(λ) - 1) h_e(x_j, y_j) + n (L_j x + M_j y)]/λ)
 
-(x_j, y_j) is where ray j of the lens without elements meets its stop. An element is thin there: rays neither walk in
-it nor are traced anew behind it. Against refraction at the height itself that leaves out a path of (h_max - h) θ²/2
-where rays behind it run at an angle θ to the axis; and that rays bent by the element cross the rest of the lens
-elsewhere, which is of second order in its slopes.
+(x_j, y_j) is where ray j of the lens without elements meets its stop. An element is thin there: rays have no path
+inside it and are not traced anew behind it. Compared with refraction at the height itself this neglects a path of
+(h_max - h) θ²/2 where rays behind it run at an angle θ to the axis, and, of second order in the slopes of the element,
+that rays deflected by it cross the rest of the lens elsewhere.
 """
 
 import dataclasses
@@ -25,18 +25,9 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
-from raytrace.psf_models.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
-from raytrace.psf_models.radial import is_centred, radii_of_waves, unfold
+from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels
-from raytrace.psf_models.wave import (
-    Waves,
-    amplitude,
-    half_spread,
-    one_field,
-    one_field_grid,
-    phase_along_radius,
-    waves,
-)
+from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, with_object_distance
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import relief
@@ -48,7 +39,7 @@ from raytrace.tracing.wavefront import Wavefront, wavefront_of
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 
 _MOST_RAYS = 400_000  # of one kernel
-_PROBE = 8, 32  # rings and arms of the rays that find how far directions spread and beams reach
+
 _FINE = 32, 64  # of the points at which slopes of an element are looked for
 _PER_PIXEL = 8.0  # radians of phase that count for a flat pixel: two rays across it along a radius
 _PER_ZONE = 4.0  # times the phase of a wrapped height: twelve rays across a zone
@@ -72,29 +63,28 @@ def element_lens(
 ) -> Lens:
     """A plano lens of one element: the stop, its round rim, is on the height's side, which faces the sensor.
 
-    sensor_distance: mm from the vertex of the height, where a thin element stands; object_distance: mm from the plane,
-    inf allowed; wavelengths: (W,) µm; substrate: mm of glass below height 0.
-    Raises ValueError for a stepped or wrapped element, which rays do not see as light does, and for heights that lie
-    beyond the plane.
+    sensor_distance: mm from the vertex of the height, the plane of the thin element; object_distance: mm from the
+    plane, inf allowed; wavelengths: (W,) µm; substrate: mm of glass below height 0. Raises ValueError for a stepped or
+    wrapped element, which diffracts, and for heights that lie beyond the plane.
     """
     front, back = surfaces_of(element, substrate=substrate)
     back = dataclasses.replace(back, thickness=torch.as_tensor(sensor_distance, dtype=front.thickness.dtype))
     zero = torch.zeros_like(front.thickness)
     before, image = (Surface(torch.as_tensor(t, dtype=zero.dtype)) for t in (object_distance, zero))
     wavelengths = torch.as_tensor(wavelengths, dtype=zero.dtype)
-    nothing = wavelengths.new_zeros(1)
+    axis = wavelengths.new_zeros(1)
     return Lens(
         surfaces=(before, front, back, image),
         stop=2,
         aperture=SystemAperture("float_by_stop", element.radius),
-        fields=Fields("angle", nothing, nothing, torch.ones_like(nothing)),
+        fields=Fields("angle", axis, axis, torch.ones_like(axis)),
         wavelengths=wavelengths,
         wavelength_weights=torch.ones_like(wavelengths),
     )
 
 
 def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[Surface, Surface]:
-    """The plane and the height of an element, beside air; errors as `element_lens` has them.
+    """The plane and the height of an element, in air; errors as for `element_lens`.
 
     The thickness between their vertices is the substrate plus the height at the axis; even powers become those of an
     asphere, all other profiles sag terms without a height at its vertex.
@@ -102,7 +92,7 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     profile, radius = element.profile, float(element.radius.detach())
     if element.period is not None or isinstance(profile, Rings):
         kind = "rings" if element.period is None else "a wrapped height"
-        raise ValueError(f"rays do not see {kind} as light does: give whole smooth heights (pixels, Zernike, powers)")
+        raise ValueError(f"{kind} diffract, which rays do not: give whole smooth heights (pixels, Zernike, powers)")
     zero = torch.zeros_like(element.radius)
     back = Surface(thickness=zero, semi_diameter=radius)
     centre = zero
@@ -145,8 +135,8 @@ def hybrid_psf(
 ) -> Kernels:
     """PSFs (D, F, W, rows, columns) of a lens that carries phase elements in contact at its stop, by waves.
 
-    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; all
-    the lens's own by default. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel, which
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; by
+    default those of the lens. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel, which
     they follow in the derivatives too; for a sensor that does not move, give `kernels` a grid. order, derivatives and
     errors: of `kernels`.
     """
@@ -165,58 +155,41 @@ def hybrid_psf(
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
-    Differentiable in the numbers of the elements and of the lens. order: as for the wave model
-    (`psf_models.wave`);
+    Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`psf_models.wave`);
     the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
-    heights converge slowly in it, by the rays across a step. Moments are left out.
+    heights converge slowly in it, by the rays across a step. Moments are those of the light inside the window.
     Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
-    of 5 %, in which the outermost height goes on), TooCoarse where more than 400,000 rays would be needed.
+    of 5 %, in which the outermost height continues), TooCoarse where more than 400,000 rays would be needed.
     """
     elements = tuple(to(element, dtype=torch.float64) for element in elements)
-    _check_media(scene)
-    found = [
-        _field_kernels(one_field(scene, f), elements, one_field_grid(grid, f), order) for f in range(scene.shape[1])
-    ]
-    kernel = torch.cat([kernel for _, kernel in found], 1).to(grid.pitch.dtype)
-    return Kernels(kernel, grid, None, None, max(rays for rays, _ in found))
+    stop = scene.lens.stop
+    if any(bool(((n - 1).abs() > 1e-3).any()) for n in media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]):
+        raise ValueError(f"elements need air on both sides; the stop, surface {stop}, borders on another medium")
+    return by_field(scene, grid, lambda part, window: _field_kernels(part, elements, window, order))
 
 
-def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
-    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf_models.wave`."""
-    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
-    probe = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
-    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
-    local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float((half_spread(probe) * probe.index / probe.wavelength).max())
+def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> Kernels:
+    """Kernels (D, 1, W, rows, columns) of one field; without elements those of `psf_models.wave`."""
+    probe = probe_of(scene)
     radial = all(is_radial(element) for element in elements)
-    matrix = None
-    if radial and symmetry(scene) == "round" and is_centred(grid):
-        x, matrix = radii_of_waves(grid, cutoff, order)
-        y, corner = torch.zeros_like(x[:1]), x.detach().max()
-    else:
-        x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch.detach()), cutoff, order))
-        corner = torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
-    reach = corner + _reach_of_elements(scene, probe, elements)
-    _refuse_too_many(rings_and_arms(phase_along_radius(probe, reach), order), elements)
-    light = waves(scene, reach, order=order)
+    points = sensor_points(scene, probe, grid, order, is_round=radial and symmetry(scene) == "round")
+    reach = points.corner + _reach_of_elements(scene, probe, elements)
+    rings, arms = rings_and_arms(phase_along_radius(probe, reach), order)
+    if elements and rings * arms > _MOST_RAYS:
+        raise TooCoarse(
+            f"the elements need {rings} × {arms} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a smaller "
+            "window, or the wave camera, which takes any height but no lens"
+        )
+    light = waves(scene, reach, order=order, probe=probe)
     stop = _at_stop(scene, light.wavefront.pupil)
     if light.symmetry != "none" and not radial:
-        arms = rings_and_arms(phase_along_radius(probe, reach), order)[1]
         light, stop = _unfolded(light, stop, arms)
-    U = amplitude(_through(light, stop, elements), x, y)
-    intensity = U.real**2 + U.imag**2
-    if matrix is None:
-        return light.amplitude.shape[-1], integrate(intensity, weight, grid.pitch)
-    return light.amplitude.shape[-1], unfold(grid, intensity[..., 0, :] @ matrix.mT)
-
-
-def _through(light: Waves, stop: Tensor, elements: tuple[Element, ...]) -> Waves:
-    """The waves with the path of the elements at (2, D, F, W, P) mm of the stop."""
-    if not elements:
-        return light
-    front = light.wavefront
-    added = [path(elements, *stop[:, :, :, w], wavelength[None])[0] for w, wavelength in enumerate(front.wavelength)]
-    return dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=front.opd + torch.stack(added, 2)))
+    if elements:
+        front = light.wavefront
+        added = [path(elements, *stop[:, :, :, w], colour[None])[0] for w, colour in enumerate(front.wavelength)]
+        light = dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=front.opd + torch.stack(added, 2)))
+    kernel, centroid, covariance = points.integrated(light, probe)
+    return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1])
 
 
 def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
@@ -234,28 +207,28 @@ def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:
     front = light.wavefront
     L, M, N = front.direction
     if light.symmetry == "mirror":
-        turned = [torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in ((L, M), stop)]
+        rotated = [torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in ((L, M), stop)]
         copies = 2
     else:
         angle = (torch.arange(arms, dtype=L.dtype, device=L.device) + 0.5) * (2 * math.pi / arms)
         c, s = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
         pairs = ((a[..., None, :], b[..., None, :]) for a, b in ((L, M), stop))
-        turned = [torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs]
+        rotated = [torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs]
         copies = arms
     repeated = [torch.cat([t] * copies, -1) for t in (front.opd, N, light.amplitude / copies)]
-    front = dataclasses.replace(front, opd=repeated[0], direction=torch.cat([turned[0], repeated[1][None]]))
-    return Waves(repeated[2], front, "none"), turned[1]
+    front = dataclasses.replace(front, opd=repeated[0], direction=torch.cat([rotated[0], repeated[1][None]]))
+    return Waves(repeated[2], front, "none"), rotated[1]
 
 
 # -- sampling ----------------------------------------------------------------------------------------------------------
 
 
 def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, ...]) -> float:
-    """By how many mm on the sensor rays spread farther with the elements, and what their steps need beside.
+    """By how many mm on the sensor rays spread farther with the elements, plus a distance that stands for their steps.
 
     A slope g of path at the stop moves a ray of the lens, whose directions are (L, M) = -K s for points s of the stop,
-    by K⁻ᵀ g/n on the sensor; elements that focus make the blur smaller. `waves` samples what turns by 2πn a/λ for each
-    mm between a ray and a point, a the spread of directions: steps are counted as distances that turn as much.
+    by K⁻ᵀ g/n on the sensor; elements that focus make the blur smaller. `waves` samples 2πn a/λ of phase for each
+    mm between a ray and a point, a the spread of directions: steps are counted as distances of the same phase.
     """
     if not elements:
         return 0.0
@@ -264,29 +237,22 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
         front = wavefront_of(scene, points)
         stop = torch.where(front.usable, _at_stop(scene, points), 0.0)
         beam = torch.linalg.vector_norm(stop, dim=0).max()
-        _refuse_wide(beam, elements)
+        for element in elements:
+            if beam > _WIDER * element.radius:
+                raise ValueError(
+                    f"the beam at the stop has a radius of {float(beam):.4g} mm, the element of "
+                    f"{float(element.radius):.4g} mm: make the element larger, or the aperture of the lens smaller"
+                )
         shift, wave = _shift(front, stop, _slopes(elements, stop, front.wavelength)), 1e-3 * probe.wavelength
         spread = torch.where(front.usable, torch.linalg.vector_norm(front.landing + shift, dim=0), 0.0).amax(-1)
         alone = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
-        steps = torch.zeros_like(wave)
-        for element in elements:
-            steps = steps + _phase_of_steps(element, beam, probe.wavelength)
-            steps = steps + _phase_of_turns(element, beam, probe.wavelength)
+        steps = sum(phase(e, beam, probe.wavelength) for e in elements for phase in (_phase_of_steps, _phase_of_turns))
         steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / wave)
         return float((spread + steps - alone).max())
 
 
-def _refuse_wide(beam: Tensor, elements: tuple[Element, ...]) -> None:
-    for element in elements:
-        if beam > _WIDER * element.radius:
-            raise ValueError(
-                f"the beam at the stop has a radius of {float(beam):.4g} mm, the element of "
-                f"{float(element.radius):.4g} mm: make the element larger, or the aperture of the lens smaller"
-            )
-
-
 def _slopes(elements: tuple[Element, ...], stop: Tensor, wavelengths: Tensor) -> Tensor:
-    """Gradient (2, D, F, W, P) of the path, no unit, at points of the stop; of what is smooth in the elements."""
+    """Gradient (2, D, F, W, P) of the path, no unit, of the smooth elements at points of the stop."""
     total = torch.zeros_like(stop)
     for element in elements:
         if not is_flat(element):
@@ -305,7 +271,7 @@ def _shift(front: Wavefront, stop: Tensor, slopes: Tensor) -> Tensor:
 
 
 def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) in radians along a radius that the steps of flat pixels, rings and wrapped heights count for."""
+    """Phase (W,) in radians along a radius that represents the steps of flat pixels, rings and wrapped heights."""
     profile, none = element.profile, torch.zeros_like(wavelengths)
     excess = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths
     if is_flat(element):
@@ -320,7 +286,7 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
 
 
 def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) that lets the margin of `rings_and_arms` hold round the pupil for polynomials of m turns, not one."""
+    """Phase (W,) that extends the margin of `rings_and_arms` to polynomials of more than one period round the pupil."""
     coefficients, none = getattr(element.profile, "coefficients", None), torch.zeros_like(wavelengths)
     if not isinstance(element.profile, Zernike) or not bool((coefficients != 0).any()):
         return none
@@ -330,24 +296,9 @@ def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
     return max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
 
 
-def _refuse_too_many(rule: tuple[int, int], elements: tuple[Element, ...]) -> None:
-    if elements and rule[0] * rule[1] > _MOST_RAYS:
-        raise TooCoarse(
-            f"the elements need {rule[0]} × {rule[1]} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a "
-            "smaller window, or the wave camera, which takes any height but no lens"
-        )
-
-
 def _disc(radius: Tensor) -> Tensor:
     """Points (2, P) mm all over a disc, its centre and its rim among them."""
     points, _ = gauss_rings(*_FINE, dtype=radius.dtype, device=radius.device)
     rim = points[:, -_FINE[1] :]
     rim = rim / torch.linalg.vector_norm(rim, dim=0)
     return radius.detach() * torch.cat([torch.zeros_like(points[:, :1]), points, rim], 1)
-
-
-def _check_media(scene: Scene) -> None:
-    stop = scene.lens.stop
-    indices = media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]
-    if any(bool(((n - 1).abs() > 1e-3).any()) for n in indices):
-        raise ValueError(f"elements count their path beside air; the stop, surface {stop}, borders on another medium")

@@ -1,8 +1,8 @@
 """Mixed scenes: round elements with steps in contact with smooth ones that are not round, such as a kinoform under a
 cubic plate.
 
-Steps cannot be sampled on a grid but by brute force: cells that they cut scatter light. What the window sees of the
-round part is its own field within some radius P of the axis, exact along one radius (`propagation.radial_field`):
+Cells that steps cut scatter light, so that a grid samples steps poorly. Of the round part the window sees its field
+within some radius P of the axis, exact along one radius (`propagation.radial_field`):
 
     U_r(ρ) = ∫ F_r J₀,      F(t) = 2π/λ² ∫_0^∞ U_r(ρ) τ(ρ) J₀(2π t ρ/λ) ρ dρ
 
@@ -31,7 +31,7 @@ _TAIL = 1.1  # erfc's transform has fallen to 1e-5 at 1.1 λ over the width of t
 
 @value
 class MixedSums:
-    """What the heights do not change.
+    """Sums that do not depend on the heights.
 
     r: (J,) mm, radii of the round part; sphere: (D, J) mm; forward: (W, n, J) from its phasors to U at n radii of the
     sensor; back: (W, T, n) from there to F at T even steps of t; place: (N, N) of the cells in that table; x, y: (N, N)
@@ -59,7 +59,7 @@ def is_mixed(scene: WaveScene) -> bool:
 
 
 def round_part(scene: WaveScene) -> WaveScene:
-    """The scene with its round elements alone, in its own aperture."""
+    """The scene with its round elements alone, in the aperture of the scene."""
     parts = (dataclasses.replace(one, radius=aperture(scene)) for one in scene.elements if is_radial(one))
     return dataclasses.replace(scene, elements=tuple(parts))
 
@@ -70,7 +70,7 @@ def _free_part(scene: WaveScene) -> tuple[Element, ...]:
 
 @torch.no_grad()
 def deflection(scene: WaveScene, extent: float) -> float:
-    """How far (mm) the free part takes light aside on the sensor at most, from within `extent` apertures."""
+    """Largest shift (mm) on the sensor of light by the free part, from within `extent` apertures."""
     R, z = aperture(scene), scene.sensor_distance
     line = torch.linspace(-1, 1, 401, dtype=R.dtype, device=R.device) * R * extent
     W = path(_free_part(scene), line.expand(401, -1), line[:, None].expand(-1, 401), scene.wavelengths)
@@ -80,7 +80,7 @@ def deflection(scene: WaveScene, extent: float) -> float:
 
 
 def extent_of(scene: WaveScene, band: tuple[float, float]) -> float:
-    """Of the smoothed round part over the aperture: how far its rim is washed out."""
+    """Extent of the smoothed round part over the aperture, whose rim is washed out."""
     width = (band[1] - band[0]) / (2 * _STEEP)
     edge, _ = slope(scene, aperture(scene).detach())
     return 1 + _TAIL * float(millimetres(scene).detach().max() / width / edge)
@@ -121,8 +121,7 @@ def intensity(scene: WaveScene, sums: MixedSums) -> Tensor:
     rays = torch.view_as_real(phasors(round_part(scene), sums.r, sums.sphere))  # (D, W, J, 2)
     tables = torch.view_as_complex((sums.back @ (sums.forward @ rays)).contiguous())
     free = phasor(path(_free_part(scene), sums.x, sums.y, scene.wavelengths) / wavelength[..., None])
-    found = [light_of(scene, sums, _between(table, sums.place) * free) for table in tables]
-    return torch.stack(found)
+    return torch.stack([light_of(scene, sums, _between(table, sums.place) * free) for table in tables])
 
 
 def _between(table: Tensor, place: Tensor) -> Tensor:

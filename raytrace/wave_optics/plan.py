@@ -1,24 +1,17 @@
-"""Plan: which engine computes the PSFs of a scene, how finely, at what cost, and how wrong it will be.
+"""Plan: which engine computes the PSFs of a scene, how finely, at what cost, and with which error.
 
     pupil      N cells across D repeat the image every P = λzN/D: P >= reach of the window + half the blur
     radial     Gauss radii between steps by the phase between them
     fresnel    dx <= λz/(D + blur) samples the converging field; |f| < L/(2λz) keeps light from wrapping round
     pixels     Gauss nodes by the cutoff D/(λz) of the intensity
 
-Errors are relative L2 norms (`sampling`). A PSF wider than its window leaves light out, which is no error here.
+Errors are relative L2 norms, fitted to converged references of two dozen scenes: half to five times the measured error
+where that is above 1e-4. A PSF wider than its window leaves light out, which is no error here. Stray light, spread
+evenly with a density ε per mm², errs by √(2 ε A), A the area of the light.
 
-Spread: where the light of a scene goes by rays: how wide it lands, how it gathers, and how much steps scatter.
-
-A plan needs to know before anything is computed how much light lies where copies of the image, edges and steps would
-put it. Rays are bent by the local slope of the residual path, W(x + s) - W(x) over s, modulo a wave: over flat features
-s is their pitch, so that a staircase bends as the slope it follows.
-
-Sampling: the numbers of a wave scene that decide how finely it is to be sampled, and the error that each sampling
-leaves.
-
-Errors are relative L2 norms, fitted to converged references of two dozen scenes: half to five times what is measured
-where that is above 1e-4. Stray light, spread evenly with a density ε per mm², errs by √(2 ε A), A the area of the light
-(`spread`).
+`spread` finds by rays where light lands, before anything is computed. Rays are refracted by the local slope of the
+residual path, W(x + s) - W(x) over s, modulo a wave: over flat features s is their pitch, so that a staircase refracts
+as the slope it follows.
 """
 
 import math
@@ -59,9 +52,9 @@ _AIRY = 2.4  # λz/D: √(1/∫I²) of a kernel in focus, behind pixels as large
 
 @value
 class Spread:
-    """Of every kernel: width (D, W) mm, √2 times the RMS distance from the axis, the radius of an even disc; area
-    (D, W) mm², ∫I/∫I² inside the window; and of every wavelength: steps (W,) 1/mm, Σ |jump of the field|² · length of
-    the edge, over the area of the aperture.
+    """Distribution of light on the sensor: width (D, W) mm, √2 times the RMS distance from the axis, the radius of an
+    even disc; area (D, W) mm², ∫I/∫I² inside the window; steps (W,) 1/mm, Σ |jump of the field|² · length of the edge
+    over the area of the aperture.
     """
 
     width: Tensor
@@ -74,42 +67,49 @@ def spread(scene: WaveScene) -> Spread:
     """The spread of a scene, by 4096 rays a kernel.
 
     Free features keep the share |⟨exp(iφ)⟩|² of the light where it would go without them, and scatter the rest; wrapped
-    heights bend as their first order.
+    heights refract as their first order.
     """
     scene = to(scene, dtype=torch.float64)
     free = [e for e in scene.elements if is_free(e)]
-    kept = _coherent(scene, free)[None]
+    whole = [e for e in scene.elements if not is_free(e)]
+    phase = 2 * math.pi * _waves(scene, free, *_points(aperture(scene)))
+    coherent = torch.cos(phase).mean(-1) ** 2 + torch.sin(phase).mean(-1) ** 2 if free else phase[:, 0]
+    kept = coherent[None]
     width = squares = light = kept.new_zeros(len(scene.depths), len(scene.wavelengths))
-    parts = [(kept, [e for e in scene.elements if not is_free(e)]), (1 - kept, scene.elements)]
-    for share, elements in parts if free else parts[1:]:
+    for share, elements in [(kept, whole)] * bool(free) + [(1 - kept, scene.elements)]:
         x, y = _landings(scene, elements)
         inside, gathered = _gathered(scene, x, y)
         width = width + share * 2 * (x * x + y * y).mean(-1)
         light, squares = light + share * inside, squares + share**2 * gathered
     # Where no two rays meet the light is thin: an even disc.
     area = torch.where(squares > 0, light / squares.clamp(min=1e-300), math.pi * width)
-    return Spread(torch.sqrt(width), area, _steps(scene))
+    steps = torch.zeros_like(scene.wavelengths)
+    for element in scene.elements:
+        steps = steps + _edges(element, scene, excess_index(element, scene.wavelengths, steps) / millimetres(scene))
+    return Spread(torch.sqrt(width), area, steps)
 
 
 def is_free(element: Element) -> bool:
-    """Whether heights are those of features, not wrapped: whatever they are."""
+    """Whether the heights are those of features and not wrapped."""
     return is_flat(element) and element.period is None
 
 
 def blur(scene: WaveScene) -> Tensor:
-    """Geometric radius (D, W) mm of the light on the sensor, of the smooth profiles; steps spread light beside it."""
+    """Geometric radius (D, W) mm of the light of the smooth profiles on the sensor, without the light that steps
+    spread.
+    """
     R = aperture(scene).detach()
     points, _ = gauss_rings(24, dtype=R.dtype, device=R.device)
     edge = torch.linspace(0, 2 * math.pi, 97, dtype=R.dtype, device=R.device)
     x, y = R * torch.cat([points, torch.stack([torch.cos(edge), torch.sin(edge)])], 1)
-    bent = torch.stack([torch.linalg.vector_norm(slopes(scene, x, y, order), dim=0) for order in (False, True)])
-    return bent.amax((0, -1)) * scene.sensor_distance.detach()
+    angles = torch.stack([torch.linalg.vector_norm(slopes(scene, x, y, order), dim=0) for order in (False, True)])
+    return angles.amax((0, -1)) * scene.sensor_distance.detach()
 
 
 def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> Tensor:
     """Gradient (2, D, W, P) of the residual path at points (P,), of heights before they are wrapped or stepped.
 
-    diffracted: a wrapped height bends as its first order, λ/period times its gradient.
+    diffracted: a wrapped height refracts as its first order, λ/period times its gradient.
     """
     wavelength = millimetres(scene).detach()
     r2, z = x * x + y * y, scene.sensor_distance.detach()
@@ -130,7 +130,7 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
 def blur_of_pixels(scene: WaveScene) -> Tensor:
     """Radius (D, W) mm of a disc as wide, in the mean square, as the light behind a map of pixels.
 
-    Where the bare sphere is too steep for the steps between pixels to tell, the light is as wide as without them.
+    Where the bare sphere is too steep to be resolved by steps between pixels, the light is as wide as without them.
     """
     profile, R = scene.elements[0].profile, aperture(scene).detach()
     pitch = profile.pitch.detach()
@@ -148,13 +148,6 @@ def blur_of_pixels(scene: WaveScene) -> Tensor:
     return torch.where(bare > 0.5 * widest, bare, torch.sqrt(2 * total) * widest)
 
 
-def _coherent(scene: WaveScene, elements: Sequence[Element]) -> Tensor:
-    """|⟨exp(iφ)⟩|² (W,) of elements over the aperture; 0 of none."""
-    waves = _waves(scene, elements, *_points(aperture(scene)))
-    phase = 2 * math.pi * waves
-    return torch.cos(phase).mean(-1) ** 2 + torch.sin(phase).mean(-1) ** 2 if len(elements) else waves[:, 0]
-
-
 def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) -> Tensor:
     """Path (W, P) in waves of elements; a wrapped height counts whole, in periods: the first order."""
     total = x.new_zeros(len(scene.wavelengths), len(x))
@@ -167,7 +160,7 @@ def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) 
 
 
 def _points(radius: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y (M,) mm all over a disc, drawn: of points in any order pairs would come closer, or less close, than rays."""
+    """x, y (M,) mm, random over a disc: an ordered rule would bias the distances of pairs."""
     draw = torch.Generator().manual_seed(0)
     place, turn = torch.rand(2, _RAYS, generator=draw, dtype=torch.float64).to(radius)
     r, angle = radius * torch.sqrt(place), 2 * math.pi * turn
@@ -175,9 +168,8 @@ def _points(radius: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _landings(scene: WaveScene, elements: Sequence[Element]) -> tuple[Tensor, Tensor]:
-    """x, y (D, W, M) mm on the sensor of rays through some of the elements.
-
-    Steps of rings are crossed along the radius, where one pitch holds one of them.
+    """x, y (D, W, M) mm on the sensor of rays through some of the elements; steps of rings are crossed along the
+    radius.
     """
     R, wavelength = aperture(scene), millimetres(scene)[:, None]
     x, y = _points(R)
@@ -191,12 +183,12 @@ def _landings(scene: WaveScene, elements: Sequence[Element]) -> tuple[Tensor, Te
         u, v = x + share * step * a, y + share * step * b
         return spheres(scene, u * u + v * v)[:, None] / wavelength + _waves(scene, elements, u, v)
 
-    def bent(a: Tensor, b: Tensor) -> Tensor:
+    def deflection_along(a: Tensor, b: Tensor) -> Tensor:
         apart = waves(0.5, a, b) - waves(-0.5, a, b)
         return (apart - apart.round()) * wavelength * scene.sensor_distance / step
 
     (a, b), (c, d) = along, (-along[1], along[0])
-    u, v = bent(a, b), bent(c, d)
+    u, v = deflection_along(a, b), deflection_along(c, d)
     return u * a + v * c, u * b + v * d
 
 
@@ -220,17 +212,10 @@ def _gathered(scene: WaveScene, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return light, squares
 
 
-def _steps(scene: WaveScene) -> Tensor:
-    """Σ |jump|² · length of all edges where heights jump, (W,) 1/mm, over the area of the aperture."""
-    total = torch.zeros_like(scene.wavelengths)
-    for element in scene.elements:
-        waves = excess_index(element, scene.wavelengths, total) / millimetres(scene)
-        total = total + _edges(element, scene, waves)
-    return total
-
-
 def _edges(element: Element, scene: WaveScene, waves: Tensor) -> Tensor:
-    """The same of one element; waves: (W,) of path in 1 mm of height."""
+    """Σ |jump|² · length of the edges of an element, (W,) 1/mm, over the area of the aperture; waves: (W,) of path in 1
+    mm of height.
+    """
     R, profile = aperture(scene), element.profile
 
     def squares(jumps: Tensor) -> Tensor:
@@ -269,11 +254,11 @@ class Setting:
     width: float  # radius of an even disc as wide as the light
     core: float  # of one as large in area, beyond a core in focus
     sharpest: float  # the least of it over kernels
-    scatter: float  # √(2 A S/12)/(λz), mm^-1.5: what steps S/mm scatter
+    scatter: float  # √(2 A S/12)/(λz), mm^-1.5: light scattered by steps S/mm
     features: tuple[float, ...]  # pitches of rings and pixels, mm
     speckle: bool  # whether there are features that no period wraps
     lattice: bool  # cells can share the edges of all steps: those of one map of pixels
-    edge: float  # √(2 A λz (1 + S R/2)/(2π³ R)), mm^1.5: what edges and steps send far away
+    edge: float  # √(2 A λz (1 + S R/2)/(2π³ R)), mm^1.5: light sent far away by edges and steps
 
     @property
     def airy(self) -> float:
@@ -329,14 +314,14 @@ def edge_error(s: Setting, samples: int, width: float | None = None) -> float:
 
 
 def step_error(s: Setting, samples: float) -> float:
-    """Of N cells over a profile with steps; where cells lie in flat pixels, the smooth rest bends across them."""
-    bent = 0.25 * ((s.blur + 0.5 * s.reach) / s.period(samples)) ** 2
-    return min(1.0, _area_error(s, samples) + (bent if s.lattice else _scattered(s, samples)))
+    """Of N cells over a profile with steps; where cells lie in flat pixels, the smooth rest varies across them."""
+    curved = 0.25 * ((s.blur + 0.5 * s.reach) / s.period(samples)) ** 2
+    return min(1.0, _area_error(s, samples) + (curved if s.lattice else _scattered(s, samples)))
 
 
 def _scattered(s: Setting, samples: float) -> float:
     """A cell cut by an edge into f and 1 - f holds the field of one side: in the mean over a cell |jump|²/12 of light,
-    scattered evenly over a period. What repeats with the cells adds up: up to four times as much.
+    scattered evenly over a period. Steps that repeat with the cells add up: up to four times as much.
     """
     shares = [pitch * samples / s.diameter for pitch in s.features]
     whole = [min(abs(n - round(n)) / n for n in (share, 1 / share) if n > 0.5) < 0.01 for share in shares]
@@ -349,7 +334,7 @@ def transfer_error(s: Setting, samples: int, pad: float, band_limit: bool) -> fl
     """Of the sampled field, its interpolation beyond 3/4 of the band, and the light that wraps round or is cut off.
 
     Edges and steps send light to a distance ρ with a density ∝ 1/ρ³: without a limit six neighbouring copies bring it
-    back, with one its sharp end rings, by the gap that is left to the window.
+    back, with one its sharp end rings, by the gap to the window.
     """
     width, aside = pad * s.diameter, 0.5 * s.diameter + s.reach
     error = _area_error(s, samples) + _scattered(s, samples)
@@ -367,7 +352,7 @@ def node_error(s: Setting, nodes: int) -> float:
 
 
 def radius_error(half: float, samples: int) -> float:
-    """Of n Gauss radii between steps that the phase turns by 2·half."""
+    """Of n Gauss radii between steps with a phase of 2·half."""
     if half < 20:
         return min(1.0, bessel(half, samples))
     enough = rings_and_arms(2 * half, 0)[0]
@@ -387,7 +372,9 @@ def _area_error(s: Setting, samples: float) -> float:
 
 
 def cut_error(s: Setting, samples: int, bare: float) -> float:
-    """Of cells of flat pixels cut by the rim: across them turns the bare sphere, with a blur of `bare` mm."""
+    """Of cells of flat pixels cut by the rim, across which the phase of the bare sphere varies, with a blur of `bare`
+    mm.
+    """
     return min(1.0, 0.8 * (s.core + 0.1 * s.airy) * bare / s.period(samples) ** 2 + _tail(s, samples))
 
 
@@ -402,16 +389,17 @@ def gauss_count(a: float, tol: float) -> int:
 
 
 def half_phases(scene: WaveScene, s: Setting) -> tuple[float, float]:
-    """Largest half of the phase, radians, that the integrand of the radial engine turns between two steps: a bound,
-    the slope at the farther one times their distance, and what it turns."""
+    """Two estimates of the largest half of the phase, radians, of the integrand of the radial engine between two steps:
+    a bound, the slope at the farther one times their distance, and the accumulated phase.
+    """
     edges = propagation.edges(scene).detach()
     r = torch.linspace(0, 1, 513, dtype=edges.dtype, device=edges.device) * edges[-1]
-    bent = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
-    turned = torch.cumsum(bent, 0) * (edges[-1] / 512)
+    angle = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
+    phase = torch.cumsum(angle, 0) * (edges[-1] / 512)
     place = edges / edges[-1] * 512
     low = place.long().clamp(max=511)
-    across = torch.lerp(turned[low], turned[low + 1], place - low).diff()
-    bound = across if len(edges) == 2 else edges.diff() * bent[place[1:].long()]
+    across = torch.lerp(phase[low], phase[low + 1], place - low).diff()
+    bound = across if len(edges) == 2 else edges.diff() * angle[place[1:].long()]
     return tuple(float(math.pi / s.shortest * half.max()) for half in (bound, across))
 
 
@@ -430,13 +418,12 @@ class AliasedSampling(ValueError):
 class Plan:
     """How to compute the PSFs of a scene.
 
-    engine: one of ENGINES; samples: cells or samples across the aperture (`radial`: Gauss radii between steps);
-    nodes: per pixel and axis (`radial`: of its rule); cells: "smooth", "sampled", "flat" or "mixed"
-    (`wave_optics.mixed`):
-    what stands in a cell of the pupil; extent: of the cells over the diameter; inner: Gauss nodes in a flat cell, or
-    radii between steps; parts: cells along a flat pixel; pad, band_limit: of the transfer functions; band: mm on the
-    sensor over which the round part fades out (mixed). error: predicted, relative L2 of the worst kernel; flops, memory
-    (bytes): predicted.
+    engine: a name of ENGINES; samples: cells or samples across the aperture (`radial`: Gauss radii between steps);
+    nodes: per pixel and axis (`radial`: of its rule); cells: of the pupil, "smooth", "sampled", "flat" or "mixed"
+    (`wave_optics.mixed`); extent: of the cells over the diameter; inner: Gauss nodes in a flat cell, or radii between
+    steps; parts: cells along a flat pixel; pad, band_limit: of the transfer functions; band: mm on the sensor over
+    which the round part fades out (mixed). error: predicted, relative L2 of the worst kernel; flops, memory (bytes):
+    predicted.
     """
 
     engine: str
@@ -464,14 +451,14 @@ def plan(
     pad: float = 2.0,
     band_limit: bool = True,
 ) -> Plan:
-    """The cheapest sampling whose predicted error is at most tol (relative L2), or what a given one will do.
+    """The cheapest sampling whose predicted error is at most tol (relative L2), or the error of a given sampling.
 
-    engine: one of ENGINES, or "auto": `radial` for round elements and a window on the axis, else `pupil`. samples,
+    engine: a name of ENGINES, or "auto": `radial` for round elements and a window on the axis, else `pupil`. samples,
     nodes: to be used as they are (`Plan`). pad, band_limit: of the transfer functions; pad 1.5 without a band limit is
     that of Sitzmann et al. (2018).
     Raises AliasedSampling where copies of the image would lie in the window, ValueError where an engine cannot hold
     the scene; warns `psf_models.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the
-    finest sampling there is does not meet tol.
+    finest sampling does not meet tol.
     """
     check(scene)
     round_scene = is_round(scene) and is_centred(scene.grid)
@@ -481,22 +468,23 @@ def plan(
         raise ValueError(f"no engine {engine!r}; choose among auto, {', '.join(ENGINES)}")
     if engine == "radial" and not round_scene:
         raise ValueError("the radial engine needs round elements and a grid centred on the axis; use engine='pupil'")
-    setting = setting_of(scene)
-    found = ENGINES[engine].plan(
+    row, setting = ENGINES[engine], setting_of(scene)
+    sampling = row.plan(
         scene, setting, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
     )
-    if not ENGINES[engine].is_reference and samples is None and nodes is None and found.error > tol:
-        message = f"predicted error {found.error:.2g} above the tolerance {tol:.2g} with {found.samples} samples"
+    # An engine that samples the converging field itself is a reference: not held to a tolerance.
+    if row.prepare is not None and samples is None and nodes is None and sampling.error > tol:
+        message = f"predicted error {sampling.error:.2g} above the tolerance {tol:.2g} with {sampling.samples} samples"
         message += f"; the worst light lies within ±{setting.width:.3g} mm"
         warnings.warn(message, NotConverged, stacklevel=calling_level())
-    return found
+    return sampling
 
 
 # -- the engines -------------------------------------------------------------------------------------------------------
 
 
 def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
-    nodes = nodes or _nodes(s, tol)
+    nodes = nodes or gauss_count(s.band, 0.4 * tol / 0.15)
     if samples is None and is_mixed(scene):
         return _mixed(scene, s, nodes, tol)
     least = s.diameter * (s.reach + s.blur) / (s.shortest * s.distance)
@@ -536,8 +524,9 @@ def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | No
 
 
 def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
-    """Smooth cells behind a round part that is known within a band: what the free part takes into the window's corner,
-    and 25 Airy radii beyond, where light diffracted at the rim has faded."""
+    """Smooth cells behind a round part that is known within a band: the reach of the free part into the window's
+    corner, and 25 Airy radii beyond, where light diffracted at the rim has faded.
+    """
     longest = float(millimetres(scene).detach().max())
     aside, beyond = deflection(scene, 1.0), 25 * longest * s.distance / s.diameter
     near = math.sqrt(2) * s.reach + aside + beyond
@@ -545,9 +534,9 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
     extent = extent_of(scene, band)
     period = band[1] + deflection(scene, extent) + beyond + s.reach
     samples = _even(extent * s.diameter * period / (s.shortest * s.distance))
-    half, turned = half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
+    half, phase = half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
     inner = gauss_count(half, 0.1 * tol)
-    error = node_error(s, nodes) + radius_error(turned, inner) + 3e-4
+    error = node_error(s, nodes) + radius_error(phase, inner) + 3e-4
     D, W = s.kernels
     K, J, n = s.size * nodes, inner * (len(propagation.edges(round_part(scene))) - 1), radii_of_band(scene, band)
     T = 20 * n
@@ -557,13 +546,13 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
 
 
 def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
-    half, turned = half_phases(scene, s)
+    half, phase = half_phases(scene, s)
     if samples is None:
         samples = gauss_count(half, 0.1 * tol) if half < 20 else rings_and_arms(2 * half, 0 if tol > 1e-6 else 1)[0]
     # Nodes of the rule of pixels from order -2 on (`radii_of_waves`).
     base = math.ceil(0.5 * s.band) + 4
     nodes = max(base - 2, gauss_count(s.band, 0.5 * tol / 0.15)) if nodes is None else max(nodes, base - 2)
-    error = node_error(s, nodes) + radius_error(turned, samples)
+    error = node_error(s, nodes) + radius_error(phase, samples)
     D, W = s.kernels
     J = samples * (len(propagation.edges(scene)) - 1)
     K = math.ceil(s.band * reach(scene.grid) + 1.5 * (4 + (2 * s.band * reach(scene.grid)) ** (1 / 3)))
@@ -572,7 +561,7 @@ def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | N
 
 
 def _transfer(scene: WaveScene, s: Setting, *, engine, samples, nodes, tol, pad, band_limit) -> Plan:
-    nodes = nodes or _nodes(s, tol)
+    nodes = nodes or gauss_count(s.band, 0.4 * tol / 0.15)
     least, slope = s.diameter * (s.diameter + 2 * s.blur) / (s.shortest * s.distance), 0.5 * s.diameter / s.distance
     if samples is None:
         samples = _even(1.3 * least)
@@ -613,12 +602,7 @@ def _even(number: float) -> int:
     return max(16, 2 * math.ceil(0.5 * number))
 
 
-def _nodes(s: Setting, tol: float) -> int:
-    """Per pixel and axis."""
-    return gauss_count(s.band, 0.4 * tol / 0.15)
-
-
-# -- what carries them out ---------------------------------------------------------------------------------------------
+# -- the kernels -------------------------------------------------------------------------------------------------------
 
 
 def _pupil_sums(scene: WaveScene, plan: Plan) -> pupil.PupilSums | mixed.MixedSums:
@@ -634,45 +618,34 @@ def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
     return integrate(light, sums.pixel, scene.grid.pitch)
 
 
-def _radial_sums(scene: WaveScene, plan: Plan) -> propagation.RadialSums:
-    return propagation.prepare_radial(scene, plan.samples, propagation.order_of(scene, plan.nodes))
-
-
-def _sent(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
-    how = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
-    light, weight = propagation.transfer_function_intensity(scene, samples=plan.samples, nodes=plan.nodes, **how)
+def _transfer_kernels(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
+    options = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
+    light, weight = propagation.transfer_function_intensity(scene, samples=plan.samples, nodes=plan.nodes, **options)
     return integrate(light, weight, scene.grid.pitch)
 
 
 class Engine(NamedTuple):
     """A way from the elements to the pixels.
 
-    assumes: of the scene; errs: by what; plan: (scene, its numbers, what is asked for) -> Plan, with cost and error;
-    kernels: (scene, sums, plan) -> light in the pixels (D, W, rows, columns); prepare: (scene, plan) -> sums, what the
-    heights do not change, if there is anything.
+    plan: (scene, its numbers, the request) -> Plan, with cost and error; kernels: (scene, sums, plan) -> light in the
+    pixels (D, W, rows, columns); prepare: (scene, plan) -> sums that the heights do not change, if any.
     """
 
-    assumes: str
-    errs: str
     plan: Callable[..., Plan]
     kernels: Callable[[WaveScene, Any, Plan], Tensor]
     prepare: Callable[[WaveScene, Plan], Any] | None = None
 
-    @property
-    def is_reference(self) -> bool:
-        """Whether it samples the converging field itself: never chosen, and not held to a tolerance."""
-        return self.prepare is None
-
 
 ENGINES = {
-    "pupil": Engine("nothing", "copies of the image; cells at rim and steps", _pupil, _pupil_kernels, _pupil_sums),
+    # Any scene; copies of the image, cells at rim and steps.
+    "pupil": Engine(_pupil, _pupil_kernels, _pupil_sums),
+    # Round elements, a window on the axis; phase between two radii.
     "radial": Engine(
-        "round elements, a window on the axis",
-        "phase between two radii",
         _radial,
         lambda scene, sums, plan: propagation.radial_kernels(scene, sums),
-        _radial_sums,
+        lambda scene, plan: propagation.prepare_radial(scene, plan.samples, propagation.order_of(scene, plan.nodes)),
     ),
-    "fresnel": Engine("paraboloids", "light that wraps round, or the band limit cuts off", _transfer, _sent),
-    "angular_spectrum": Engine("true spheres", "the same, and paraboloids elsewhere", _transfer, _sent),
+    # Paraboloids, true spheres; light that wraps round, or that the band limit cuts off.
+    "fresnel": Engine(_transfer, _transfer_kernels),
+    "angular_spectrum": Engine(_transfer, _transfer_kernels),
 }

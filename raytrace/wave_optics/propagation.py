@@ -46,16 +46,12 @@ def transfer_function_intensity(
     """
     pitch = 2 * aperture(scene) / samples
     u, v, weight = sub_pixels(scene.grid, nodes)
-    rows = []
-    for k in range(len(scene.wavelengths)):
-        field = behind(scene, k, samples)
-        wavelength = millimetres(scene)[k]
-        size = padded(samples, pad)
-        field = propagate(
-            field, pitch, scene.sensor_distance, wavelength, size=size, band_limit=band_limit, spectrum=spectrum
-        )
-        rows.append(at_nodes(field, pitch, u, v))
-    U = torch.stack(rows, 1)
+    options = {"size": padded(samples, pad), "band_limit": band_limit, "spectrum": spectrum}
+    fields = []
+    for k, wavelength in enumerate(millimetres(scene)):
+        field = propagate(behind(scene, k, samples), pitch, scene.sensor_distance, wavelength, **options)
+        fields.append(at_nodes(field, pitch, u, v))
+    U = torch.stack(fields, 1)
     return U.real**2 + U.imag**2, weight
 
 
@@ -119,8 +115,8 @@ def transfer(
         limit = width / (2 * wavelength * distance)
     if not band_limit:
         return H
-    kept = (f.abs() <= limit).to(f.dtype).detach()
-    return H * (kept * kept[:, None])
+    passed = (f.abs() <= limit).to(f.dtype).detach()
+    return H * (passed * passed[:, None])
 
 
 def at_nodes(field: Tensor, pitch: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -155,10 +151,10 @@ _PROBES = 20_000  # radii where the jumps of a wrapped height are looked for
 
 @value
 class RadialSums:
-    """What the heights do not change.
+    """Sums that do not depend on the heights.
 
     r: (J,) mm, radii of the element; sphere: (D, J) mm; bessel: (W, K, J), from amplitudes at r to fields at the K
-    radii of the sensor, with the weights of the integral; to_pixels: (U, K) mm² to the pixels that differ.
+    radii of the sensor, with the weights of the integral; to_pixels: (U, K) mm² to the distinct pixels.
     """
 
     r: Tensor
@@ -241,11 +237,11 @@ def edges(scene: WaveScene) -> Tensor:
             inner.append(steps)
         elif element.period is not None:
             inner.append(_jumps(element, R.detach()))
-    # Two steps of different elements at one radius, to rounding, are one.
-    found = torch.cat(inner).sort().values
-    share = found.detach() / R.detach()
+    # Steps of different elements at the same radius, to rounding, count once.
+    radii = torch.cat(inner).sort().values
+    share = radii.detach() / R.detach()
     apart = (torch.cat([share.new_zeros(1), share]).diff() > 1e-9) & (share < 1 - 1e-9)
-    return torch.cat([R.new_zeros(1), found[apart], R.reshape(1)])
+    return torch.cat([R.new_zeros(1), radii[apart], R.reshape(1)])
 
 
 def _jumps(element: Element, radius: Tensor) -> Tensor:

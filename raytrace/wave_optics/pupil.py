@@ -1,12 +1,12 @@
-"""Pupil engine: the field at the sensor as one matrix Fourier transform of what the element leaves of the sphere.
+"""Pupil engine: the field at the sensor as one matrix Fourier transform of the residual path behind the element.
 
     U(u) = 1/(λz) Σ_cells A exp(ik W_residual) exp(-ik x·u/z) dA
 
 The sphere that converges to the sensor and its chirp cancel, so that only the residual path is sampled, and the sum is
-taken right at the points of the pixels: no padding, any window (Soummer et al., Opt. Express 15, 15935 (2007)). With
-true spheres x/z becomes the direction sine t = x/√(r² + z²), on which the grid then stands (Debye's integral).
-Flat pixels are integrated over exactly: their plane and the paraboloid, which separates in x and y, are summed at Gauss
-nodes inside each of them, whatever the light's angle.
+taken at the points of the pixels: no padding, any window (Soummer et al., Opt. Express 15, 15935 (2007)). With true
+spheres x/z becomes the direction sine t = x/√(r² + z²), on which the grid is then regular (Debye's integral).
+Flat pixels are integrated exactly: their plane and the paraboloid, which separates in x and y, are summed at Gauss
+nodes inside each of them, whatever the angle of the light.
 """
 
 import functools
@@ -28,7 +28,7 @@ _MARGIN = 3  # cells beyond the aperture: half the points of the interpolation a
 
 @value
 class PupilSums:
-    """What the heights do not change: the matrices of the transform and the cells of the aperture.
+    """Sums that do not depend on the heights: the matrices of the transform and the cells of the aperture.
 
     x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell; sphere: (D, N, N) mm or None where
     the matrices hold it; along_x: (W, X, N) or (D, W, X, N), along_y likewise, or if `folded` cosine and sine of one
@@ -49,7 +49,7 @@ def prepare(scene: WaveScene, samples: int, nodes: int, *, extent: float = 1.0) 
     """Constants of samples × samples cells over `extent` times the diameter, nodes per sensor pixel and axis.
 
     Cells that the edge of the aperture cuts count by their area inside, which is exact for flat ones; smooth elements
-    have weights of higher order, for which the grid goes on by three cells on either side.
+    have weights of higher order, for which the grid is wider by three cells on either side.
     """
     R, z, wavelength = aperture(scene), scene.sensor_distance, millimetres(scene)
     if all(is_smooth(element) for element in scene.elements):

@@ -4,7 +4,7 @@
 
 W is the path of the elements, z' the depth of the source, z the sensor distance and S the path to a point beyond that
 of the axis. Every phase is a sum of such path differences, never k times a distance: at 10 m a float32 phase k·r steps
-by 8 rad. The light of the source is as bright all over the aperture.
+by 8 rad. The light of the source is uniform over the aperture.
 """
 
 import torch
@@ -18,7 +18,7 @@ from raytrace.wave_optics.element import Element, is_radial, path
 
 @value
 class WaveScene:
-    """What a wave camera looks through and from where.
+    """The elements, sources and sensor of a wave camera.
 
     elements: in contact; the radius of the first is that of the aperture. sensor_distance: z, mm; depths: (D,) mm of
     point sources on the axis, inf allowed; wavelengths: (W,) µm; grid: pixels, its centre counted from the axis.
@@ -34,12 +34,12 @@ class WaveScene:
 
 
 def check(scene: WaveScene) -> None:
-    """Refuse a scene that makes no sense, at the door: ValueError, `glass.InvalidIndex`; warns `glass.OutOfRange`."""
+    """Refuse an invalid scene: ValueError, `glass.InvalidIndex`; warns `glass.OutOfRange`."""
     if not scene.elements:
         raise ValueError("a wave scene needs an element: its radius is the aperture")
     if scene.depths.dim() != 1 or scene.wavelengths.dim() != 1 or not len(scene.depths) or not len(scene.wavelengths):
-        found = f"depths {tuple(scene.depths.shape)} and wavelengths {tuple(scene.wavelengths.shape)}"
-        raise ValueError(f"expected depths (D,) and wavelengths (W,), found {found}; write one number as a list of one")
+        shapes = f"depths {tuple(scene.depths.shape)} and wavelengths {tuple(scene.wavelengths.shape)}"
+        raise ValueError(f"expected depths (D,) and wavelengths (W,), found {shapes}; write a single number as a list")
     if scene.grid.centre.dim() != 1:
         raise ValueError(f"a wave scene has one window, found a grid with centres {tuple(scene.grid.centre.shape)}")
     positive = {
@@ -81,9 +81,9 @@ def spheres(scene: WaveScene, r2: Tensor) -> Tensor:
 
 
 def residual(scene: WaveScene, x: Tensor, y: Tensor, sphere: Tensor | None = None) -> Tensor:
-    """Path (D, W, ...) mm to the sensor's centre through points (...) mm of the aperture: what is left to be sampled.
+    """Residual path (D, W, ...) mm to the sensor's centre through points (...) mm of the aperture.
 
-    A lens that focuses there leaves 0. sphere: of `spheres`, where it is known already.
+    A lens that focuses there leaves 0. sphere: of `spheres`, if it is known.
     """
     sphere = spheres(scene, x * x + y * y) if sphere is None else sphere
     return sphere[:, None] + path(scene.elements, x, y, scene.wavelengths)

@@ -25,8 +25,7 @@ from pathlib import Path
 import torch
 
 from raytrace.materials.agf import Catalog, write_agf
-from raytrace.materials.formulas import BY_NUMBER, FORMULAS
-from raytrace.materials.glass import LINES, Glass, normal_line_deviation, refractive_index
+from raytrace.materials.glass import BY_NUMBER, FORMULAS, LINES, Glass, normal_line_deviation, refractive_index
 
 TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
 

@@ -7,10 +7,22 @@ object: a surface (SO, SI, Sk), a field (Fk), a wavelength (Wk), a zoom position
 
 import re
 from collections.abc import Iterator
+from fractions import Fraction
 from typing import NamedTuple
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import MAX_SURFACES, Block, LensFileError, Place, Record, UnsupportedSurface, is_number, shown
+from raytrace.io.source import (
+    Block,
+    LensFileError,
+    Place,
+    Record,
+    UnsupportedSurface,
+    by_word,
+    is_number,
+    plain,
+    refuse_surplus,
+    shown,
+)
 
 #: Commands of x and y of the field points, by the kind of field.
 FIELD_KINDS = {
@@ -19,6 +31,15 @@ FIELD_KINDS = {
     "paraxial_image_height": ("XIM", "YIM"),
     "real_image_height": ("XRI", "YRI"),
 }
+
+#: Commands of the system aperture, by its kind.
+SYSTEM_APERTURES = {"entrance_pupil_diameter": "EPD", "image_f_number": "FNO", "object_na": "NAO"}
+
+#: An object at this distance or further away, in the unit of the file, is at infinity.
+INFINITY = 1e10
+
+#: More coefficients than any diffractive surface has; mm.
+MOST_TERMS, NANOMETRE = 50, Fraction(1, 10**6)
 
 #: Coefficients of an asphere, of r⁴, r⁶, … r²⁰.
 LETTERS = "ABCDEFGHJ"
@@ -42,27 +63,19 @@ LEFT_HANDED = ("ADE", "BDE")
 POSE_TYPES = ("DAR", "BEN", "REV")
 
 
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-SYSTEM_READ = _words(
-    "RDM LEN TIT EPD FNO NAO DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM PUX PUY PUI"
-) | {word for pair in FIELD_KINDS.values() for word in pair}
-SURFACE_READ = _words("CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF DIF HOR HWL HCT HCO") | {
-    *LETTERS,
-    *APERTURE_WORDS,
-    *POSE_WORDS.values(),
-    *POSE_TYPES,
+SYSTEM_READ = {
+    *by_word({"": "RDM LEN TIT DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM"}),
+    *("PUX", "PUY", "PUI", *SYSTEM_APERTURES.values()),
+    *(word for pair in FIELD_KINDS.values() for word in pair),
+}
+SURFACE_READ = {
+    *by_word({"": "CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF DIF HOR HWL HCT HCO"}),
+    *(*LETTERS, *APERTURE_WORDS, *POSE_WORDS.values(), *POSE_TYPES),
 }
 
 
-def _by_word(rows: dict[str, str]) -> dict[str, str]:
-    return {word: reason for reason, words in rows.items() for word in words.split()}
-
-
 #: Commands that are known and left out, with the reason.
-LEFT_OUT = _by_word(
+LEFT_OUT = by_word(
     {
         "initials of the designer": "INI",
         "identity of the program": "UID",
@@ -84,7 +97,7 @@ LEFT_OUT = _by_word(
 )
 
 #: Commands that are known and not modelled: a file with one of them is refused.
-REFUSED = _by_word(
+REFUSED = by_word(
     {
         "centre of a tilt off the vertex": "XOD YOD ZOD",
         "return to an earlier surface": "RET",
@@ -204,28 +217,20 @@ class Stream:
     def take(self, record: Record) -> None:
         """Sort one command in."""
         if record.keyword == OWN:
-            self._take_own(record)
+            word = record.words[0].upper() if record.words else ""
+            status = READ if word in _OWN_WORDS else UNKNOWN
+            self.report.met(f"{OWN.lower()} {word.lower()[:40]}", status, record.place)
+            self.own.append(record._replace(keyword=word, place=self._place(record)))
         elif self.in_catalog and record.keyword not in ("PWL", "END"):
-            self._take_glass(record)
+            name, waves = unquoted(_WORD.match(record.text.strip())[0]), self.system.last("PWL")
+            self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves.words if waves else ()))
+            self.report.met("PRV", READ, record.place)
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
             raise LensFileError("variables of macros (^) are not followed; export the lens as numbers", record.place)
         elif zoom := next((match for word in record.words[:2] if (match := _ZOOM.fullmatch(word))), None):
             self._take_zoomed(record, zoom)
         else:
             self._take_command(record)
-
-    def _take_own(self, record: Record) -> None:
-        word = record.words[0].upper() if record.words else ""
-        status = READ if word in _OWN_WORDS else UNKNOWN
-        self.report.met(f"{OWN.lower()} {word.lower()[:40]}", status, record.place)
-        self.own.append(record._replace(keyword=word, place=self._place(record)))
-
-    def _take_glass(self, record: Record) -> None:
-        name = unquoted(_WORD.match(record.text.strip())[0])
-        held = self.system.records.get("PWL")
-        waves = held[-1].words if held else ()
-        self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves))
-        self.report.met("PRV", READ, record.place)
 
     def _take_zoomed(self, record: Record, zoom: re.Match) -> None:
         words = tuple(word for word in record.words if word != zoom[0])
@@ -258,11 +263,9 @@ class Stream:
 
     def _surface(self, record: Record) -> None:
         """S, SO, SI, Sk: the next surface or an earlier one, and its first numbers."""
-        name = record.keyword[1:]
-        number = {"O": 0, "I": None, "": None}.get(name, int(name) if name.isdigit() else None)
-        count = len(self.surfaces)
-        if name == "I" and self.has_image:
-            number = count - 1
+        name, count = record.keyword[1:], len(self.surfaces)
+        number = 0 if name == "O" else int(name) if name.isdigit() else None
+        number = count - 1 if name == "I" and self.has_image else number
         if number is None or number == count:
             self._append(record, "image" if name == "I" else "object" if name == "O" else "surface")
         elif number < count:
@@ -273,8 +276,7 @@ class Stream:
 
     def _append(self, record: Record, role: str) -> None:
         count = len(self.surfaces)
-        if count >= MAX_SURFACES:
-            raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", record.place)
+        refuse_surplus(self.surfaces, record.place)
         if self.has_image:
             raise LensFileError("a surface after SI, the image", record.place)
         if (count == 0) != (role == "object"):
@@ -289,12 +291,7 @@ class Stream:
         if len(words) == 1 or len(words) > 4:
             message = f"{record.keyword} with {len(words)} words, expected radius, thickness and glass"
             raise LensFileError(message, place)
-        if (
-            self.slope is None
-            and words
-            and is_number(words[0])
-            and not _has_no_effect(record._replace(words=words[:1]))
-        ):
+        if self.slope is None and words and is_number(words[0]) and plain(words[0]):
             message = "its first number may be a radius (RDM) or a curvature (RDM N), which is not specified before"
             raise LensFileError(f"{message}; add one of them", place)
         mirror = len(words) > 2 and unquoted(words[2]).upper() == "REFL"
@@ -369,7 +366,7 @@ def _has_no_effect(record: Record) -> bool:
     if [word.upper() for word in record.words] in (["N"], ["NO"]):
         return True
     numbers = [word for word in record.words if is_number(word)]
-    return bool(numbers) and not any(float(re.sub("[dD]", "e", word)) for word in numbers)
+    return bool(numbers) and not any(map(plain, numbers))
 
 
 def sections(text: str, file: str, report: Draft) -> Sections:

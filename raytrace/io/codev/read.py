@@ -12,12 +12,14 @@ numbers that CODE V stored in public files, or against two other programs' reade
 - CIR, REX and REY, ELX and ELY are radii and half-widths, and clip; with OBS they obscure, EDG is the edge of the part.
 - XDE YDE ZDE decentre, then ADE BDE CDE tilt about x, y, z, the first two left-handed, all the axes that follow; with
   DAR those of this surface alone, with REV those behind it, back. BEN tilts again behind a mirror.
-- DIF DOE with HCT R adds the path HOR λ/HWL Σ C_j r^2j.
+- DIF DOE with HCT R adds the path HOR λ/HWL Σ_j C_j r^2j, with C_j of HCO Cj in units of length and HWL in nm. A
+  `RadialPhase` has A_j = 2π C_j radius^2j/HWL in radians at a radius of its own, rounded once; they come back.
 - Rays are aimed at the stop, along paraxial lines.
 - Of zoom positions (ZOO) the first is read.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -25,16 +27,47 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble
+from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_aperture, pose_of
 from raytrace.io.codev import glass as codev_glass
-from raytrace.io.codev.keywords import FIELD_KINDS, OWN, Sections, sections, unquoted
-from raytrace.io.codev.surfaces import build
+from raytrace.io.codev.keywords import (
+    APERTURES,
+    FIELD_KINDS,
+    INFINITY,
+    LEFT_HANDED,
+    LETTERS,
+    MOST_TERMS,
+    NANOMETRE,
+    OWN,
+    POSE_WORDS,
+    RING,
+    SYSTEM_APERTURES,
+    Sections,
+    sections,
+    unquoted,
+)
 from raytrace.io.report import Draft
-from raytrace.io.source import Block, LensFileError, Place, Record, double, number, plain_text, shown, words
-from raytrace.materials.glass import AIR, refractive_index
+from raytrace.io.source import (
+    Block,
+    LensFileError,
+    Place,
+    Record,
+    UnsupportedSurface,
+    double,
+    in_lines,
+    is_infinite,
+    nonzero,
+    number,
+    plain_text,
+    refuse_few,
+    shown,
+    words,
+)
+from raytrace.materials.glass import AIR, MIRROR, Glass, refractive_index
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
-from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, vertex_curvature
+from raytrace.system.phases import RadialPhase
+from raytrace.system.poses import Pose, undone
+from raytrace.system.surface import Surface, medium_surfaces, power, signed, ynu
 
 #: Millimetres in a unit of DIM.
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4, "INCH": 25.4}
@@ -42,14 +75,15 @@ _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4, "IN
 #: Tolerated relative error of the stored distance of a paraxial image, due to indices of another catalog.
 _SOLVED = 1e-6
 
+#: Kinds of aperture: clear, obscuration, edge of the part, hole in it.
+_KINDS = ("CLR", "OBS", "EDG", "HOL")
+
 
 def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> Lens:
     """The lens of a .seq text; report: filled. Raises LensFileError, UnsupportedSurface and UnknownGlass."""
     parts = sections(text, file, report)
-    system, count = parts.system, len(parts.surfaces)
-    if count < 3:
-        message = f"{count} surfaces, expected at least object, one surface and image"
-        raise LensFileError(message, parts.surfaces[-1].place)
+    system = parts.system
+    refuse_few(parts.surfaces)
     unit = _unit(system, report)
     wave_words, source = _list(system, "WL") or (None, None)
     if wave_words is None:
@@ -66,7 +100,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     surfaces, before = [], AIR
     for k, block in enumerate(parts.surfaces):
         own = {record.keyword: record for record in parts.own if record.place.surface == k}
-        surface = build(block, unit, before, own=own, library=library, report=report)
+        surface = _surface(block, unit, before, own, library, report)
         before = before if surface.is_mirror or surface.is_break else surface.glass
         surfaces.append(surface)
     solve, primary = system.last("PIM"), reference.integer(0, "number of the reference wavelength") if reference else 1
@@ -76,10 +110,11 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     last = dataclasses.replace(last, thickness=last.thickness + image.thickness)
     focused = [*front, last, dataclasses.replace(image, thickness=torch.zeros_like(image.thickness))]
     weights, title = _numbers(system, "WTW", "weight"), system.last("TIT")
-    stop, aperture = _stop(parts.surfaces, report), _aperture(system, surfaces[0], unit)
+    stop, aperture = _stop(parts.surfaces, report), _system_aperture(system, surfaces[0], unit)
     catalog_names = _own_words(parts, "CATALOGS")
     if not any(record.keyword == "CATALOGS" for record in parts.own):
         catalog_names = dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog)
+    title_words = title.words if title else ()
     draft = LensDraft(
         surfaces=focused,
         stop=stop.surface,
@@ -89,7 +124,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
         wavelengths=waves,
         wavelength_weights=weights and weights[0],
         primary_wavelength=primary,
-        name=_title(title) if title else "",
+        name=(unquoted(title_words[0]) if len(title_words) == 1 else " ".join(title_words)).strip(),
         notes=tuple(plain_text(record.text) for record in parts.own if record.keyword == "NOTE"),
         catalogs=tuple(catalog_names),
         ray_aiming=_aiming(parts, report),
@@ -101,10 +136,6 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     lens = assemble(draft, file)
     _report_left_out(system, report)
     return lens
-
-
-def _title(record: Record) -> str:
-    return (unquoted(record.words[0]) if len(record.words) == 1 else " ".join(record.words)).strip()
 
 
 def _unit(system: Block, report: Draft) -> float:
@@ -121,24 +152,13 @@ def _unit(system: Block, report: Draft) -> float:
 
 
 def _at_paraxial_image(surfaces: list[Surface], wavelength: Tensor, place: Place, report: Draft) -> list[Surface]:
-    """The image at its paraxial distance (PIM): the stored one, or the one of an axial ray where they differ.
-
-    y-nu of a ray from the axial object point: n' u' = n u - y c (n' - n), the index changes its sign at mirrors.
-    """
+    """The image at its paraxial distance (PIM): the stored one, or the one of an axial ray where they differ."""
     first, *others, image = surfaces
-    index, y = refractive_index(first.glass, wavelength), torch.ones_like(wavelength)
-    slope = index / first.thickness
-    for surface in others:
-        if surface.is_break:
-            behind = index
-        elif surface.is_mirror:
-            behind = -index
-        else:
-            behind = index.sign() * refractive_index(surface.glass, wavelength)
-        power = 0.0 if surface.phase is None else power_of(surface.phase, wavelength)[1]
-        slope, index = slope - y * (vertex_curvature(surface) * (behind - index) + power), behind
-        before, y = y, y + surface.thickness * slope / index
-    solved, stored = -before * index / slope, others[-1].thickness
+    n = signed(others, [refractive_index(surfaces[k].glass, wavelength) for k in medium_surfaces(surfaces[:-1])])
+    powers = [power(s, before, behind, wavelength) for s, before, behind in zip(others, n[:-1], n[1:], strict=True)]
+    gaps = [surface.thickness / index for surface, index in zip(others[:-1], n[1:-1], strict=True)]
+    y, omega = ynu(torch.ones_like(wavelength), n[0] / first.thickness, powers, gaps)[-1]
+    solved, stored = -y * n[-1] / omega, others[-1].thickness
     if bool((solved - stored).abs() <= _SOLVED * stored.abs()):
         return surfaces
     message = f"PIM puts the image at {float(solved):.9g} mm, where {float(stored):.9g} mm is stored"
@@ -159,25 +179,21 @@ def _stop(surfaces: Sequence[Block], report: Draft) -> Place:
     return stop.place
 
 
-def _aperture(system: Block, first: Surface, unit: float) -> tuple[str, float, tuple[str, Place]]:
+def _system_aperture(system: Block, first: Surface, unit: float) -> tuple[str, float, tuple[str, Place]]:
     """The system aperture: EPD, FNO (of an object at infinity) or NAO."""
-    records = system.all("EPD", "FNO", "NAO")
+    records = system.all(*SYSTEM_APERTURES.values())
     if not records:
         raise LensFileError("no system aperture; expected one of EPD, FNO, NAO", system.place)
     record = records[-1]
     if len({other.keyword for other in records}) > 1:
-        names = " and ".join(f"{other.keyword} in line {other.place.line}" for other in records)
-        raise LensFileError(f"several system apertures ({names}), expected one", record.place)
+        raise LensFileError(f"several system apertures ({in_lines(records)}), expected one", record.place)
     size = record.number(0, "size of the aperture")
-    source = (f"{record.keyword} is {shown(record.words[0])}", record.place)
-    if record.keyword == "EPD":
-        return "entrance_pupil_diameter", size * unit, source
-    if record.keyword == "NAO":
-        return "object_na", size, source
-    if not bool(torch.isinf(first.thickness)):
+    if record.keyword == "FNO" and not bool(torch.isinf(first.thickness)):
         message = "FNO of an object at a finite distance: the distance that it refers to is not documented"
         raise LensFileError(f"{message}; give EPD or NAO", record.place)
-    return "image_f_number", size, source
+    kind = next(kind for kind, keyword in SYSTEM_APERTURES.items() if keyword == record.keyword)
+    source = (f"{record.keyword} is {shown(record.words[0])}", record.place)
+    return kind, size * unit if record.keyword == "EPD" else size, source
 
 
 # -- lists over fields and wavelengths --------------------------------------------------------------------------------
@@ -234,10 +250,7 @@ def _fields(system: Block, unit: float, report: Draft) -> dict:
 
 
 def _per_field(system: Block, keyword: str, count: int, default: float, report: Draft) -> list[float]:
-    listed = _numbers(system, keyword, "value of a field")
-    if listed is None:
-        return [default] * count
-    values, record = listed
+    values, record = _numbers(system, keyword, "value of a field") or ([default] * count, None)
     if len(values) < count:
         message = f"{keyword} has {len(values)} values for {count} fields; the others are taken as {default:g}"
         report.warn(message, record.place)
@@ -246,20 +259,20 @@ def _per_field(system: Block, keyword: str, count: int, default: float, report: 
 
 def _vignetting(system: Block, count: int, report: Draft) -> list[list[float]]:
     """Decentre and compression of the pupil from the fractions that are cut off on either side, each rounded once."""
-    rows = {}
+    decentres, compressions = [], []
     for axis in "XY":
         cut = []
         for side in "UL":
             _per_field(system, f"V{side}{axis}", count, 0.0, report)
             listed = (_list(system, f"V{side}{axis}") or ([],))[0]
-            cut.append([Fraction(word.upper().replace("D", "E")) for word in (listed + ["0"] * count)[:count]])
-        rows[f"D{axis}"] = [float((low - high) / 2) for high, low in zip(*cut, strict=True)]
-        rows[f"C{axis}"] = [float((low + high) / 2) for high, low in zip(*cut, strict=True)]
-        sides = [side for side in "UL" if system.last(f"V{side}{axis}")]
-        if axis == "X" and len(sides) == 1 and any(rows["CX"]):
-            record = system.last(f"V{sides[0]}X")
-            raise LensFileError(f"{record.keyword} without its other side; give VUX and VLX", record.place)
-    return [rows["DX"], rows["DY"], rows["CX"], rows["CY"], [0.0] * count]
+            cut.append([_fraction(word) for word in (listed + ["0"] * count)[:count]])
+        decentres.append([float((low - high) / 2) for high, low in zip(*cut, strict=True)])
+        compressions.append([float((low + high) / 2) for high, low in zip(*cut, strict=True)])
+        sides = [record for side in "UL" if (record := system.last(f"V{side}{axis}"))]
+        if axis == "X" and len(sides) == 1 and any(compressions[0]):
+            message = f"{sides[0].keyword} without its other side; give VUX and VLX"
+            raise LensFileError(message, sides[0].place)
+    return [*decentres, *compressions, [0.0] * count]
 
 
 # -- comments of this package, and commands that are left out ---------------------------------------------------------
@@ -292,12 +305,212 @@ def _report_left_out(system: Block, report: Draft) -> None:
         if record and record.number(0, "environment", normal[0]) not in normal:
             message = f"{keyword} {record.words[0][:20]} {unit}: indices are those of 20 °C and 1 atm"
             report.warn(message, record.place)
-    beam = system.last("PUI", "PUX", "PUY")
-    if beam:
+    if beam := system.last("PUI", "PUX", "PUY"):
         report.warn(f"the beam is apodised ({beam.keyword}); taken as uniform", beam.place)
-    zoom = system.last("ZOO")
+    zoom, used = system.last("ZOO"), system.last("CA")
     if zoom and zoom.words and zoom.integer(0, "number of zoom positions") > 1:
         report.warn(f"{zoom.words[0][:20]} zoom positions (ZOO): the first is read", zoom.place)
-    used = system.last("CA")
     if used and used.words and used.words[0].upper()[:2] == "NO":
         report.warn("apertures are not to be used (CA NO); here they clip", used.place)
+
+
+# -- a surface --------------------------------------------------------------------------------------------------------
+
+
+def _surface(
+    block: Block,
+    unit: float,
+    before: Glass,
+    own: dict[str, Record],
+    library: codev_glass.GlassLibrary,
+    report: Draft,
+) -> Surface:
+    """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
+
+    own: comments of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase.
+    """
+    apertures, semi_diameter = _apertures(block, unit, report)
+    label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
+    glass, is_break = _medium(block, before, library, report), "BREAK" in own
+    radius = number((own["RADIUS"].text or "?").strip(), "radius", own["RADIUS"].place) if "RADIUS" in own else 1.0
+    if is_break and ahead is None and behind is not None:
+        ahead, behind = behind, None
+    slope = block.last("CUY")  # or RDY, a radius; 0 is a plane in both
+    value = slope.number(0, "radius or curvature") if slope else 0.0
+    return Surface(
+        thickness=_thickness(block, unit),
+        curvature=nonzero(value / unit if slope.keyword == "CUY" else 1.0 / (value * unit)) if value else None,
+        **_conic_and_terms(block, unit),
+        phase=_phase(block, radius, unit),
+        before=ahead,
+        after=behind,
+        is_break=is_break,
+        glass=AIR if is_break else glass,
+        semi_diameter=semi_diameter,
+        apertures=apertures,
+        comment=unquoted(label.words[0]).strip() if label and label.words else "",
+    )
+
+
+def _thickness(block: Block, unit: float) -> Tensor:
+    record = block.last("THI")
+    if record is None:
+        raise LensFileError("surface without a thickness; S is followed by radius, thickness, glass", block.place)
+    word = record.words[0] if record.words else ""
+    is_object = block.place.surface == 0
+    distance = math.inf if is_object and is_infinite(word) else number(word, "thickness", record.place)
+    if is_object and distance <= -INFINITY:
+        message = f"thickness is {shown(word)}, expected a distance or {INFINITY:g} for infinity"
+        raise LensFileError(message, record.place)
+    return double(math.inf if is_object and distance >= INFINITY else distance * unit)
+
+
+def _conic_and_terms(block: Block, unit: float) -> dict:
+    """The conic constant and the terms a_j of r^2j: A is a_2; those up to the last letter that is there."""
+    flat, record, type_ = block.last("CUF"), block.last("K"), block.last("TYPE")
+    kind = type_.keyword if type_ else "SPH"
+    if flat and flat.number(0, "CUF", 0.0):
+        raise UnsupportedSurface(f"CUF {flat.words[0][:40]} (fraction of a curvature) is not modelled", flat.place)
+    conic = record.number(0, "conic constant") if record else 0.0
+    if conic and kind == "SPH":
+        raise LensFileError("K on a sphere; put CON or ASP before it", record.place)
+    records = {j: record for j, letter in enumerate(LETTERS, 2) if (record := block.last(letter))}
+    terms = {j: record.number(0, "coefficient") for j, record in records.items()}
+    if kind == "ASP":
+        powers = range(2, max(records, default=1) + 1)
+        coefficients = double([0.0, *(terms.get(j, 0.0) / unit ** (2 * j - 1) for j in powers)])
+        return {"conic": nonzero(conic), "coefficients": coefficients}
+    for j, term in terms.items():
+        if term:
+            message = f"{records[j].keyword} on a surface that is no asphere; put ASP before it"
+            raise LensFileError(message, records[j].place)
+    return {"conic": nonzero(conic)}
+
+
+def _medium(block: Block, before: Glass, library: codev_glass.GlassLibrary, report: Draft) -> Glass:
+    mode, glass = block.last("RMD"), block.last("GLA")
+    word = unquoted(mode.words[0]).upper() if mode and mode.words else "REFR"
+    if word not in ("REFL", "REFR"):
+        raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", mode.place)
+    place = glass.place if glass else block.place
+    name = glass.words[0] if glass and glass.words else ""
+    glass_behind = codev_glass.medium(name, library, place=place, report=report)
+    if word == "REFR":
+        return glass_behind
+    if block.place.surface == 0:
+        raise LensFileError("the object is a mirror (REFL)", mode.place)
+    if name and glass_behind.name != before.name:
+        message = f"a mirror followed by {shown(name)}, while light stays in {before.name or 'air'}"
+        raise LensFileError(f"{message}; leave out the glass behind REFL", place)
+    return MIRROR
+
+
+def _fraction(word: str) -> Fraction:
+    return Fraction(word.upper().replace("D", "E"))
+
+
+def _phase(block: Block, radius: float, unit: float) -> RadialPhase | None:
+    """The phase of a surface, None if it is not diffractive; radius: mm, of its coefficients."""
+    record = block.last("DIF")
+    if record is None:
+        return None
+    kind, type_, wave = record.words[:1], block.last("HCT"), block.last("HWL")
+    if [word.upper() for word in kind] != ["DOE"]:
+        raise UnsupportedSurface(f"DIF {' '.join(kind)[:40]} (diffractive surface) is not modelled", record.place)
+    if not type_ or [word.upper() for word in type_.words] != ["R"]:
+        stated = f"HCT {' '.join(type_.words)[:40]}" if type_ else "DIF DOE without HCT"
+        raise UnsupportedSurface(f"{stated} is not modelled; modelled is HCT R, powers of r²", record.place)
+    if wave is None or wave.number(0, "wavelength") <= 0:
+        raise LensFileError("DIF DOE without the wavelength of its construction (HWL)", record.place)
+    length, radians = _fraction(wave.words[0]) * NANOMETRE, {}
+    for record in block.all("HCO"):
+        word = record.words[0].upper() if record.words else ""
+        j = int(word[1:]) if word[:1] == "C" and word[1:].isdigit() and len(word) < 6 else 0
+        if not 1 <= j <= MOST_TERMS:
+            raise LensFileError(f"HCO {word[:20]}, expected C1 to C{MOST_TERMS} and a number", record.place)
+        record.number(1, f"coefficient C{j}")
+        coefficient = _fraction(record.words[1]) / Fraction(unit) ** (2 * j - 1)
+        try:
+            radians[j] = float(Fraction(2 * math.pi) * coefficient * Fraction(radius) ** (2 * j) / length) + 0.0
+        except OverflowError as error:
+            raise LensFileError(f"HCO C{j} is too large", record.place) from error
+    order = block.last("HOR")
+    coefficients = double([radians.get(j, 0.0) for j in range(1, max(radians, default=0) + 1)])
+    return RadialPhase(coefficients, double(radius), double(order.number(0, "order") if order else 1.0))
+
+
+def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
+    """The pose of a surface and the one behind it, by decentres, tilts and their type: DAR, REV, BEN or none."""
+    numbers = {}
+    for name, word in POSE_WORDS.items():
+        if record := block.last(word):
+            factor = -1.0 if word in LEFT_HANDED else 1.0 if name.startswith("tilt") else unit
+            numbers[name] = factor * record.number(0, "decentre or tilt")
+    pose, type_ = pose_of(numbers), block.last("POSE")
+    word = type_.keyword if type_ else ""
+    if pose is None or not word:
+        return pose, None
+    if word == "DAR":
+        return pose, undone(pose)
+    if word == "REV":
+        return None, undone(pose)
+    tilts = {name: value for name, value in numbers.items() if name.startswith("tilt") and value}
+    if len(tilts) > 1:
+        message = "BEN with tilts about several axes, to which CODE V adds one of its own, is not modelled"
+        raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", type_.place)
+    return pose, pose_of(tilts)
+
+
+# -- apertures --------------------------------------------------------------------------------------------------------
+
+
+def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture, ...], float | None]:
+    """The apertures, and the semi-diameter of the part, from CIR EDG."""
+    groups: dict[tuple[str, str], dict[str, Record]] = {}
+    for record in block.all("APERTURE"):
+        words, kind, label = list(record.words), "CLR", ""
+        while words and (words[0].upper() in _KINDS or words[0][:2] in ("L'", 'L"', "l'", 'l"')):
+            word = words.pop(0)
+            kind, label = (word.upper(), label) if word.upper() in _KINDS else (kind, word[1:].upper())
+        groups.setdefault((kind, label), {})[record.keyword] = record._replace(words=tuple(words))
+    apertures, semi_diameter = [], None
+    for (kind, label), sizes in groups.items():
+        if kind == "EDG":
+            semi_diameter = sizes["CIR"].number(0, "edge of the part") * unit if "CIR" in sizes else semi_diameter
+        elif kind == "HOL":
+            first = next(iter(sizes.values()))
+            report.warn("a hole in the part (HOL) is left out: no ray is clipped by it", first.place)
+        else:
+            apertures.append(_aperture(sizes, kind == "OBS", unit))
+            if label.strip("'\"") == RING and len(apertures) > 1:
+                apertures[-2:] = _ring(*apertures[-2:])
+    clear = [aperture for aperture in apertures if not aperture.obscures]
+    if len(clear) > 1:
+        message = f"{len(clear)} clear apertures on one surface; whether light passes any or all of them is ambiguous"
+        raise LensFileError(message, block.all("APERTURE")[0].place)
+    if semi_diameter is not None and semi_diameter < 0:
+        raise LensFileError("CIR EDG is negative, expected a semi-diameter of 0 or more", block.place)
+    return tuple(apertures), semi_diameter
+
+
+def _ring(outer: Aperture, inner: Aperture) -> list[Aperture]:
+    """A clear circle and the obscuration within it as one aperture, if they have the same centre."""
+    if outer.shape != inner.shape or outer.shape != "circular" or outer.obscures or outer.centre != inner.centre:
+        return [outer, inner]
+    return [Aperture("circular", (inner.extent[1], outer.extent[1]), False, outer.centre)]
+
+
+def _aperture(sizes: dict[str, Record], obscures: bool, unit: float) -> Aperture:
+    place = next(iter(sizes.values())).place
+    shapes = [shape for shape, keywords in APERTURES.items() if any(keyword in sizes for keyword in keywords)]
+    if len(shapes) != 1:
+        raise LensFileError(f"an aperture of {len(shapes)} shapes ({', '.join(sizes)}), expected one", place)
+    shape, keywords = shapes[0], APERTURES[shapes[0]]
+    if missing := [keyword for keyword in keywords if keyword not in sizes]:
+        raise LensFileError(f"a {shape} aperture without {' and '.join(missing)}", place)
+    if "ARO" in sizes and sizes["ARO"].number(0, "rotation"):
+        raise LensFileError("a rotated aperture (ARO), which is not modelled", sizes["ARO"].place)
+    extent = tuple(sizes[keyword].number(0, "size of the aperture") * unit for keyword in keywords)
+    extent = (0.0, *extent) if shape == "circular" else extent
+    centre = (sizes[word].number(0, "decentre") * unit if word in sizes else 0.0 for word in ("ADX", "ADY"))
+    return clear_aperture(shape, extent, obscures, tuple(centre), keywords[0], place)

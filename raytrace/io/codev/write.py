@@ -1,7 +1,9 @@
 """Write a lens as a sequence of CODE V (.seq), every number with the digits that bring it back exactly."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
+from decimal import Decimal, localcontext
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,21 +11,41 @@ import torch
 from torch import Tensor
 
 from raytrace.io.codev import glass as codev_glass
-from raytrace.io.codev.keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
-from raytrace.io.codev.surfaces import INFINITY, phase_lines
-from raytrace.io.source import LensFileError, Place, exact, exact_list, one_line, quoted, refuse_sag_terms, word
+from raytrace.io.codev.keywords import (
+    APERTURES,
+    FIELD_KINDS,
+    INFINITY,
+    LEFT_HANDED,
+    LETTERS,
+    MOST_TERMS,
+    NANOMETRE,
+    OWN,
+    POSE_WORDS,
+    RING,
+    SYSTEM_APERTURES,
+)
+from raytrace.io.source import (
+    LensFileError,
+    Place,
+    exact,
+    exact_list,
+    one_line,
+    quoted,
+    refuse_sag_terms,
+    thickness,
+    word,
+)
 from raytrace.materials.glass import Glass
 from raytrace.system.apertures import Aperture
+from raytrace.system.configurations import same
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose, undone
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
-#: Commands of the system aperture.
-_APERTURES = {"entrance_pupil_diameter": "EPD", "image_f_number": "FNO", "object_na": "NAO"}
-
-_TILTS = ("tilt_x", "tilt_y", "tilt_z")
+#: Digits of a written coefficient of a phase, enough that it comes back through two roundings.
+_DIGITS = 40
 
 #: Characters of a line, after which a list continues in the next.
 _LINE = 72
@@ -112,7 +134,7 @@ def _wrapped(line: str) -> str:
 
 
 def _aperture(aperture: SystemAperture, first: Surface, place: Place) -> str:
-    keyword = _APERTURES.get(aperture.kind)
+    keyword = SYSTEM_APERTURES.get(aperture.kind)
     if keyword is None or (keyword == "FNO" and not bool(torch.isinf(first.thickness).all())):
         at = " of an object at a finite distance" if keyword else ""
         message = f"the aperture {aperture.kind.replace('_', ' ')}{at}, which a .seq file does not hold"
@@ -173,7 +195,7 @@ def _surface(
         f"  {OWN.lower()} break" if surface.is_break else "",
         *_poses(surface, place),
         *_shape(surface, place),
-        *(phase_lines(surface.phase, float(lens.primary), place) if is_round else []),
+        *(_phase(surface.phase, float(lens.primary), place) if is_round else []),
         *_apertures(surface.apertures, place),
         "" if surface.semi_diameter is None else f"  CIR EDG {exact(surface.semi_diameter, 'semi-diameter', place)}",
     ]
@@ -200,10 +222,11 @@ def _poses(surface: Surface, place: Place) -> list[str]:
     if pose is not None and not pose.tilts_first:
         if behind is None:
             return _pose(pose, place)
-        if _same(behind, undone(pose)):
+        if same(behind, undone(pose)):
             return [*_pose(pose, place), "  DAR"]
-        tilts = [name for name in _TILTS if getattr(pose, name) is not None]
-        if surface.is_mirror and len(tilts) == 1 and _same(behind, Pose(**{tilts[0]: getattr(pose, tilts[0])})):
+        tilts = Pose(tilt_x=pose.tilt_x, tilt_y=pose.tilt_y, tilt_z=pose.tilt_z)
+        count = sum(tilt is not None for tilt in (tilts.tilt_x, tilts.tilt_y, tilts.tilt_z))
+        if surface.is_mirror and count == 1 and same(behind, tilts):
             return [*_pose(pose, place), "  BEN"]
     message = "poses before and behind the surface, which a .seq file has no command for"
     raise LensFileError(f"{message}; put them into coordinate breaks", place)
@@ -218,23 +241,11 @@ def _pose(pose: Pose, place: Place) -> list[str]:
     ]
 
 
-def _same(a: Pose, b: Pose) -> bool:
-    """Whether two poses have the same numbers and the same order."""
-    for name in POSE_WORDS:
-        x, y = getattr(a, name), getattr(b, name)
-        if (x is None) != (y is None) or (x is not None and not torch.equal(x, y)):
-            return False
-    return a.tilts_first == b.tilts_first
-
-
 def _thickness(surface: Surface, is_image: bool, place: Place) -> str:
-    thickness = surface.thickness
-    if place.surface == 0 and thickness.ndim == 0 and float(thickness) == torch.inf:
-        return "0.1e14"
-    text = exact(thickness, "thickness", place)
+    text = thickness(surface.thickness, "0.1e14", place)
     if is_image and float(text):
         raise LensFileError(f"the image has thickness {text}, which a .seq file takes for a defocus", place)
-    if place.surface == 0 and abs(float(text)) >= INFINITY:
+    if place.surface == 0 and text != "0.1e14" and abs(float(text)) >= INFINITY:
         raise LensFileError(f"the object is {text} mm away, which CODE V takes for infinity; make it inf", place)
     return text
 
@@ -250,6 +261,24 @@ def _shape(surface: Surface, place: Place) -> list[str]:
         excess = f"a term of r² ({square})" if float(square) else f"terms to r^{2 * len(terms) + 2}"
         raise LensFileError(f"{excess}; an asphere of a .seq file has r⁴ to r²⁰: write a table (.csv)", place)
     return ["  ASP", *conic, *(f"  {letter} {term}" for letter, term in zip(LETTERS, terms, strict=False))]
+
+
+def _phase(phase: RadialPhase, wavelength: float, place: Place) -> list[str]:
+    """The commands of a phase; wavelength: µm, that of its construction."""
+    length, turn = Fraction(repr(wavelength)) * 1000 * NANOMETRE, Fraction(2 * math.pi)
+    radius = exact(phase.radius, "radius of the phase", place)
+    if not float(radius) > 0:
+        raise LensFileError(f"the radius of the phase is {radius}, expected one above 0", place)
+    terms = exact_list(phase.coefficients, "coefficients of the phase", place)
+    if len(terms) > MOST_TERMS:
+        raise LensFileError(f"{len(terms)} coefficients of the phase, a .seq file has at most {MOST_TERMS}", place)
+    lines = ["  DIF DOE", f"  HOR {exact(phase.order, 'order', place)}"]
+    lines.append(f"  HWL {Decimal(repr(wavelength)).scaleb(3).normalize():f}; HCT R")
+    for j, term in enumerate(terms, 1):
+        fraction = Fraction(float(term)) * length / (turn * Fraction(float(radius)) ** (2 * j))
+        with localcontext(prec=_DIGITS):
+            lines.append(f"  HCO C{j} {Decimal(fraction.numerator) / Decimal(fraction.denominator)}")
+    return lines if float(radius) == 1 else [*lines, f"  {OWN.lower()} radius {radius}"]
 
 
 def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:

@@ -28,8 +28,7 @@ from pathlib import Path
 
 import torch
 
-from raytrace.io.assembly import LensDraft, assemble
-from raytrace.io.materials import AtHand, catalogs_of_lens
+from raytrace.io.assembly import AtHand, LensDraft, assemble, catalogs_of_lens
 from raytrace.io.report import Draft
 from raytrace.io.source import (
     MILLIMETRES,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from raytrace.io.materials import by_figures, is_code, listed_glass
+from raytrace.io.assembly import by_figures, is_code, listed_glass
 from raytrace.io.report import Draft
 from raytrace.io.source import LensFileError, Place, UnsupportedSurface, double, is_infinite, is_number, number, shown
 from raytrace.io.table.columns import order
@@ -15,8 +15,17 @@ from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.environment import Environment
-from raytrace.materials.formulas import MODEL_LINES
-from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
+from raytrace.materials.glass import (
+    AIR,
+    LINES,
+    MIRROR,
+    MODEL_LINES,
+    Glass,
+    constant,
+    mil_glass,
+    model_glass,
+    refractive_index,
+)
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
@@ -38,7 +47,7 @@ def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     """The medium of a row without a named glass; air where no figure is given.
 
     One index alone is constant. n_d, V_d and ΔP_gF are kept unchanged; any other set of figures is met by the model
-    glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.formulas`), on the normal line of glasses where two are
+    glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.glass`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
     given = {name: number(cell, name.replace("_", " "), place) for name, cell in figures(cells).items()}

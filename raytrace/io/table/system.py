@@ -28,7 +28,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.io.materials import catalogs_needed
+from raytrace.io.assembly import catalogs_needed
 from raytrace.io.source import (
     LensFileError,
     Place,

@@ -5,7 +5,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from raytrace.io.materials import is_code, is_left_out, is_listed, listed_name
+from raytrace.io.assembly import is_code, is_left_out, is_listed, listed_name
 from raytrace.io.source import LensFileError, Place, exact, exact_list, quoted, refuse_sag_terms, thickness
 from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, written, written_environment

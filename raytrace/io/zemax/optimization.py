@@ -32,15 +32,19 @@ from typing import NamedTuple
 from raytrace.io.report import IGNORED, READ, Draft
 from raytrace.io.source import Block, LensFileError, Place, Record, double, is_number, one_line, plain, read_text
 from raytrace.io.zemax.configurations import cell_of
-from raytrace.io.zemax.keywords import BLANK, SYSTEM_IGNORED, TAIL_REASON, Sections, records
 from raytrace.io.zemax.surfaces import (
+    BLANK,
     FIRST_TERM,
     INVERSE,
+    SYSTEM_IGNORED,
+    TAIL_REASON,
     Named,
     Numbers,
+    Sections,
     SurfaceType,
     in_millimetres,
     numbers_of,
+    records,
     type_name,
     type_of,
     types,

@@ -17,12 +17,11 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble
-from raytrace.io.materials import AtHand, catalogs_of_lens
+from raytrace.io.assembly import MOST_POINTS, AtHand, LensDraft, assemble, catalogs_of_lens
 from raytrace.io.report import Draft
 from raytrace.io.source import MILLIMETRES, Block, LensFileError, Record, UnsupportedSurface, shown
 from raytrace.io.zemax import configurations, optimization
-from raytrace.io.zemax.keywords import (
+from raytrace.io.zemax.surfaces import (
     AIMINGS,
     FIELD_KINDS,
     FIELD_LISTS,
@@ -30,9 +29,10 @@ from raytrace.io.zemax.keywords import (
     NOTE_PIECE,
     SYSTEM_APERTURES,
     Sections,
+    build,
+    refuse_unsupported,
     sections,
 )
-from raytrace.io.zemax.surfaces import build, refuse_unsupported
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.io.materials import catalogs_needed, is_code, is_left_out, listed_name
+from raytrace.io.assembly import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.io.report import Draft
 from raytrace.io.source import (
     MILLIMETRES,
@@ -37,18 +37,6 @@ from raytrace.io.zemax.configurations import (
     with_environments,
     word_of,
 )
-from raytrace.io.zemax.keywords import (
-    AIMINGS,
-    BLANK,
-    FIELD_KINDS,
-    FIELD_LISTS,
-    FIELDS_IN_LISTS,
-    NOTE_PIECE,
-    SYSTEM_APERTURES,
-    Sections,
-    aperture_keywords,
-    sections,
-)
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
@@ -59,10 +47,20 @@ from raytrace.io.zemax.optimization import (
     with_rules,
 )
 from raytrace.io.zemax.surfaces import (
+    AIMINGS,
+    BLANK,
+    FIELD_KINDS,
+    FIELD_LISTS,
+    FIELDS_IN_LISTS,
     INVERSE,
+    NOTE_PIECE,
+    SYSTEM_APERTURES,
+    Sections,
     SurfaceType,
+    aperture_keywords,
     in_millimetres,
     poses_are_parameters,
+    sections,
     spelled_inverse,
     type_of,
     types,

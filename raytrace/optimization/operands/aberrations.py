@@ -1,6 +1,7 @@
-"""Operands of aberrations: colours, Seidel's sums, field curvature and distortion.
+"""Operands of aberrations: colours, Seidel sums, field curvature and distortion.
 
-Seidel's by the sums of `analysis.seidel` (Welford 1986), here with the derivatives of a state; the others by rays.
+Seidel sums are those of `analysis.seidel` (Welford 1986), with the derivatives of a state; the others follow rays, as
+in `analysis.chief`.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,31 +9,36 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from raytrace.analysis.chief import NEAR_AXIS, NEAR_CHIEF, focus_of_close_rays, relative_error
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
 from raytrace.maths.dual import value_of
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
-from raytrace.optimization.lens_state import LensState
-from raytrace.optimization.operands.paraxial import along, chief_ray_of, field_of, listed, paraxial_image_distance
+from raytrace.maths.numerics import dot_2
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.optimization.lens_state import LensState, listed
+from raytrace.optimization.operands.paraxial import (
+    along,
+    chief_ray_of,
+    field_of,
+    paraxial_image_distance,
+    per_row,
+)
 from raytrace.optimization.operands.rays import known
-from raytrace.system.surface import is_even
+from raytrace.optimization.ray_bundle import largest_field
+from raytrace.system.surface import is_even, ynu
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import vignette
-from raytrace.tracing.paraxial import ynu
 
-_NEAR_AXIS = 1e-4  # of the field: its chief ray tells the scale of the image
-_NEAR_CHIEF = 1e-3  # of the pupil: close rays tell where they meet
-_FIELDS = 30  # by which f θ is fitted
+_FIELDS = 30  # of the fit of f θ
 
-# -- rays of an axis and of a pupil without vignetting -----------------------------------------------------------------
+# -- rays of the whole pupil, without vignetting -----------------------------------------------------------------------
 
 
-def bare(planner: Planner, field: tuple[float, float], pupil: tuple[float, float]) -> tuple[float, float]:
+def unvignetted(planner: Planner, field: tuple[float, float], pupil: tuple[float, float]) -> tuple[float, float]:
     """The pupil point that vignetting factors take to a point of the whole pupil."""
     lens = planner.lens
     if lens.fields.vignetting is None:
         return pupil
-    largest = float(torch.hypot(lens.fields.x, lens.fields.y).max())
-    at = largest * torch.tensor(field, dtype=torch.float64)[:, None]
+    at = largest_field(lens) * torch.tensor(field, dtype=torch.float64)[:, None]
     corners = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     shift, *ends = vignette(lens, at, corners).numpy().T
     matrix = np.stack([end - shift for end in ends], -1)
@@ -40,49 +46,47 @@ def bare(planner: Planner, field: tuple[float, float], pupil: tuple[float, float
 
 
 def _chief(line: Line, planner: Planner, field: tuple[float, float], wavelength: int) -> int:
-    return planner.ray(line, field=field, pupil=bare(planner, field, (0.0, 0.0)), wavelength=wavelength)
+    return planner.ray(line, field=field, pupil=unvignetted(planner, field, (0.0, 0.0)), wavelength=wavelength)
 
 
 # -- colours -----------------------------------------------------------------------------------------------------------
 
 
 def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """Where light of one wavelength meets the axis, less where that of another does."""
+    """The axial crossing of one wavelength less that of another."""
     side = _side(planner)
-    waves = [_two_wavelengths(line, planner) for line in lines]
-    zones = [line.row.numbers[0] for line in lines]
-    rays = [
-        [planner.ray(line, field=(0.0, 0.0), pupil=(0.0, zone), wavelength=wave) for wave in pair] if zone else None
-        for line, zone, pair in zip(lines, zones, waves, strict=True)
-    ]
 
-    def number(context: EvaluationContext, pair, asked):
-        if asked is None:
-            return paraxial_image_distance(context.state, pair[0]) - paraxial_image_distance(context.state, pair[1])
-        hits = context.hits(np.array(asked))
-        crossing = known(hits.valid, hits.position[2] - hits.position[1] * hits.direction[2] / hits.direction[1])
-        return crossing[0] - crossing[1]
+    def row(line: Line) -> Callable[[EvaluationContext], object]:
+        zone, (first, second) = line.row.numbers[0], _two_wavelengths(line, planner)
+        if not zone:
+            return lambda context: (
+                side * (paraxial_image_distance(context.state, first) - paraxial_image_distance(context.state, second))
+            )
+        waves = (first, second)
+        rays = np.array([planner.ray(line, field=(0.0, 0.0), pupil=(0.0, zone), wavelength=w) for w in waves])
 
-    def evaluate(context: EvaluationContext) -> Found:
-        told = [side * number(context, pair, asked) for pair, asked in zip(waves, rays, strict=True)]
-        return Found(listed(told, context.state.count))
+        def number(context: EvaluationContext):
+            hits = context.hits(rays)
+            crossing = known(hits.valid, hits.position[2] - hits.position[1] * hits.direction[2] / hits.direction[1])
+            return side * (crossing[0] - crossing[1])
 
-    return evaluate
+        return number
+
+    return per_row(map(row, lines))
 
 
 def _lateral_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """y of the chief ray of the largest field of one wavelength, less that of another."""
-    side = _side(planner)
+    side, field = _side(planner), field_of(planner, 0)
     waves = [_two_wavelengths(line, planner) for line in lines]
-    field = field_of(planner, 0)
     first, second = (
         np.array([_chief(line, planner, field, pair[k]) for line, pair in zip(lines, waves, strict=True)])
         for k in range(2)
     )
 
-    def evaluate(context: EvaluationContext) -> Found:
-        one, other = context.hits(first), context.hits(second)
-        return Found(known(one.valid & other.valid, side * (one.position[1] - other.position[1])))
+    def evaluate(context: EvaluationContext) -> RowValues:
+        a, b = context.hits(first), context.hits(second)
+        return RowValues(known(a.valid & b.valid, side * (a.position[1] - b.position[1])))
 
     return evaluate
 
@@ -92,7 +96,7 @@ def _side(planner: Planner) -> float:
 
 
 def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
-    """The wavelengths of a row, from 0; where it says 0 the shortest and the longest."""
+    """The wavelengths of a row, from 0; its integers 0 are the shortest and the longest."""
     wavelengths = planner.view.wavelengths
     extremes = int(np.argmin(wavelengths)), int(np.argmax(wavelengths))
     return tuple(n - 1 if n else extreme for n, extreme in zip(line.row.integers, extremes, strict=True))
@@ -113,24 +117,19 @@ def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
     marginal, chief = ([listed(column, state.count) for column in zip(*ray, strict=True)] for ray in rays)
     vertex = listed(c[1:-1], state.count)
     indices = [listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0)]
-    return third_order(
-        marginal, chief, vertex, indices, shapes.departures(state, vertex), omega_bar * y - omega * y_bar
-    )
+    invariant = omega_bar * y - omega * y_bar
+    return third_order(marginal, chief, vertex, indices, shapes.departures(state, vertex), invariant)
 
 
 class _Shapes:
-    """By how much surfaces depart from the spheres of their vertex curvatures, in r⁴."""
+    """The difference of surfaces from the spheres of their vertex curvatures, in r⁴."""
 
     def __init__(self, planner: Planner):
-        surfaces = planner.lens.surfaces[1:-1]
-        self.conics = [
-            (k, planner.view.number((k, "conic"))) for k, surface in enumerate(surfaces, 1) if surface.conic is not None
-        ]
-        self.terms = [
-            (k, planner.view.number((k, "a4")))
-            for k, surface in enumerate(surfaces, 1)
-            if surface.coefficients is not None and len(surface.coefficients) > 1
-        ]
+        surfaces = [*enumerate(planner.lens.surfaces)][1:-1]
+        number = planner.view.number
+        self.conics = [(k, number((k, "conic"))) for k, surface in surfaces if surface.conic is not None]
+        even = [k for k, surface in surfaces if surface.coefficients is not None and len(surface.coefficients) > 1]
+        self.terms = [(k, number((k, "a4"))) for k in even]
 
     def departures(self, state: LensState, vertex):
         """G (K,) in 1/mm³."""
@@ -143,47 +142,41 @@ class _Shapes:
         return departure_from_sphere(c, listed(shape, count), listed(terms, count), vertex)
 
 
-def _of_seidel(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _seidel_sum(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A sum in waves of the row's wavelength, of a surface or of all."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        _need_seidel(lines[0], planner)
+        if is_bent(planner.lens):
+            raise BadRow(lines[0], "is of a straight axis: tilts and decentres bend this one")
+        for k, surface in enumerate(planner.lens.surfaces):
+            if not is_even(surface):
+                raise BadRow(lines[0], f"is of even powers of r: surface {k} has other terms, added sag or a phase")
         shapes = planner.shared(_Shapes)
         share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
 
         def number(context: EvaluationContext, line: Line):
-            sums = context.state.kept(_seidel, line.wavelength, shapes)[which]
-            surface = line.row.integers[0]
-            told = sums[surface - 1] if surface else sums.sum()
-            return told / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
+            sums, surface = context.state.kept(_seidel, line.wavelength, shapes)[which], line.row.integers[0]
+            total = sums[surface - 1] if surface else sums.sum()
+            return total / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
 
-        return lambda context: Found(listed([number(context, line) for line in lines], context.state.count))
+        return lambda context: RowValues(listed([number(context, line) for line in lines], context.state.count))
 
     return plan
 
 
-def _need_seidel(line: Line, planner: Planner) -> None:
-    """Raises BadRow for a lens that Seidel's theory does not know."""
-    if is_bent(planner.lens):
-        raise BadRow(line, "is of a straight axis: tilts and decentres bend this one")
-    for k, surface in enumerate(planner.lens.surfaces):
-        if not is_even(surface):
-            raise BadRow(line, f"is of even powers of r: surface {k} has other terms, added sag or a phase")
-
-
 def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """S5 in waves of the surfaces that rows name; where they name none, the real distortion of the largest field."""
+    """S5 in waves of the surfaces of the rows; of surface 0 the real distortion of the largest field."""
     of_lens = [line for line in lines if line.row.integers[0] == 0]
     of_surface = [line for line in lines if line.row.integers[0] != 0]
-    parts = [(of_lens, _distortion), (of_surface, _of_seidel(4))]
-    planned = [(rows, plan(rows, planner)) for rows, plan in parts if rows]
+    plans = ((of_lens, _distortion), (of_surface, _seidel_sum(4)))
+    planned = [(rows, plan(rows, planner)) for rows, plan in plans if rows]
 
-    def evaluate(context: EvaluationContext) -> Found:
-        told = {}
-        for rows, found in planned:
-            values = found(context).values
-            told |= {line.number: values[k] for k, line in enumerate(rows)}
-        return Found(listed([told[line.number] for line in lines], context.state.count))
+    def evaluate(context: EvaluationContext) -> RowValues:
+        numbers = {}
+        for rows, values_of in planned:
+            values = values_of(context).values
+            numbers |= {line.number: values[k] for k, line in enumerate(rows)}
+        return RowValues(listed([numbers[line.number] for line in lines], context.state.count))
 
     return evaluate
 
@@ -195,117 +188,108 @@ def _distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """100 (h/h₀ - 1) in %, or h - h₀ where the number in the column of Hx is not 0; h₀ by a ray near the axis."""
     fields = [field_of(planner, line.row.integers[0]) for line in lines]
     for line, field in zip(lines, fields, strict=True):
-        if not any(field) or not _largest(planner):
+        if not any(field) or not largest_field(planner.lens):
             raise BadRow(line, f"names field {line.row.integers[0]}, on the axis, where nothing is distorted")
-    close = [tuple(_NEAR_AXIS * part for part in field) for field in fields]
+    close = [tuple(NEAR_AXIS * part for part in field) for field in fields]
     far, near = (
         np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, at, strict=True)])
         for at in (fields, close)
     )
-    x, y = np.array([along(field) for field in fields]).T
-    scale = np.array([_length(planner, field) / _length(planner, at) for field, at in zip(fields, close, strict=True)])
+    meridian = np.array([along(field) for field in fields]).T
+    extent, close_extent = (np.array([_extent(planner, field) for field in at]) for at in (fields, close))
     absolute = np.array([bool(line.row.numbers[0]) for line in lines])
 
-    def evaluate(context: EvaluationContext) -> Found:
-        hits, ideal = context.hits(far), context.hits(near)
-        h, h0 = (part.position[0] * x + part.position[1] * y for part in (hits, ideal))
-        h0 = h0 * scale
-        return Found(known(hits.valid & ideal.valid, np.where(absolute, (h - h0) / planner.unit, 100 * (h / h0 - 1))))
+    def evaluate(context: EvaluationContext) -> RowValues:
+        hits, close_hits = context.hits(far), context.hits(near)
+        h, ideal = (dot_2(part.position, meridian) for part in (hits, close_hits))
+        ideal = ideal * (extent / close_extent)
+        error = np.where(absolute, (h - ideal) / planner.unit, 100 * relative_error(h, ideal))
+        return RowValues(known(hits.valid & close_hits.valid, error))
 
     return evaluate
 
 
-def _largest(planner: Planner) -> float:
-    fields = planner.lens.fields
-    return float(torch.hypot(fields.x, fields.y).max())
-
-
-def _length(planner: Planner, field: tuple[float, float]) -> float:
-    """What the ideal height of a field is proportional to: tan θ, or the height itself."""
-    size = _largest(planner) * float(np.hypot(*field))
+def _extent(planner: Planner, field: tuple[float, float]) -> float:
+    """tan θ of a field, or its height: the ideal image height is proportional to it."""
+    size = largest_field(planner.lens) * float(np.hypot(*field))
     return float(np.tan(np.deg2rad(size))) if planner.lens.fields.kind == "angle" else size
 
 
 def _largest_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """|distortion|, or the target where that is met."""
-    found = _distortion(lines, planner)
-    targets = np.array([line.row.target for line in lines])
-    return lambda context: Found(np.maximum(np.abs(found(context).values), targets))
+    distortion, targets = _distortion(lines, planner), np.array([line.row.target for line in lines])
+    return lambda context: RowValues(np.maximum(np.abs(distortion(context).values), targets))
 
 
 def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """The largest |y - f θ|, in % of f θ or as it is, of fields along y, f by least squares over all of them."""
-    if planner.lens.fields.kind != "angle" or not _largest(planner):
+    """The largest |y - f θ|, in % of f θ or in lengths, of fields along y; f by least squares over all of them."""
+    largest = largest_field(planner.lens)
+    if planner.lens.fields.kind != "angle" or not largest:
         kind = planner.lens.fields.kind.replace("_", " ")
         raise BadRow(lines[0], f"is of angles of the field; this lens has a field of {kind}")
     steps = _FIELDS if planner.conventions.f_theta == "axis left out" else _FIELDS - 1
     parts = [(k + 1) / steps for k in range(steps)]
-    theta = np.deg2rad(_largest(planner)) * np.array(parts)
-    rays = [np.array([_chief(line, planner, (0.0, part), line.wavelength) for part in parts]) for line in lines]
+    theta = np.deg2rad(largest) * np.array(parts)
 
-    def number(context: EvaluationContext, line: Line, asked: np.ndarray):
-        hits = context.hits(asked)
-        if not hits.valid.all():
-            return np.nan
-        y = hits.position[1]
-        ideal = ((y * theta).sum() / (theta @ theta)) * theta
-        off = np.abs((y - ideal) / planner.unit if line.row.numbers[0] else 100 * (y / ideal - 1))
-        return off[int(np.argmax(value_of(off)))]
+    def row(line: Line) -> Callable[[EvaluationContext], object]:
+        rays = np.array([_chief(line, planner, (0.0, part), line.wavelength) for part in parts])
 
-    def evaluate(context: EvaluationContext) -> Found:
-        told = [number(context, line, asked) for line, asked in zip(lines, rays, strict=True)]
-        return Found(listed(told, context.state.count))
+        def number(context: EvaluationContext):
+            hits = context.hits(rays)
+            if not hits.valid.all():
+                return np.nan
+            y = hits.position[1]
+            ideal = ((y * theta).sum() / (theta @ theta)) * theta
+            absolute = line.row.numbers[0]
+            error = np.abs((y - ideal) / planner.unit if absolute else 100 * relative_error(y, ideal))
+            return error[int(np.argmax(value_of(error)))]
 
-    return evaluate
+        return number
+
+    return per_row(map(row, lines))
 
 
 def _field_curvature(across: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
-    """mm from the image along z to where close rays about the chief ray meet: -Δx/Δ(L/N), in the plane of the field."""
+    """mm from the image along z to the focus of close rays about the chief ray, in the plane of the field or across."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        sections = []
-        for line in lines:
-            x, y = along(line.field)
-            sections.append((y, -x) if across else (x, y))
-        first, second = (
-            np.array(
-                [
-                    planner.ray(line, pupil=bare(planner, line.field, (side * x, side * y)))
-                    for line, (x, y) in zip(lines, sections, strict=True)
-                ]
-            )
-            for side in (_NEAR_CHIEF, -_NEAR_CHIEF)
-        )
-        x, y = np.array(sections).T
+        meridians = [along(line.field) for line in lines]
+        sections = [(y, -x) if across else (x, y) for x, y in meridians]
 
-        def evaluate(context: EvaluationContext) -> Found:
-            one, other = context.hits(first), context.hits(second)
-            apart = (one.position[0] - other.position[0]) * x + (one.position[1] - other.position[1]) * y
-            opening = sum(
-                (one.direction[k] / one.direction[2] - other.direction[k] / other.direction[2]) * part
-                for k, part in enumerate((x, y))
-            )
-            return Found(known(one.valid & other.valid, -apart / opening))
+        def rays(side: float) -> np.ndarray:
+            points = [
+                unvignetted(planner, line.field, (side * x, side * y))
+                for line, (x, y) in zip(lines, sections, strict=True)
+            ]
+            return np.array([planner.ray(line, pupil=point) for line, point in zip(lines, points, strict=True)])
+
+        first, second, section = rays(NEAR_CHIEF), rays(-NEAR_CHIEF), np.array(sections).T
+
+        def evaluate(context: EvaluationContext) -> RowValues:
+            a, b = context.hits(first), context.hits(second)
+            apart = [a.position[k] - b.position[k] for k in range(2)]
+            opening = [a.direction[k] / a.direction[2] - b.direction[k] / b.direction[2] for k in range(2)]
+            focus = focus_of_close_rays(dot_2(apart, section), dot_2(opening, section))
+            return RowValues(known(a.valid & b.valid, focus))
 
         return evaluate
 
     return plan
 
 
-_SEIDEL = "S{} in waves: of a surface (0: all of them), at a wavelength"
-_SEIDEL_CONVENTION = "Seidel's coefficient S{} itself over the wavelength; `seidel` wavefront: S{}/{}"
-_CONTRIBUTION = "contribution", "wavelength"
-_CLOSE = "without vignetting factors, by rays at a thousandth of the pupil"
-
-
 def _sum_row(which: int, word: str, share: int) -> Operand:
     return Operand(
-        _of_seidel(which - 1),
-        f"{word} " + _SEIDEL.format(which),
-        convention=_SEIDEL_CONVENTION.format(which, which, share),
+        _seidel_sum(which - 1),
+        f"{word} S{which} in waves: of a surface (0: all of them), at a wavelength",
+        convention=f"Seidel's coefficient S{which} itself over the wavelength; `seidel` wavefront: S{which}/{share}",
         takes=_CONTRIBUTION,
     )
 
+
+_CONTRIBUTION = "contribution", "wavelength"
+_CLOSE = "without vignetting factors, by rays at a thousandth of the pupil"
+_SIGN = "the first wavelength's less the second's; `colour` second: the other way round"
+_OR_LENGTHS = "in lengths where the number in the column of Hx is not 0"
 
 ABERRATIONS = {
     "AXCL": Operand(
@@ -313,14 +297,14 @@ ABERRATIONS = {
         "axial colour: where one wavelength meets the axis less where another does; paraxial, or of the real ray at "
         "the height of the pupil in the column of Hx",
         length=1,
-        convention="the first wavelength's less the second's; `colour` second: the other way round",
+        convention=_SIGN,
         takes=("shortest", "longest"),
     ),
     "LACL": Operand(
         _lateral_colour,
         "lateral colour: y of the chief ray of one wavelength less that of another, of the largest field",
         length=1,
-        convention="real chief rays; the first wavelength's less the second's; `colour` second: the other way round",
+        convention=f"real chief rays; {_SIGN}",
         takes=("shortest", "longest"),
     ),
     "SPHA": _sum_row(1, "spherical aberration", 8),
@@ -329,8 +313,8 @@ ABERRATIONS = {
     "FCUR": _sum_row(4, "field curvature", 4),
     "DIST": Operand(
         _distortion_sum,
-        "distortion S5 in waves of a surface at a wavelength; of surface 0 that of the largest field in %, or in "
-        "lengths where the number in the column of Hx is not 0",
+        f"distortion S5 in waves of a surface at a wavelength; of surface 0 that of the largest field in %, or "
+        f"{_OR_LENGTHS}",
         convention="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, "
         "against one near the axis",
         takes=_CONTRIBUTION,
@@ -338,30 +322,25 @@ ABERRATIONS = {
     "DIMX": Operand(
         _largest_distortion,
         "|distortion| of a field (0: the largest) at a wavelength is meant to be below the target: its value in %, or "
-        "in lengths where the number in the column of Hx is not 0, or the target itself where that is met",
+        f"{_OR_LENGTHS}, or the target itself where that is met",
         convention="of the largest field alone where the field is 0; the ideal height by a chief ray near the axis",
         takes=("field", "wavelength"),
     ),
     "DISC": Operand(
         _calibrated_distortion,
-        "largest distortion from y = f θ at a wavelength, in %, or in lengths where the number in the column of Hx is "
-        "not 0",
+        f"largest distortion from y = f θ at a wavelength, in %, or {_OR_LENGTHS}",
         convention=f"{_FIELDS} fields along y at even steps, the axis left out, f by least squares over them; "
         f"`f_theta` axis included: {_FIELDS - 1} steps and the axis",
         takes=("", "wavelength"),
     ),
-    "FCGS": Operand(
-        _field_curvature(True),
-        "sagittal field curvature of a field Hx Hy: from the image to the focus of close rays",
-        length=1,
-        convention=_CLOSE,
-        takes=("", "wavelength"),
-    ),
-    "FCGT": Operand(
-        _field_curvature(False),
-        "tangential field curvature of a field Hx Hy: from the image to the focus of close rays",
-        length=1,
-        convention=_CLOSE,
-        takes=("", "wavelength"),
-    ),
+    **{
+        name: Operand(
+            _field_curvature(across),
+            f"{word} field curvature of a field Hx Hy: from the image to the focus of close rays",
+            length=1,
+            convention=_CLOSE,
+            takes=("", "wavelength"),
+        )
+        for name, across, word in (("FCGS", True, "sagittal"), ("FCGT", False, "tangential"))
+    },
 }

@@ -1,17 +1,27 @@
-"""Operands of arithmetic: what rows make of the values of other rows, wherever those stand.
+"""Operands of arithmetic: functions of the values of other rows, before or after them.
 
-Values are those of the rows as they are told: in the unit of length of the merit function, targets and weights left
-out. A row whose number does not exist, as the root of a negative one, is nan and counts as lost.
+Values are those of the rows as they are reported: in the unit of length of the merit function, without targets and
+weights. A row without a number, as the root of a negative one, is nan and counts as lost.
 """
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
 from raytrace.maths.dual import Dual, value_of
-from raytrace.optimization.context import SETTINGS, BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
-from raytrace.optimization.operands.paraxial import listed
+from raytrace.optimization.context import (
+    SETTINGS,
+    BadRow,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Planner,
+    RowValues,
+)
+from raytrace.optimization.lens_state import listed
 from raytrace.system.optimization_data import Row
 
 
@@ -40,17 +50,16 @@ def _two(line: Line, rows: Sequence[Row]) -> list[int]:
 def _range(line: Line, rows: Sequence[Row]) -> list[int]:
     """All between two that have a value; the ends may be text."""
     first, last = sorted(line.row.integers)
-    for number in (first, last):
-        if not 1 <= number <= len(rows):
-            raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}")
-    found = [number for number in range(first, last + 1) if rows[number - 1].operand not in SETTINGS]
-    if not found:
+    if first < 1 or last > len(rows):
+        raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}")
+    numbers = [number for number in range(first, last + 1) if rows[number - 1].operand not in SETTINGS]
+    if not numbers:
         raise BadRow(line, f"takes the values of rows {first} to {last}: none of them has one")
-    return found
+    return numbers
 
 
 def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
-    """Rows of arithmetic, each behind those that it takes values of. Raises Circle where they go in a circle.
+    """Rows of arithmetic, each after those that it takes values of. Raises Circle.
 
     referred: the rows whose values each takes, by its own number.
     """
@@ -63,19 +72,16 @@ def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
         ) from None
 
 
-def _operand(tell: Callable, refers: Callable, text: str, convention: str = "", bounds: str = "") -> Operand:
-    """tell: of the row and of the values that it takes."""
+def _operand(function: Callable, refers: Callable, text: str, convention: str = "", bounds: str = "") -> Operand:
+    """function: of the row and of the values that it takes."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        taken = [refers(line, planner.rows) for line in lines]
+        taken = [(line.row, refers(line, planner.rows)) for line in lines]
 
-        def evaluate(context: EvaluationContext) -> Found:
+        def evaluate(context: EvaluationContext) -> RowValues:
             with np.errstate(all="ignore"):
-                told = [
-                    tell(line.row, *(context.values[n] for n in numbers))
-                    for line, numbers in zip(lines, taken, strict=True)
-                ]
-                return Found(_finite(listed(told, context.state.count)))
+                numbers = [function(row, *(context.values[n] for n in rows)) for row, rows in taken]
+                return RowValues(_finite(listed(numbers, context.state.count)))
 
         return evaluate
 
@@ -83,13 +89,13 @@ def _operand(tell: Callable, refers: Callable, text: str, convention: str = "", 
 
 
 def _finite(number):
-    """nan where there is no number; no derivative where there is none."""
+    """nan for an infinite number, with a derivative of 0."""
     if isinstance(number, Dual):
         return Dual(_finite(number.value), np.where(np.isfinite(number.slope), number.slope, 0.0))
     return np.where(np.isfinite(number), number, np.nan)
 
 
-# -- what they do ------------------------------------------------------------------------------------------------------
+# -- their functions ---------------------------------------------------------------------------------------------------
 
 
 def _in_angle(function: Callable) -> Callable:
@@ -106,12 +112,7 @@ def _logarithm(function: Callable) -> Callable:
 
 
 def _folded(function: Callable) -> Callable:
-    def tell(row: Row, first, *others):
-        for other in others:
-            first = function(first, other)
-        return first
-
-    return tell
+    return lambda row, *values: reduce(function, values)
 
 
 def _above(row: Row, a):
@@ -125,8 +126,7 @@ def _below(row: Row, a):
 def _spread(row: Row, *values):
     """target + Σ (|v - mean| - target) over those further from the mean than the target."""
     mean = sum(values) / len(values)
-    beyond = [np.maximum(np.abs(value - mean) - row.target, 0.0) for value in values]
-    return row.target + sum(beyond)
+    return row.target + sum(np.maximum(np.abs(value - mean) - row.target, 0.0) for value in values)
 
 
 _FLAG = "; in degrees where the second integer is not 0"

@@ -1,21 +1,9 @@
 """Operands of boundaries: thicknesses, curvatures, conics and semi-diameters that shall not pass a target.
 
-A row over several surfaces is its target where all of them comply, else less, or more, by the sum of what they lack. So
-its error is 0 and does not move where the boundary is kept, and grows from 0 steadily where it is passed. Breaks of
-coordinates are no surfaces here, and a gap ends at the next one that is none. A surface that closes before its
-semi-diameter has no edge: it lacks what it falls short of it in every row of edges, whichever side that bounds.
-
-Semi-diameters: how far the light of all fields reaches from the vertex of every surface, with derivatives.
-
-    s = (1 + a/100) max √(x² + y²) + c
-
-over all fields and wavelengths and the ends of the two diameters of the pupil, at every state; a per cent and c mm are
-the margin of `OptimizationData`, which neither the stop nor the image has. The derivative is that of the largest ray.
-
-Gaps: what stands behind the surfaces of a lens: thicknesses at centre and edge, and sags, with derivatives.
-
-A gap goes from a surface to the next one that is no coordinate break. All of them are found at once, when the first row
-asks at a state; arrays (S,) have an entry for every surface, of which only those that were asked for mean anything.
+A row over several surfaces is its target if all of them comply, else less, or more, by the sum of their violations. Its
+error is 0, with zero derivatives, where the boundary is kept, and grows continuously where it is passed. Coordinate
+breaks are no surfaces here: a gap ends at the next surface that is none. A surface that closes before its semi-diameter
+has no edge: the difference is a violation of every row of edges, least or largest.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -24,118 +12,117 @@ import numpy as np
 import torch
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.dual import Dual, value_of
-from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
-from raytrace.optimization.lens_state import ENDS, LensState
-from raytrace.optimization.ray_bundle import Bundle, Marks
+from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.optimization.lens_state import ENDS, LensState, listed
+from raytrace.optimization.ray_bundle import Bundle, largest_field
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
 from raytrace.tracing.trace import media
 
 
 class SemiDiameters:
-    """Those of the surfaces that are asked for; rays are traced only where one of these follows them."""
+    """Semi-diameters with derivatives; rays are traced only for surfaces of rows whose semi-diameter follows the rays.
+
+        s = (1 + a/100) max √(x² + y²) + c
+
+    over all fields and wavelengths and the ends of the two diameters of the pupil; a per cent and c mm are the margin
+    of `OptimizationData`, which neither the stop nor the image has. The derivative is that of the largest ray.
+    """
 
     def __init__(self, planner: Planner):
-        lens, view = planner.lens, planner.view
-        self.given = given_semi_diameters(view)
-        percent, length = (0.0, 0.0) if lens.optimization_data is None else lens.optimization_data.semi_diameter_margin
-        without = (lens.stop, planner.image)
-        surfaces = range(len(lens.surfaces))
-        self.factors = np.array([1.0 if k in without else 1 + percent / 100 for k in surfaces])
-        self.lengths = np.array([0.0 if k in without else length for k in surfaces])
-        self.view, self.asked, self._bundle = view, set(), None
+        self.view, surfaces, data = planner.view, planner.lens.surfaces, planner.lens.optimization_data
+        fixed = range(len(surfaces)) if data is None else data.semi_diameters
+        #: mm, by surface, of those that do not follow the rays; the object's is 0 by default.
+        self.fixed = {0: surfaces[0].semi_diameter or 0.0}
+        self.fixed |= {k: float(surfaces[k].semi_diameter) for k in fixed if surfaces[k].semi_diameter}
+        percent, length = (0.0, 0.0) if data is None else data.semi_diameter_margin
+        has_margin = ~np.isin(np.arange(len(surfaces)), (planner.lens.stop, planner.image))
+        self.factors, self.lengths = np.where(has_margin, 1 + percent / 100, 1.0), np.where(has_margin, length, 0.0)
+        self.asked: set[int] = set()
+        self._bundle: Bundle | None = None
 
     def ask(self, surfaces: Iterable[int]) -> None:
-        """Tell, while rows are planned, whose semi-diameters will be looked at."""
+        """Register, while rows are planned, surfaces whose semi-diameters they need."""
         self.asked |= set(surfaces)
 
     def at(self, context: EvaluationContext):
-        """mm (S,) of all surfaces; nan of those that were not asked for, and where no ray arrives."""
-        return context.once(self._found)
+        """mm (S,) of all surfaces; nan of those without a row, and where no ray arrives."""
+        return context.once(self._at)
 
-    def _found(self, context: EvaluationContext):
-        found = np.full(len(self.factors), np.nan)
-        follow = sorted(self.asked - set(self.given))
-        slopes = np.zeros((context.state.count, len(found)))
-        if follow:
-            places = np.array(follow) - 1
-            heights, by = largest_heights(self.bundle(follow[-1]).marks(context.state), places)
-            found[follow] = self.factors[follow] * heights + self.lengths[follow]
+    def _at(self, context: EvaluationContext):
+        sizes = np.full(len(self.factors), np.nan)
+        slopes = np.zeros((context.state.count, len(sizes)))
+        if follow := sorted(self.asked - set(self.fixed)):
+            heights, by = self._largest_heights(context.state, follow)
+            sizes[follow] = self.factors[follow] * heights + self.lengths[follow]
             if by is not None:
                 slopes[:, follow] = self.factors[follow] * by
-        for surface, number in self.given.items():
-            found[surface] = number
-        return Dual(found, slopes) if context.state.count else found
+        for surface, number in self.fixed.items():
+            sizes[surface] = number
+        return Dual(sizes, slopes) if context.state.count else sizes
 
-    def bundle(self, last: int) -> Bundle:
-        """The rays up to a surface; `last` is the same in every call, once rows are planned."""
+    def _largest_heights(self, state: LensState, surfaces: list[int]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Largest √(x² + y²) mm (P,) on some surfaces, and its derivatives (V, P); nan where no ray arrives."""
+        marks, places = self._rays(surfaces[-1]).marks(state), np.array(surfaces) - 1
+        x, y, valid = marks.x[places], marks.y[places], marks.valid[places]
+        heights = np.where(valid, np.hypot(x, y), -1.0)
+        ray, rows = heights.argmax(-1), np.arange(len(places))
+        largest = heights[rows, ray]
+        largest = np.where(largest < 0, np.nan, largest)
+        if marks.by_x is None:
+            return largest, None
+        cosine, sine = (part[rows, ray] / np.where(largest > 0, largest, 1.0) for part in (x, y))
+        by_x, by_y = (part[places, :, ray] for part in (marks.by_x, marks.by_y))
+        slopes = cosine[:, None] * by_x + sine[:, None] * by_y
+        return largest, np.where(np.isnan(largest)[:, None], 0.0, slopes).T
+
+    def _rays(self, last: int) -> Bundle:
+        """The rays through the `ENDS` of all fields and wavelengths up to a surface, the same in every call."""
         if self._bundle is None:
-            self._bundle = outermost(self.view, last)
+            fields, self._bundle = self.view.lens.fields, Bundle(self.view, last)
+            largest = largest_field(self.view.lens) or 1.0
+            points = [*zip((fields.x / largest).tolist(), (fields.y / largest).tolist(), strict=True)]
+            for wavelength in range(len(self.view.wavelengths)):
+                for field in points:
+                    for end in ENDS:
+                        self._bundle.ask(wavelength, field, end)
         return self._bundle
 
 
-def given_semi_diameters(view) -> dict[int, float]:
-    """mm, by surface: those that stay as they are; the object's is 0 where none is told."""
-    surfaces, optimization_data = view.lens.surfaces, view.lens.optimization_data
-    stay = range(len(surfaces)) if optimization_data is None else optimization_data.semi_diameters
-    told = {k: float(surfaces[k].semi_diameter) for k in stay if surfaces[k].semi_diameter}
-    return {0: surfaces[0].semi_diameter or 0.0} | told
-
-
-def outermost(view, last: int) -> Bundle:
-    """The rays through the `ENDS` of all fields and wavelengths, on the surfaces 1 to `last`."""
-    fields, found = view.lens.fields, Bundle(view, last)
-    x, y = fields.x.detach().numpy(), fields.y.detach().numpy()
-    largest = np.hypot(x, y).max() or 1.0
-    for wavelength in range(len(view.wavelengths)):
-        for field in zip((x / largest).tolist(), (y / largest).tolist(), strict=True):
-            for end in ENDS:
-                found.ask(wavelength, field, end)
-    return found
-
-
-def largest_heights(marks: Marks, places: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Largest √(x² + y²) mm (P,) at some surfaces of a bundle, and its derivatives (V, P); nan where no ray arrives."""
-    x, y, valid = marks.x[places], marks.y[places], marks.valid[places]
-    heights = np.where(valid, np.hypot(x, y), -1.0)
-    ray, rows = heights.argmax(-1), np.arange(len(places))
-    found = heights[rows, ray]
-    found = np.where(found < 0, np.nan, found)
-    if marks.by_x is None:
-        return found, None
-    cosine, sine = (part[rows, ray] / np.where(found > 0, found, 1.0) for part in (x, y))
-    by_x, by_y = (part[places, :, ray] for part in (marks.by_x, marks.by_y))
-    return found, np.where(np.isnan(found)[:, None], 0.0, cosine[:, None] * by_x + sine[:, None] * by_y).T
-
-
-#: Where on the edge of a surface a row looks, by its code: +y, +x, -y, -x.
+#: The point on the edge of a surface, by the code of a row: +y, +x, -y, -x.
 SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 
-_EDGE = 1e-4  # of 1 - (1+k) c² s²: how near its edge the root of a conic is held
+_EDGE = 1e-4  # of 1 - (1+k) c² s²: from where the root of a conic is continued
 
 
 class Gaps:
-    """The gaps of a lens in one configuration."""
+    """Gaps from a surface to the next one that is no coordinate break: thicknesses at centre and edge, sags.
+
+    Arrays (S,) have an entry for every surface; those of surfaces without a row are meaningless.
+    """
 
     def __init__(self, planner: Planner):
         view, surfaces = planner.view, planner.lens.surfaces
+        last = len(surfaces) - 1
         self.semi_diameters = planner.shared(SemiDiameters)
         self.is_air = np.array([is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)])
-        #: -1 behind an odd number of mirrors, where light goes towards -z.
+        #: -1 behind an odd number of mirrors, where light travels towards -z.
         self.side = np.where(view.indices[0] < 0, -1.0, 1.0)
-        #: The surface behind each that ends its gap.
-        self.end = np.array([_next(surfaces, k) for k in range(len(surfaces))])
+        #: The surface that ends the gap behind each.
+        self.end = np.array(
+            [next((k for k in range(j + 1, last) if not surfaces[k].is_break), last) for j in range(last + 1)]
+        )
         self.stored = {"thickness": np.array(view.thickness), "curvature": np.array(view.curvature)}
         self.stored |= {"conic": np.array([0.0 if s.conic is None else float(s.conic.detach()) for s in surfaces])}
-        terms = [_even_terms(surface) for surface in surfaces]
+        terms = [s.coefficients.tolist() if s.coefficients is not None and _is_even(s) else [] for s in surfaces]
         self.terms = [f"a{2 * j + 2}" for j in range(max(map(len, terms)))]
         for j, name in enumerate(self.terms):
-            self.stored[name] = np.array([own[j] if j < len(own) else 0.0 for own in terms])
-        self.others = [k for k, surface in enumerate(surfaces) if not (surface.is_break or is_even(surface))]
+            self.stored[name] = np.array([even[j] if j < len(even) else 0.0 for even in terms])
+        self.others = [k for k, surface in enumerate(surfaces) if not (surface.is_break or _is_even(surface))]
 
     def ask_edges(self, surfaces: Iterable[int]) -> None:
-        """Tell, while rows are planned, behind which surfaces edges will be looked at."""
+        """Register, while rows are planned, surfaces behind which they need edges."""
         self.semi_diameters.ask([k for start in surfaces for k in (start, int(self.end[start]))])
 
     def numbers(self, state: LensState, quantity: str):
@@ -150,16 +137,16 @@ class Gaps:
         return values if slopes is None else Dual(values, slopes)
 
     def centre(self, context: EvaluationContext):
-        """mm on the axis, as the lens has them."""
+        """mm on the axis, signed like the lens's."""
         return context.once(self._centre)
 
     def _centre(self, context: EvaluationContext):
-        own = found = self.numbers(context.state, "thickness")
+        each = total = self.numbers(context.state, "thickness")
         start = np.arange(len(self.end))
         for step in range(1, int((self.end - start).max())):
             within = start + step < self.end
-            found = found + np.where(within, own[np.where(within, start + step, 0)], 0.0)
-        return found
+            total = total + np.where(within, each[np.where(within, start + step, 0)], 0.0)
+        return total
 
     def edge(self, context: EvaluationContext, code: int = 0):
         """mm at the edge: t + z′ - z, each surface at its own semi-diameter; code: the number of a side in `SIDES`."""
@@ -170,7 +157,7 @@ class Gaps:
         return self.centre(context) + (z[self.end] - z)
 
     def whole(self, context: EvaluationContext, code: int = 0):
-        """mm along the axis between what stands out furthest, of both surfaces, be it at the centre or at the edge."""
+        """mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
         z = self.sag(context, code)
         return self.centre(context) + (np.maximum(z[self.end], 0.0) - np.minimum(z, 0.0))
 
@@ -179,20 +166,17 @@ class Gaps:
         return context.once(self._sag, code)
 
     def _sag(self, context: EvaluationContext, code: int):
-        heights = self.semi_diameters.at(context)
-        found = self._even_sag(context.state, heights)
+        state, heights, (x, y) = context.state, self.semi_diameters.at(context), SIDES[code]
+        sag = self._even_sag(state, heights)
         asked = [k for k in self.others if not np.isnan(value_of(heights)[k])]
         if not asked:
-            return found
-        count = context.state.count
-        found = found if isinstance(found, Dual) or not count else Dual(found, np.zeros((count, 1)))
-        values, slopes = value_of(found).copy(), found.full().copy() if count else None
+            return sag
+        values, slopes = value_of(sag).copy(), slope_of(sag, state.count).copy()
         for k in asked:
-            one = _sag_by_torch(context.state, k, heights[k], SIDES[code])
-            values[k] = value_of(one)
-            if count:
-                slopes[:, k] = one.slope
-        return Dual(values, slopes) if count else values
+            sag_of_k = lambda lens, s, k=k: sag_at(lens.surfaces[k], x * s, y * s)  # noqa: E731
+            z = state.each_through_torch(sag_of_k, [heights[k : k + 1]])
+            values[k], slopes[:, k] = value_of(z)[0], slope_of(z, state.count)[:, 0]
+        return Dual(values, slopes) if state.count else values
 
     def shortfall(self, context: EvaluationContext):
         """mm by which surfaces fall short of their semi-diameters s, below 0 where they reach them: s (q - 1)/2.
@@ -222,51 +206,31 @@ class Gaps:
         if closed.any():
             over = np.where(closed, 1 - left / _EDGE, 0.0)
             left = np.where(closed, _EDGE / (1 + over + over * over), left)
-        found = c * u / (1 + np.sqrt(left))
+        sag = c * u / (1 + np.sqrt(left))
         power = u
         for name in self.terms:
-            found = found + power * self.numbers(state, name)
+            sag = sag + power * self.numbers(state, name)
             power = power * u
-        return found
+        return sag
 
 
-def is_even(surface: Surface) -> bool:
-    """Whether the sag is that of a conic with even terms at most, which is told here in numpy."""
+def _is_even(surface: Surface) -> bool:
+    """Whether the sag is that of a conic with even terms at most, which `Gaps` computes in numpy."""
     return surface.sag_terms is None and (surface.coefficients is None or surface.kind == EVEN)
-
-
-def _even_terms(surface: Surface) -> list[float]:
-    return surface.coefficients.tolist() if surface.coefficients is not None and is_even(surface) else []
-
-
-def _next(surfaces: tuple[Surface, ...], start: int) -> int:
-    """The next surface that is no coordinate break, or the image."""
-    last = len(surfaces) - 1
-    return next((k for k in range(start + 1, last) if not surfaces[k].is_break), last)
-
-
-def _sag_by_torch(state: LensState, surface: int, height, side: tuple[float, float]):
-    """The sag of a surface of any kind, a number ()."""
-    with torch.enable_grad():
-        leaves, lens = state.view.leaves({at: value_of(n) for at, n in state.numbers.items()})
-        s = torch.tensor(float(value_of(height)), dtype=torch.float64, requires_grad=True)
-        z = sag_at(lens.surfaces[surface], side[0] * s, side[1] * s)
-        if not state.count:
-            return float(z.detach())
-        by_height = torch.autograd.grad(z, s, retain_graph=True)[0]
-        return state.chained(z, leaves) + float(by_height) * (height - value_of(height))
 
 
 _AT_LEAST, _AT_MOST = 1.0, -1.0
 
-#: What is compared: numbers (S,) of all surfaces at a state.
+#: Numbers (S,) of all surfaces at a state, which rows compare.
 Amounts = Callable[[EvaluationContext], object]
 
-#: How rows are prepared to be compared: of a planner, the surfaces they look at, and their code.
+#: Plans the amounts of rows: of a planner, the surfaces of the rows, and their code.
 Prepared = Callable[[Planner, Sequence[int], int], Amounts]
 
+#: The surfaces of a row, each with a code.
+Chosen = Callable[[Line, Planner], list[tuple[int, int]]]
 
-# -- what is compared --------------------------------------------------------------------------------------------------
+# -- amounts -----------------------------------------------------------------------------------------------------------
 
 
 def _centre(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
@@ -286,7 +250,7 @@ def _whole(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
 
 
 def _along_light(prepared: Prepared) -> Prepared:
-    """Thicknesses behind an odd number of mirrors turned to positive ones."""
+    """Thicknesses with the sign of the direction of light: positive behind an odd number of mirrors, too."""
 
     def prepare(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
         amounts, side = prepared(planner, surfaces, 0), planner.shared(Gaps).side
@@ -298,14 +262,14 @@ def _along_light(prepared: Prepared) -> Prepared:
 
 
 def _semi_diameter(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
-    found = planner.shared(SemiDiameters)
-    found.ask(surfaces)
-    return found.at
+    semi_diameters = planner.shared(SemiDiameters)
+    semi_diameters.ask(surfaces)
+    return semi_diameters.at
 
 
 def _diameter(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
-    found = _semi_diameter(planner, surfaces, code)
-    return lambda context: 2.0 * found(context)
+    semi_diameter = _semi_diameter(planner, surfaces, code)
+    return lambda context: 2.0 * semi_diameter(context)
 
 
 def _slenderness(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
@@ -313,6 +277,12 @@ def _slenderness(planner: Planner, surfaces: Sequence[int], code: int) -> Amount
     diameter, thickness = _diameter(planner, surfaces, code), _along_light(_centre)(planner, surfaces, code)
     asked = np.isin(np.arange(planner.image + 1), surfaces)
     return lambda context: diameter(context) / np.where(asked, thickness(context), 1.0)
+
+
+def _shortfall(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
+    gaps = planner.shared(Gaps)
+    gaps.semi_diameters.ask(surfaces)
+    return gaps.shortfall
 
 
 def _number(quantity: str) -> Prepared:
@@ -323,38 +293,31 @@ def _number(quantity: str) -> Prepared:
     return prepare
 
 
-def _of_glass(tell: Callable) -> Prepared:
+def _of_glass(number: Callable) -> Prepared:
     """A number of the media behind the surfaces, of their indices at the lines d, F and C."""
 
     def prepare(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
         def numbers(lens) -> list:
-            lines = lens.wavelengths.new_tensor([0.5875618, 0.4861327, 0.6562725])
-            indices = media(lens, lines)
-            return [
-                tell(*indices[k].expand(3)) if k in surfaces else torch.zeros(()) for k in range(len(lens.surfaces))
-            ]
+            indices = media(lens, lens.wavelengths.new_tensor([0.5875618, 0.4861327, 0.6562725]))
+            every = range(len(lens.surfaces))
+            return [number(*indices[k].expand(3)) if k in surfaces else torch.zeros(()) for k in every]
 
-        def amounts(context: EvaluationContext):
-            found = context.state.through_torch(numbers)
-            values = np.array([float(value_of(number)) for number in found])
-            return Dual(values, np.stack([number.slope for number in found], -1)) if context.state.count else values
-
-        return amounts
+        return lambda context: listed(context.state.through_torch(numbers), context.state.count)
 
     return prepare
 
 
-# -- which surfaces ----------------------------------------------------------------------------------------------------
+# -- surfaces of a row -------------------------------------------------------------------------------------------------
 
 
 def _single(line: Line, planner: Planner) -> list[tuple[int, int]]:
-    """The surface that a row names, and the side of its edge. Raises BadRow."""
+    """The surface of a row, and the side of its edge. Raises BadRow."""
     surface, code = planner.checked(line, line.row.integers[0]), line.row.integers[1]
     return [(surface, code if 0 <= code < len(SIDES) else 0)]
 
 
 def _range(line: Line, planner: Planner) -> list[tuple[int, int]]:
-    """The surfaces that a row names, from the first behind the object to the last before the image, but for breaks."""
+    """The surfaces of a row, from the first behind the object to the last before the image, without breaks."""
     first, last = line.row.integers
     surfaces = range(max(first, 1), min(last, planner.image - 1) + 1)
     return [(k, 0) for k in surfaces if not planner.lens.surfaces[k].is_break]
@@ -368,19 +331,25 @@ def _in_air(line: Line, planner: Planner) -> list[tuple[int, int]]:
     return [(k, code) for k, code in _range(line, planner) if planner.shared(Gaps).is_air[k]]
 
 
-#: The surfaces of a row, each with a code.
-Chosen = Callable[[Line, Planner], list[tuple[int, int]]]
+def _both_ends(chosen: Chosen) -> Chosen:
+    """The surfaces at the start and the end of the gaps, each once a row; the image has no edge."""
+
+    def ends_of(line: Line, planner: Planner) -> list[tuple[int, int]]:
+        ends = [end for k, _ in chosen(line, planner) for end in (k, int(planner.shared(Gaps).end[k]))]
+        return [(k, 0) for k in dict.fromkeys(ends) if 0 < k < planner.image]
+
+    return ends_of
 
 
-# -- how they are compared ---------------------------------------------------------------------------------------------
+# -- comparison --------------------------------------------------------------------------------------------------------
 
 
 class _Places:
-    """The surfaces (P,) of all rows: `rows`, of which row each is; `at`, their amounts at a state."""
+    """The surfaces (P,) of all rows, the row of each, and their amounts at a state."""
 
     def __init__(self, prepared: Prepared, chosen: Chosen, lines: Sequence[Line], planner: Planner):
-        found = [(number, *pair) for number, line in enumerate(lines) for pair in chosen(line, planner)]
-        self.rows, self.surfaces, self.codes = np.array(found, dtype=int).reshape(-1, 3).T
+        places = [(number, *pair) for number, line in enumerate(lines) for pair in chosen(line, planner)]
+        self.rows, self.surfaces, self.codes = np.array(places, dtype=int).reshape(-1, 3).T
         self.amounts = {
             code: prepared(planner, self.surfaces[self.codes == code].tolist(), code)
             for code in sorted(set(self.codes.tolist()))
@@ -388,143 +357,111 @@ class _Places:
 
     def values(self, context: EvaluationContext) -> np.ndarray:
         """Without derivatives."""
-        found = np.zeros(len(self.rows))
-        for code, tell in self.amounts.items():
-            own = self.codes == code
-            found[own] = value_of(tell(context))[self.surfaces[own]]
-        return found
+        values = np.zeros(len(self.rows))
+        for code, amounts in self.amounts.items():
+            same = self.codes == code
+            values[same] = value_of(amounts(context))[self.surfaces[same]]
+        return values
 
     def at(self, context: EvaluationContext, places: np.ndarray):
         """Those of some places, with derivatives."""
-        found = np.zeros(len(places))
-        for code, tell in self.amounts.items():
-            own = tell(context)[self.surfaces[places]]
-            found = own if len(self.amounts) == 1 else np.where(self.codes[places] == code, own, found)
-        return found
+        numbers = np.zeros(len(places))
+        for code, amounts in self.amounts.items():
+            each = amounts(context)[self.surfaces[places]]
+            numbers = each if len(self.amounts) == 1 else np.where(self.codes[places] == code, each, numbers)
+        return numbers
 
 
-def within(prepared: Prepared, chosen: Chosen, side: float, length: int, also: Prepared | None = None):
-    """Rows that are their target where no surface passes it, else off by what the surfaces lack.
+def _largest_violations(violated: np.ndarray, rows: np.ndarray, violations: np.ndarray) -> np.ndarray:
+    """Of every row the place of the largest violation."""
+    order = violated[np.argsort(-violations[violated], kind="stable")]
+    return order[np.unique(rows[order], return_index=True)[1]]
 
-    also: what the surfaces at both ends of the gaps lack whatever the target is, mm.
+
+def _within(prepared: Prepared, chosen: Chosen, side: float, length: int, also: Prepared | None = None):
+    """Rows that are their target if no surface passes it, else off by the violations.
+
+    also: violations of the surfaces at both ends of the gaps, mm, whatever the target.
     """
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, chosen, lines, planner)
         targets = np.array([line.row.target for line in lines]) * planner.unit**length
-        counted = LACKS[planner.conventions.boundary]
-        closed = None if also is None else _Places(also, _both(chosen), lines, planner)
-        rows = places.rows if closed is None else np.concatenate([places.rows, closed.rows])
-        surfaces = places.surfaces if closed is None else np.concatenate([places.surfaces, closed.surfaces])
+        summed = planner.conventions.boundary == "sum"
+        ends = None if also is None else _Places(also, _both_ends(chosen), lines, planner)
+        rows = places.rows if ends is None else np.concatenate([places.rows, ends.rows])
+        surfaces = places.surfaces if ends is None else np.concatenate([places.surfaces, ends.surfaces])
 
-        def lacking(context: EvaluationContext, chosen: np.ndarray):
-            """What some places lack, with derivatives."""
-            first = chosen[chosen < len(places.rows)]
-            lacks = side * (targets[places.rows[first]] - places.at(context, first))
-            further = chosen[chosen >= len(places.rows)] - len(places.rows)
-            return np.concatenate([lacks, closed.at(context, further)]) if len(further) else lacks
+        def with_derivatives(context: EvaluationContext, some: np.ndarray):
+            """The violations of some places."""
+            first = some[some < len(places.rows)]
+            violations = side * (targets[places.rows[first]] - places.at(context, first))
+            further = some[some >= len(places.rows)] - len(places.rows)
+            return np.concatenate([violations, ends.at(context, further)]) if len(further) else violations
 
-        def evaluate(context: EvaluationContext) -> Found:
-            lacks = side * (targets[places.rows] - places.values(context))
-            lacks = lacks if closed is None else np.concatenate([lacks, closed.values(context)])
-            sides = (rows, lacking(context, np.arange(len(rows))), surfaces) if counted is _all else ()
-            passed = counted(np.flatnonzero(~(lacks <= 0)), rows, lacks)  # nan is none that complies
-            if not passed.size:
-                return Found(targets, sides=sides)
-            of_row = (rows[passed] == np.arange(len(lines))[:, None]).astype(float)
-            return Found(targets - side * (of_row @ lacking(context, passed)), sides=sides)
+        def evaluate(context: EvaluationContext) -> RowValues:
+            violations = side * (targets[places.rows] - places.values(context))
+            violations = violations if ends is None else np.concatenate([violations, ends.values(context)])
+            sides = (rows, with_derivatives(context, np.arange(len(rows))), surfaces) if summed else ()
+            counted = np.flatnonzero(~(violations <= 0))  # nan does not comply
+            counted = counted if summed else _largest_violations(counted, rows, violations)
+            if not counted.size:
+                return RowValues(targets, sides=sides)
+            of_row = (rows[counted] == np.arange(len(lines))[:, None]).astype(float)
+            return RowValues(targets - side * (of_row @ with_derivatives(context, counted)), sides=sides)
 
         return evaluate
 
     return plan
 
 
-def _shortfall(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
-    """How far surfaces fall short of their semi-diameters."""
-    gaps = planner.shared(Gaps)
-    gaps.semi_diameters.ask(surfaces)
-    return gaps.shortfall
-
-
-def _both(chosen: Chosen) -> Chosen:
-    """The surfaces that begin and end the gaps, each once a row; the image ends none that has an edge."""
-
-    def either(line: Line, planner: Planner) -> list[tuple[int, int]]:
-        ends = [end for k, _ in chosen(line, planner) for end in (k, int(planner.shared(Gaps).end[k]))]
-        return [(k, 0) for k in dict.fromkeys(ends) if 0 < k < planner.image]
-
-    return either
-
-
-def _all(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndarray:
-    return passed
-
-
-def _largest(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndarray:
-    """Of every row the place that lacks most."""
-    order = passed[np.argsort(-lacks[passed], kind="stable")]
-    return order[np.unique(rows[order], return_index=True)[1]]
-
-
-#: Which of the places that pass a target count, by `Conventions.boundary`.
-LACKS = {"sum": _all, "largest": _largest}
-
-
-def value(prepared: Prepared):
+def _value(prepared: Prepared):
     """Rows of the amount itself, of one surface."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        places = _Places(prepared, _single, lines, planner)
-        every = np.arange(len(lines))
-        return lambda context: Found(places.at(context, every))
+        places, every = _Places(prepared, _single, lines, planner), np.arange(len(lines))
+        return lambda context: RowValues(places.at(context, every))
 
     return plan
 
 
 _SUM = (
-    "`boundary` sum: of what all surfaces lack, or largest; `behind_mirrors` reversed: thicknesses behind an odd "
-    "number of mirrors are compared along the light, or signed: as the lens has them"
+    "`boundary` sum: of the violations of all surfaces, or largest; `behind_mirrors` reversed: thicknesses behind an "
+    "odd number of mirrors are compared along the light, or signed: as the lens has them"
 )
 _SIGNED = "thicknesses behind mirrors as the lens has them, negative"
 _SIDE = "thickness at the edge behind surface int1; int2: 0 +y, 1 +x, 2 -y, 3 -x"
-_WHOLE = "thickness behind surface int1 from where it begins to where it ends"
+_WHOLE = "thickness behind surface int1 between the extreme points of both surfaces"
 _PLACES = {
-    "G": (_in_glass, "in glass"),
-    "A": (_in_air, "in air, behind mirrors too"),
-    "T": (_range, "in glass and air"),
+    "G": (_in_glass, " in glass"),
+    "A": (_in_air, " in air, behind mirrors too"),
+    "T": (_range, " in glass and air"),
 }
 _RELATIONS = {_AT_LEAST: ">=", _AT_MOST: "<="}
-_SIDES = (("MN", _AT_LEAST, "least"), ("MX", _AT_MOST, "largest"))
-_BOUNDS = (("GT", _AT_LEAST, "at least"), ("LT", _AT_MOST, "at most"))
 
 
-def _ranges(letter: str, prepared: Prepared, text: str, also: Prepared | None = None) -> dict[str, Operand]:
-    """MN… and MX… over the gaps of surfaces int1 to int2."""
-    return {
-        f"{head}{letter}{kind}": Operand(
-            within(_along_light(prepared), surfaces, side, 1, also),
-            f"{word} {text} {place}, surfaces int1 to int2",
-            1,
-            _SUM,
-            bounds=_RELATIONS[side],
-        )
-        for head, side, word in _SIDES
-        for kind, (surfaces, place) in _PLACES.items()
-    }
-
-
-def _of_range(tail: str, prepared: Prepared, surfaces, text: str, length: int = 0) -> dict[str, Operand]:
+def _of_range(
+    tail: str, prepared: Prepared, surfaces: Chosen, text: str, length: int = 0, also: Prepared | None = None
+) -> dict[str, Operand]:
     """MN and MX of a number of surfaces int1 to int2."""
     return {
         f"{head}{tail}": Operand(
-            within(prepared, surfaces, side, length),
+            _within(prepared, surfaces, side, length, also),
             f"{word} {text}, surfaces int1 to int2",
-            length=length,
-            convention=_SUM,
+            length,
+            _SUM,
             bounds=_RELATIONS[side],
         )
-        for head, side, word in _SIDES
+        for head, side, word in (("MN", _AT_LEAST, "least"), ("MX", _AT_MOST, "largest"))
     }
+
+
+def _of_gaps(letter: str, prepared: Prepared, text: str, also: Prepared | None = None) -> dict[str, Operand]:
+    """MN and MX of thicknesses in glass, in air and in both."""
+    rows = {}
+    for kind, (surfaces, place) in _PLACES.items():
+        rows |= _of_range(f"{letter}{kind}", _along_light(prepared), surfaces, text + place, 1, also)
+    return rows
 
 
 def _of_one(
@@ -533,20 +470,20 @@ def _of_one(
     """GT, LT and VA of a number of surface int1."""
     bounds = {
         f"{head}{tail}": Operand(
-            within(prepared, _single, side, length, also),
+            _within(prepared, _single, side, length, also),
             f"{text}, {word} the target",
             length,
             convention,
             bounds=_RELATIONS[side],
         )
-        for tail, side, word in _BOUNDS
+        for tail, side, word in (("GT", _AT_LEAST, "at least"), ("LT", _AT_MOST, "at most"))
     }
-    return bounds | {f"{head}VA": Operand(value(prepared), text, length, convention)}
+    return bounds | {f"{head}VA": Operand(_value(prepared), text, length, convention)}
 
 
 BOUNDARIES: dict[str, Operand] = {
-    **_ranges("C", _centre, "thickness on the axis"),
-    **_ranges("E", _edge, "thickness at the edge", _shortfall),
+    **_of_gaps("C", _centre, "thickness on the axis"),
+    **_of_gaps("E", _edge, "thickness at the edge", _shortfall),
     **_of_range("CV", _number("curvature"), _range, "curvature", -1),
     **_of_range("SD", _semi_diameter, _range, "semi-diameter", 1),
     **_of_range("DT", _slenderness, _in_glass, "diameter over thickness of glasses"),

@@ -1,8 +1,4 @@
-"""Rows of any function of a lens, and what counts as lost where such a function has no number.
-
-Its derivatives are those that torch finds backward through all that it does, from a lens whose numbers are those of
-the state, carried on through solves and pickups.
-"""
+"""Rows of any function of a lens, with the derivatives of torch, backward through the function, solves and pickups."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -10,18 +6,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
-from raytrace.optimization.operands.paraxial import listed
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.optimization.lens_state import listed
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """An operand of one's own: its name, and a function from a lens to a tensor () or (k,).
+    """A user-defined operand: its name, and a function from a lens to a tensor () or (k,).
 
     The lens is in the configuration of the row, with its apertures. Several numbers count by their length √Σ v²; with
-    a target of 0 the solver is given each. length: the power of mm in them, which become the unit of the rows.
+    a target of 0 the solver uses each. length: the power of mm in them, which become the unit of the rows.
     """
 
     name: str
@@ -36,53 +32,48 @@ class Measure:
 
 
 def measured(function: Callable[[Lens], torch.Tensor]) -> Operand:
-    """The operand of rows that hold a `Measure`, or a function just as it is."""
-    text = f"{Row(function).name}, a function of the lens"
-    return Operand(_planned(function), text, length=getattr(function, "length", 0))
+    """The operand of rows of a `Measure`, or of a plain function."""
 
-
-def _planned(function: Callable) -> Callable[[Sequence[Line], Planner], Evaluate]:
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        one, alone = lines[0], []
+        is_scalar = []
 
-        def told(lens: Lens) -> Sequence[torch.Tensor]:
-            found = function(lens)
-            if not isinstance(found, torch.Tensor) or found.dim() > 1 or not found.numel():
-                shape = list(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
-                raise TypeError(f"row {one.number} of the merit function: {shape}, expected a tensor () or (k,)")
-            alone[:] = [found.dim() == 0]
-            return list(found.reshape(-1))
+        def numbers(lens: Lens) -> Sequence[torch.Tensor]:
+            result = function(lens)
+            if not isinstance(result, torch.Tensor) or result.dim() > 1 or not result.numel():
+                shape = list(result.shape) if isinstance(result, torch.Tensor) else type(result).__name__
+                raise TypeError(f"row {lines[0].number} of the merit function: {shape}, expected a tensor () or (k,)")
+            is_scalar[:] = [result.dim() == 0]
+            return list(result.reshape(-1))
 
-        numbers = OrLost(one, lambda context: context.state.through_torch(told, clips=True))
+        numbers_or_none = OrLost(lines[0], lambda context: context.state.through_torch(numbers, clips=True))
 
-        def evaluate(context: EvaluationContext) -> Found:
-            found = numbers(context)
-            if found is None or alone[0]:
-                return Found(listed([np.nan if found is None else found[0]] * len(lines), context.state.count))
-            length = np.sqrt(sum(number * number for number in found))
-            parts = tuple(listed([number] * len(lines), context.state.count) for number in found)
-            return Found(listed([length] * len(lines), context.state.count), parts)
+        def evaluate(context: EvaluationContext) -> RowValues:
+            def alike(number):
+                return listed([number] * len(lines), context.state.count)
+
+            parts = numbers_or_none(context)
+            if parts is None or is_scalar[0]:
+                return RowValues(alike(np.nan if parts is None else parts[0]))
+            return RowValues(alike(np.sqrt(sum(number * number for number in parts))), tuple(map(alike, parts)))
 
         return evaluate
 
-    return plan
+    text = f"{Row(function).name}, a function of the lens"
+    return Operand(plan, text, length=getattr(function, "length", 0))
 
 
 class OrLost:
-    """Numbers of a state, or None where they cannot be had of the lens that an optimisation tries.
+    """Numbers of a state, or None where the lens of a later state does not have them. Raises BadRow for the first."""
 
-    A lens to begin with that does not have them is an error of the row. Raises BadRow.
-    """
-
-    def __init__(self, line: Line, tell: Callable[[EvaluationContext], Sequence]):
-        self.line, self.tell, self.had = line, tell, False
+    def __init__(self, line: Line, numbers: Callable[[EvaluationContext], Sequence]):
+        self.line, self.numbers, self.succeeded = line, numbers, False
 
     def __call__(self, context: EvaluationContext) -> Sequence | None:
         try:
-            found = self.tell(context)
+            numbers = self.numbers(context)
         except ValueError as error:
-            if not self.had:
+            if not self.succeeded:
                 raise BadRow(self.line, f"has no value: {error}") from error
             return None
-        self.had = True
-        return found
+        self.succeeded = True
+        return numbers

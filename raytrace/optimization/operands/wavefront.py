@@ -1,12 +1,10 @@
-"""Operands of image quality: RMS of spots and wavefronts over a whole beam.
-
-A beam is traced with all the rows' rays. Its RMS is the length of a vector, an entry for every ray, which is what the
-solver is given: smooth where the RMS is 0, and no second derivative is lost.
-
-Operands of optical path: the wavefront against a reference sphere, and the paths of single rays.
+"""Operands of optical path: the wavefront against a reference sphere, its RMS and that of spots, paths of single rays.
 
 The sphere is centred where the chief ray meets the image and passes through the axial point of the exit pupil; that of
 `wavefront_of` has the radius along the chief ray from the plane of the exit pupil.
+
+A row of an RMS is traced with all other rows' rays. Its RMS is the length of a vector, an entry for every ray, which
+the solver uses: smooth where the RMS is 0, and no second derivative is lost.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,8 +15,8 @@ import numpy as np
 from raytrace.maths.dual import Dual, Vector, slope_of, value_of
 from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings, square
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
-from raytrace.optimization.operands.paraxial import listed
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.optimization.operands.paraxial import image_index, per_row
 from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
 from raytrace.tracing.aiming import is_bent
@@ -46,8 +44,8 @@ def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
     """
     centre = x, y, z = Vector(chief.position)
     if bent:
-        (bx, by, bz, *along), weight = _pupil_on_base_ray(context)
-        v = tuple(weight * (c - b) - d for c, b, d in zip(centre, (bx, by, bz), along, strict=True))
+        *base, weight = context.state.through_torch(_pupil_on_base_ray(context.planner.primary))
+        v = tuple(weight * (c - b) - d for c, b, d in zip(centre, base[:3], base[3:], strict=True))
     else:
         data = context.state.gaussian(context.planner.primary)
         B, weight = data.rear
@@ -56,15 +54,14 @@ def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
     return Sphere(centre, side * weight / np.sqrt(dot(v, v)))
 
 
-def _pupil_on_base_ray(context: EvaluationContext) -> tuple[list, object]:
-    """Where the base ray meets the image and its direction there, and the mean vergence 1/mm of the exit pupils."""
+def _pupil_on_base_ray(wavelength: int) -> Callable:
+    """Of a lens: where the base ray meets the image, its direction there, and the mean vergence 1/mm of the pupils."""
 
-    def told(lens):
-        base = base_ray(lens, lens.wavelengths[context.planner.primary])
+    def numbers(lens):
+        base = base_ray(lens, lens.wavelengths[wavelength])
         return *base.position, *base.direction, 0.5 * (1 / base.exit_pupil_position).sum(0)
 
-    *numbers, vergence = context.state.through_torch(told)
-    return numbers, vergence
+    return numbers
 
 
 # -- the wavefront -----------------------------------------------------------------------------------------------------
@@ -77,43 +74,40 @@ def opd_of(
 
     beams: (wavelength from 0, field) of each; clips: whether apertures stop rays, though not chief rays.
     """
-    every = {beam: number for number, beam in enumerate(dict.fromkeys(beams))}
-    of = np.array([every[beam] for beam in beams])
-    chief = np.array([planner.ask(w, field, (0.0, 0.0)) for w, field in every])
-    about = chief
+    numbers = {beam: number for number, beam in enumerate(dict.fromkeys(beams))}
+    of = np.array([numbers[beam] for beam in beams])
+    chief = centres = np.array([planner.ask(w, field, (0.0, 0.0)) for w, field in numbers])
     if planner.conventions.opd_chief == "primary":
-        about = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in every])
-    wavelength = np.array([w for w, _ in every])
+        centres = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in numbers])
+    wavelength = np.array([w for w, _ in numbers])
     waves = 1e-3 * np.array(planner.view.wavelengths)[wavelength]
     waves = waves if planner.conventions.opd_sign == "longer" else -waves
     bent = is_bent(planner.lens)
 
     def opd(context: EvaluationContext) -> tuple[np.ndarray, object]:
-        hits, chiefs, centres = context.hits(rays, clips=clips), context.hits(chief), context.hits(about)
-        sphere, index = sphere_of(context, centres, bent), image_index(context, wavelength)
-        zero = path_to_reference_sphere(chiefs, *sphere, index)
-        found = (path_to_reference_sphere(hits, *sphere.at(of), index[of]) - zero[of]) / waves[of]
-        return hits.valid & (chiefs.valid & centres.valid)[of], found
+        hits, chief_hits, about = context.hits(rays, clips=clips), context.hits(chief), context.hits(centres)
+        sphere, index = sphere_of(context, about, bent), image_index(context, wavelength)
+        zero = path_to_reference_sphere(chief_hits, *sphere, index)
+        difference = (path_to_reference_sphere(hits, *sphere.at(of), index[of]) - zero[of]) / waves[of]
+        return hits.valid & (chief_hits.valid & about.valid)[of], difference
 
     return opd
 
 
-def image_index(context: EvaluationContext, wavelengths: np.ndarray):
-    """Index in front of the image at wavelengths, counted from 0."""
-    found = [np.abs(context.state.index(w)[-2]) for w in wavelengths]
-    return listed(found, context.state.count) if any(isinstance(n, Dual) for n in found) else np.array(found)
-
-
-def opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]):
-    """OPD in waves less what fits best of some terms (R, K) of rows, by the weights of the rows; K = 0: the OPD."""
+def _opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """OPD in waves less the best fit of some terms (R, K) of rows, by the weights of the rows; K = 0: the OPD."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         opd = opd_of(planner.rays(lines), [(line.wavelength, line.field) for line in lines], planner)
-        fit = Fit(terms(lines, planner), _weights(lines))
+        weights = np.array([max(line.row.weight, 0.0) for line in lines])
+        for places in _groups(lines):
+            if not weights[places].any():
+                weights[places] = 1.0
+        fit = Fit(terms(lines, planner), weights)
 
-        def evaluate(context: EvaluationContext) -> Found:
-            valid, found = opd(context)
-            return Found(known(valid, fit.less(found, valid)))
+        def evaluate(context: EvaluationContext) -> RowValues:
+            valid, values = opd(context)
+            return RowValues(known(valid, fit.less(values, valid)))
 
         return evaluate
 
@@ -121,7 +115,7 @@ def opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]):
 
 
 class Fit:
-    """Least squares with basis (R, K) and weights (R,): v - B (√w B)⁺ √w v, over the entries that are there."""
+    """Least squares with basis (R, K) and weights (R,): v - B (√w B)⁺ √w v, over the valid entries."""
 
     def __init__(self, basis: np.ndarray, weights: np.ndarray):
         self.basis, self.weights = basis, weights
@@ -132,44 +126,35 @@ class Fit:
         return np.linalg.pinv(root[:, None] * self.basis) * root
 
     def less(self, values, valid: np.ndarray):
-        """Values (R,) less their fit; valid: (R,) which count."""
+        """Values (R,) less their fit; valid: (R,)."""
         if not self.basis.shape[1]:
             return values
         inverse = self.inverse if valid.all() else self._inverse(self.weights * valid)
         return values - self.basis @ (inverse @ values)
 
 
-def _weights(lines: Sequence[Line]) -> np.ndarray:
-    """(R,) those of rows, all alike for a field and wavelength without any."""
-    weights = np.array([max(line.row.weight, 0.0) for line in lines])
-    for places in _groups(lines):
-        if not weights[places].any():
-            weights[places] = 1.0
-    return weights
-
-
 def _groups(lines: Sequence[Line], *, colours: bool = True) -> list[list[int]]:
     """Places of the rows of each field, and, unless `colours` is False, of each wavelength."""
-    found: dict[tuple, list[int]] = {}
+    groups: dict[tuple, list[int]] = {}
     for place, line in enumerate(lines):
-        found.setdefault((line.field, line.wavelength if colours else None), []).append(place)
-    return list(found.values())
+        groups.setdefault((line.field, line.wavelength if colours else None), []).append(place)
+    return list(groups.values())
 
 
-def nothing(lines: Sequence[Line], planner: Planner) -> np.ndarray:
+def _nothing(lines: Sequence[Line], planner: Planner) -> np.ndarray:
     return np.zeros((len(lines), 0))
 
 
-def piston(lines: Sequence[Line], planner: Planner) -> np.ndarray:
+def _piston(lines: Sequence[Line], planner: Planner) -> np.ndarray:
     """1 for each field and wavelength."""
     return _columns(lines, _groups(lines), np.ones(len(lines)))
 
 
-def piston_and_tilt(lines: Sequence[Line], planner: Planner) -> np.ndarray:
+def _piston_and_tilt(lines: Sequence[Line], planner: Planner) -> np.ndarray:
     """1 for each field and wavelength, and the pupil point, by the convention `opd_tilt`.
 
     A field that is mirrored in a plane through the axis, of whose pupil rows leave out half, has no tilt out of it. A
-    tilt that all wavelengths have in common is one of the path: so many waves more the shorter they are.
+    tilt that all wavelengths have in common is one of the path: more waves of the shorter ones.
     """
     x, y = np.array([line.pupil for line in lines]).T
     if planner.view.is_symmetric:
@@ -180,64 +165,50 @@ def piston_and_tilt(lines: Sequence[Line], planner: Planner) -> np.ndarray:
         groups = _groups(lines, colours=False)
         waves = np.array(planner.view.wavelengths)[[line.wavelength for line in lines]]
         x, y = x / waves, y / waves
-    return np.concatenate([piston(lines, planner), _columns(lines, groups, x), _columns(lines, groups, y)], 1)
+    return np.concatenate([_piston(lines, planner), _columns(lines, groups, x), _columns(lines, groups, y)], 1)
 
 
 def _columns(lines: Sequence[Line], groups: list[list[int]], number: np.ndarray) -> np.ndarray:
-    found = np.zeros((len(lines), len(groups)))
+    columns = np.zeros((len(lines), len(groups)))
     for column, places in enumerate(groups):
-        found[places, column] = number[places]
-    return found[:, found.any(0)]
+        columns[places, column] = number[places]
+    return columns[:, columns.any(0)]
 
 
 # -- paths of single rays ----------------------------------------------------------------------------------------------
 
 
-def between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
+def _between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
     """Optical path in mm of a ray between two surfaces.
 
-    leg: both, and the wavelength; surface 0 is the object, or surface 1 where that is at infinity.
+    leg: both, and the wavelength; surface 0 is the object, or surface 1 for an object at infinity.
     """
-
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        paths = [_path_of(line, *leg(line, planner), planner) for line in lines]
-        return lambda context: Found(listed([path(context) for path in paths], context.state.count))
-
-    return plan
+    return lambda lines, planner: per_row(_path_of(line, *leg(line, planner), planner) for line in lines)
 
 
 def _path_of(
     line: Line, first: int, last: int, wavelength: int, planner: Planner
 ) -> Callable[[EvaluationContext], object]:
-    """Reduced path between the surfaces, and that of the axis, which it lacks."""
+    """The reduced path between the surfaces, and that of the axis."""
     first, last = sorted((first, last))
     source = planner.lens.surfaces[0]
     from_object = first == 0 and bool(source.thickness.isfinite())
     if from_object and not source.is_plane:
         raise BadRow(line, "measures from a curved object, which it cannot; name another surface")
     first = max(first, 1)
-    begin, end = (np.array([planner.ray(line, surface=s, wavelength=wavelength)]) for s in (first, max(last, 1)))
+    start, end = (np.array([planner.ray(line, surface=s, wavelength=wavelength)]) for s in (first, max(last, 1)))
 
     def path(context: EvaluationContext):
-        hits, behind = context.hits(begin, surface=first), context.hits(end, surface=max(last, 1))
+        hits, behind = context.hits(start, surface=first), context.hits(end, surface=max(last, 1))
         index, gaps = context.state.index(wavelength), context.state.thickness
-        axis = sum(index[k] * gaps[k] for k in range(first, last))
-        found = behind.opl - hits.opl + axis
+        length = behind.opl - hits.opl + sum(index[k] * gaps[k] for k in range(first, last))
         if from_object:
-            start = context.starts(begin, surface=first)
-            way = (start.position[2] + gaps[0]) / start.direction[2]
-            found = found + (hits.opl - start.opl) + index[0] * way
-        return known(hits.valid & behind.valid, found)[0]
+            launch = context.starts(start, first)
+            way = (launch.position[2] + gaps[0]) / launch.direction[2]
+            length = length + (hits.opl - launch.opl) + index[0] * way
+        return known(hits.valid & behind.valid, length)[0]
 
     return path
-
-
-def _to_surface(line: Line, planner: Planner) -> tuple[int, int, int]:
-    return 0, line.row.integers[0], line.wavelength
-
-
-def _from_one_to_another(line: Line, planner: Planner) -> tuple[int, int, int]:
-    return *line.row.integers, planner.primary
 
 
 _WAVELENGTH = "", "wavelength"
@@ -248,31 +219,31 @@ _SPHERE = (
 
 PATH = {
     "OPDC": Operand(
-        opd_less(nothing),
+        _opd_less(_nothing),
         "optical path difference to the chief ray, waves; Hx Hy Px Py",
         convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDM": Operand(
-        opd_less(piston),
+        _opd_less(_piston),
         "the same less its mean over the rows of its field and wavelength, by weight",
         convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDX": Operand(
-        opd_less(piston_and_tilt),
+        _opd_less(_piston_and_tilt),
         "the same less the piston and tilt that fit its field and wavelength best, by weight",
         convention=f"{_SPHERE}; a tilt for every wavelength (`opd_tilt`)",
         takes=_WAVELENGTH,
     ),
     "OPTH": Operand(
-        between_surfaces(_to_surface),
+        _between_surfaces(lambda line, planner: (0, line.row.integers[0], line.wavelength)),
         "optical path of a ray to a surface, from the object, or from surface 1 if that is at infinity",
         length=1,
         takes=("surface", "wavelength"),
     ),
     "PLEN": Operand(
-        between_surfaces(_from_one_to_another),
+        _between_surfaces(lambda line, planner: (*line.row.integers, planner.primary)),
         "optical path of a ray of the primary wavelength from one surface to another",
         length=1,
         takes=("surface", "surface"),
@@ -280,13 +251,15 @@ PATH = {
 }
 
 
+# -- beams: RMS of spots and wavefronts --------------------------------------------------------------------------------
+
 _LEAST_ARMS = 6
 
 
 class Beam(NamedTuple):
     """The rays (R,) of a row: their numbers, colours (from 0), pupil points (2, R), and shares of the light.
 
-    clips: whether apertures stop some; then what arrives counts, else a ray that does not leaves no value.
+    clips: whether apertures stop some; then the rays that arrive count, else a lost ray leaves no value.
     """
 
     line: Line
@@ -297,7 +270,7 @@ class Beam(NamedTuple):
     clips: bool
 
     def weights(self, valid: np.ndarray) -> np.ndarray | None:
-        """Shares of those that arrive, 1 together; None where the row has no value."""
+        """Shares of the rays that arrive, 1 together; None where the row has no value."""
         if not valid.all() and not (self.clips and valid.any()):
             return None
         shares = self.shares * valid
@@ -309,7 +282,7 @@ def rings(count: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(part.numpy() for part in gauss_rings(count, max(4 * count, _LEAST_ARMS)))
 
 
-def rectangular(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _rectangular(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Those of the cells of a square grid inside the pupil, `count` of them along half its side."""
     return tuple(part.numpy() for part in square(2 * count))
 
@@ -321,50 +294,45 @@ def beam_of(line: Line, rule: Callable, clips: bool, planner: Planner) -> Beam:
     points, weights = rule(line.row.integers[0])
     colours = colours_of(line, planner)
     rays = [planner.ask(w, line.field, point, clips=clips) for w in colours for point in points.T.tolist()]
-    every = np.repeat(np.array(list(colours)), len(weights))
+    of_ray = np.repeat(np.array(list(colours)), len(weights))
     shares = (np.array(list(colours.values()))[:, None] * weights).ravel()
-    return Beam(line, np.array(rays), every, np.tile(points, len(colours)), shares / shares.sum(), clips)
+    return Beam(line, np.array(rays), of_ray, np.tile(points, len(colours)), shares / shares.sum(), clips)
 
 
 def colours_of(line: Line, planner: Planner) -> dict[int, float]:
-    """Wavelengths, from 0, that a row is about, and their weights: its own, or with int2 = 0 all that have one."""
+    """Wavelengths of a row, from 0, and their weights: its own, or with int2 = 0 all that have one."""
     if line.row.integers[1] > 0:
         return {line.wavelength: 1.0}
     weights = planner.lens.wavelength_weights.tolist()
     return {w: weight for w, weight in enumerate(weights) if weight > 0}
 
 
-def rms_of(vectors: Callable, rule: Callable, *, clips: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
-    """The RMS of rows, each the length of what `vectors` gives of its beam."""
+def _rms_of(vectors: Callable, rule: Callable, *, clips: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """The RMS of rows, each the length of the vector of its beam; vectors: None of a row without a value."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        tell = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
+        of_beams = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
 
-        def evaluate(context: EvaluationContext) -> Found:
-            parts = _side_by_side(tell(context), context.state.count)
-            return Found(np.sqrt((parts * parts).sum(0)), (parts,))
+        def evaluate(context: EvaluationContext) -> RowValues:
+            columns, count = of_beams(context), context.state.count
+            longest = max((len(value_of(column)) for column in columns if column is not None), default=1)
+            values, slopes = np.zeros((longest, len(lines))), np.zeros((count, longest, len(lines)))
+            for place, column in enumerate(columns):
+                if column is None:
+                    values[:, place] = np.nan
+                    continue
+                size = len(value_of(column))
+                values[:size, place] = value_of(column)
+                slopes[:, :size, place] = slope_of(column, count)
+            parts = Dual(values, slopes) if count else values
+            return RowValues(np.sqrt((parts * parts).sum(0)), (parts,))
 
         return evaluate
 
     return plan
 
 
-def _side_by_side(vectors: Sequence, count: int):
-    """Vectors (K,) of any length, or None, as columns (K, R), 0 below and nan for None."""
-    longest = max((len(value_of(one)) for one in vectors if one is not None), default=1)
-    values, slopes = np.zeros((longest, len(vectors))), np.zeros((count, longest, len(vectors)))
-    for column, one in enumerate(vectors):
-        if one is None:
-            values[:, column] = np.nan
-            continue
-        size = len(value_of(one))
-        values[:size, column] = value_of(one)
-        if count:
-            slopes[:, :size, column] = slope_of(one, count)
-    return Dual(values, slopes) if count else values
-
-
-def spot(*, about_chief: bool):
+def _spot(*, about_chief: bool):
     """√w (x - x₀) and √w (y - y₀) mm on the image, from the centroid or the primary wavelength's chief ray."""
 
     def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
@@ -386,57 +354,59 @@ def spot(*, about_chief: bool):
     return vectors
 
 
-def wave(*, tilted: bool):
+def _wave(*, tilted: bool):
     """√w W, waves, about the mean of each colour on its own sphere; tilted: about its tilt too, the centroid's."""
 
     def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
         rays = np.concatenate([beam.rays for beam in beams])
-        own = [(w, beam.line.field) for beam in beams for w in beam.colours.tolist()]
-        opd = opd_of(rays, own, planner, clips=beams[0].clips)
+        fields = [(w, beam.line.field) for beam in beams for w in beam.colours.tolist()]
+        opd = opd_of(rays, fields, planner, clips=beams[0].clips)
         ends = np.cumsum([len(beam.rays) for beam in beams])
         places = [slice(end - len(beam.rays), end) for beam, end in zip(beams, ends, strict=True)]
         fits = [Fit(_terms(beam, tilted), beam.shares) for beam in beams]
 
-        def tell(context: EvaluationContext) -> list:
-            valid, found = opd(context)
-            return [of(*one, valid, found) for one in zip(beams, fits, places, strict=True)]
+        def numbers(context: EvaluationContext) -> list:
+            valid, values = opd(context)
+            return [of(*parts, valid, values) for parts in zip(beams, fits, places, strict=True)]
 
-        return tell
+        return numbers
 
-    def of(beam: Beam, fit: Fit, place: slice, valid: np.ndarray, found):
+    def of(beam: Beam, fit: Fit, place: slice, valid: np.ndarray, values):
         weights = beam.weights(valid[place])
-        return None if weights is None else np.sqrt(weights) * fit.less(found[place], valid[place])
+        return None if weights is None else np.sqrt(weights) * fit.less(values[place], valid[place])
 
     return vectors
 
 
 def _terms(beam: Beam, tilted: bool) -> np.ndarray:
     """(R, K): of every colour 1 and, where `tilted`, the pupil point."""
-    own = (beam.colours[:, None] == np.unique(beam.colours)).astype(float)
-    return np.concatenate([own, *(own * part[:, None] for part in beam.points)] if tilted else [own], 1)
+    constants = (beam.colours[:, None] == np.unique(beam.colours)).astype(float)
+    return np.concatenate(
+        [constants, *(constants * part[:, None] for part in beam.points)] if tilted else [constants], 1
+    )
 
 
-_RINGS = "int1 rings of four arms each, six at the least; a ray that does not arrive leaves no value"
-_GRID = "a grid of 2 int1 × 2 int1 cells across the pupil; what apertures stop does not count"
+_RINGS = "int1 rings of four arms each, six at the least; a lost ray leaves no value"
+_GRID = "a grid of 2 int1 × 2 int1 cells across the pupil; rays that apertures stop do not count"
 
-_TABLE = {
-    "RSCE": (spot(about_chief=False), True, "RMS radius of a spot about its centroid"),
-    "RSCH": (spot(about_chief=True), True, "RMS radius of a spot about the chief ray of the primary wavelength"),
-    "RSRE": (spot(about_chief=False), False, "RMS radius of a spot about its centroid"),
-    "RSRH": (spot(about_chief=True), False, "RMS radius of a spot about the chief ray of the primary wavelength"),
-    "RWCE": (wave(tilted=True), True, "RMS wavefront error about the centroid, waves"),
-    "RWCH": (wave(tilted=False), True, "RMS wavefront error about the chief ray, waves"),
-    "RWRE": (wave(tilted=True), False, "RMS wavefront error about the centroid, waves"),
-    "RWRH": (wave(tilted=False), False, "RMS wavefront error about the chief ray, waves"),
+_SPOT, _WAVEFRONT = "RMS radius of a spot about", "RMS wavefront error about"
+#: By the second and the last letter: spot or wavefront, about the centroid or the chief ray.
+_VECTORS = {
+    "SE": (_spot(about_chief=False), f"{_SPOT} its centroid"),
+    "SH": (_spot(about_chief=True), f"{_SPOT} the chief ray of the primary wavelength"),
+    "WE": (_wave(tilted=True), f"{_WAVEFRONT} the centroid, waves"),
+    "WH": (_wave(tilted=False), f"{_WAVEFRONT} the chief ray, waves"),
 }
 
+#: RSCE to RWRH; the third letter: C rings, R grid.
 QUALITY = {
-    name: Operand(
-        rms_of(vector, rings if whole else rectangular, clips=not whole),
+    f"R{quantity}{rule}{about}": Operand(
+        _rms_of(vector, points, clips=clips),
         f"{text}; int1 rays, int2 wavelength (0: all by weight), Hx Hy",
-        length=1 if name.startswith("RS") else 0,
-        convention=_RINGS if whole else _GRID,
+        length=int(quantity == "S"),
+        convention=convention,
         takes=("", "colour"),
     )
-    for name, (vector, whole, text) in _TABLE.items()
+    for rule, points, clips, convention in (("C", rings, False, _RINGS), ("R", _rectangular, True, _GRID))
+    for (quantity, about), (vector, text) in _VECTORS.items()
 }

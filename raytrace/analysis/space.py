@@ -1,0 +1,189 @@
+"""Space: a lens in three dimensions, surfaces as they stand, with the rays of its fields."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.analysis import outline
+from raytrace.maths.pupil import fan
+from raytrace.plotting import style
+from raytrace.system.apertures import reach
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.geometry import Frame, frames
+from raytrace.tracing.trace import media
+
+_RINGS, _ARMS = 6, 48  # of the mesh of a surface
+_LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start
+_MIRROR = "#b9c2ca"
+
+
+def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
+    """Surfaces as shaded meshes, glass with its edge, and the rays of both fans: z to the right, y upward."""
+    figure = style.new_figure(7.5, 6.0)
+    axes = figure.add_subplot(projection="3d", computed_zorder=False)
+    with torch.no_grad():
+        places, radii = frames(lens), outline.drawn_radii(lens, wavelengths, fields)
+        indices = [float(index) for index in media(lens, wavelengths[0])]
+        corners = _draw_surfaces(axes, lens, places, radii, indices)
+        size = max(np.ptp(corners, axis=1).max(), 1e-9)
+        distance = float(lens.surfaces[0].thickness)
+        near = math.isfinite(distance) and 0 < distance <= 1.5 * size
+        start = -distance if near else min(0.0, corners[2].min()) - _LEAD * size
+        drawn = _draw_rays(axes, lens, fields, wavelengths, rays, start)
+        image = _draw_image(axes, places[-1], drawn)
+    _frame(axes, np.concatenate([corners, *drawn, image], axis=1))
+    return figure
+
+
+def _seen(points: np.ndarray) -> np.ndarray:
+    """Points (3, ...) of the system as the axes of the picture take them: z, x and y."""
+    return points[[2, 0, 1]]
+
+
+def _mesh(surface: Surface, frame: Frame, radius: float) -> np.ndarray:
+    """Points (3, rings, arms) mm of what is drawn of a surface."""
+    centre_x, centre_y, radius = outline.clear_part(surface, radius)
+    holes = [reach(aperture)[0] for aperture in surface.apertures if not aperture.obscures and surface.is_mirror]
+    hole = min(max(holes or [0.0]), 0.95 * radius)
+    r = np.linspace(hole, radius, _RINGS + 1)[:, None]
+    angle = np.linspace(0, 2 * np.pi, _ARMS + 1)[None]
+    x, y = (frame.origin.new_tensor(p) for p in (centre_x + r * np.cos(angle), centre_y + r * np.sin(angle)))
+    return style.array(frame.outside(torch.stack([x, y, sag_at(surface, x, y)])))
+
+
+def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], indices: list[float]) -> np.ndarray:
+    """Draws them; returns all points (3, N) of their meshes."""
+    meshes = {}
+    for k, surface in enumerate(lens.surfaces[1:-1], 1):
+        if surface.is_break:
+            continue
+        glass = max(indices[k - 1], indices[k]) > outline.GLASSY
+        if surface.is_mirror or glass or surface.phase is not None or k == lens.stop:
+            meshes[k] = _mesh(surface, places[k], radii[k])
+    for k, mesh in meshes.items():
+        surface = lens.surfaces[k]
+        if surface.is_mirror:
+            _shade(axes, mesh, _MIRROR, 0.75)
+        elif max(indices[k - 1], indices[k]) > outline.GLASSY:
+            _shade(axes, mesh, style.tint(max(indices[k - 1], indices[k])), 0.35)
+        elif surface.phase is not None:
+            _shade(axes, mesh, "#d9d2e9", 0.45)
+        _rim(axes, mesh, style.INK if k == lens.stop else style.GREY, 1.4 if k == lens.stop else 0.7)
+        back = outline.partner(lens, k)
+        if indices[k] > outline.GLASSY and not surface.is_mirror and back in meshes:
+            _edge(axes, mesh, meshes[back], style.tint(indices[k]))
+    return np.concatenate([mesh.reshape(3, -1) for mesh in meshes.values()], axis=1)
+
+
+def _add_tiles(axes, tiles, **look) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    axes.add_collection3d(Poly3DCollection(tiles, **look))
+
+
+def _add_lines(axes, lines, **look) -> None:
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    axes.add_collection3d(Line3DCollection(lines, **look))
+
+
+def _shade(axes, mesh: np.ndarray, colour, alpha: float) -> None:
+    p = _seen(mesh)
+    tiles = [
+        np.stack([p[:, i, j], p[:, i + 1, j], p[:, i + 1, j + 1], p[:, i, j + 1]])
+        for i in range(p.shape[1] - 1)
+        for j in range(p.shape[2] - 1)
+    ]
+    _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=alpha, shade=False)
+
+
+def _edge(axes, front: np.ndarray, back: np.ndarray, colour) -> None:
+    """The ground edge of glass, from rim to rim."""
+    a, b = _seen(front[:, -1]), _seen(back[:, -1])
+    tiles = [np.stack([a[:, j], b[:, j], b[:, j + 1], a[:, j + 1]]) for j in range(a.shape[1] - 1)]
+    _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=0.25, shade=False)
+
+
+def _rim(axes, mesh: np.ndarray, colour: str, width: float) -> None:
+    lines = [_seen(mesh[:, -1]).T, *([_seen(mesh[:, 0]).T] if np.ptp(mesh[:, 0], axis=1).max() > 0 else [])]
+    _add_lines(axes, lines, colors=colour, linewidths=width)
+
+
+def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int, start: float) -> list[np.ndarray]:
+    """Draws both fans of every field and wavelength; returns the points (3, C) of rays that arrive."""
+    dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
+    points = torch.cat([fan(rays, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
+    colours, arrived = style.ray_colours(fields.shape[1], wavelengths.tolist()), []
+    for row, wavelength in zip(colours, wavelengths, strict=True):
+        found = outline.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
+        for colour, paths in zip(row, found, strict=True):
+            whole = [path.points for path in paths if path.status == "ok"]
+            lines = [_seen(path).T for path in whole]
+            _add_lines(axes, lines, colors=[colour], linewidths=0.7, alpha=0.9)
+            arrived += whole
+    return arrived
+
+
+def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
+    """The image surface, a rectangle about where rays end; returns its corners (3, 4)."""
+    if not arrived:
+        return np.zeros((3, 0))
+    ends = frame.origin.new_tensor(np.array([path[:, -1] for path in arrived]).T)
+    x, y, _ = style.array(frame.inside(ends))
+    least = 0.02 * max(np.ptp(np.concatenate(arrived, axis=1), axis=1))
+    half = 0.55 * max(np.ptp(x), np.ptp(y)) + least
+    middle = 0.5 * (x.min() + x.max()), 0.5 * (y.min() + y.max())
+    u = frame.origin.new_tensor([-half, half, half, -half]) + middle[0]
+    v = frame.origin.new_tensor([-half, -half, half, half]) + middle[1]
+    corners = style.array(frame.outside(torch.stack([u, v, torch.zeros_like(u)])))
+    _add_tiles(axes, [_seen(corners).T], facecolor="#f6f0d8", edgecolor=style.INK, linewidths=1.2, alpha=0.7)
+    return corners
+
+
+def _fill_page(axes, points: np.ndarray, span: np.ndarray) -> None:
+    """Make the page as high as what is seen of points (3, N) needs, and that as large as the page.
+
+    Axes in space are square: they are made as wide as the page, and reach beyond it above and below.
+    """
+    figure = axes.figure
+    width = figure.get_figwidth()
+    wide, high = _seen_size(axes, points)
+    page = min(max(width * high / wide + 1.3, 3.0), 6.5)
+    figure.set_figheight(page)
+    axes.set_position((0.0, 0.5 + (0.075 - 0.5 * width) / page, 1.0, width / page))
+    wide, high = _seen_size(axes, points)
+    room = (page - 1.15) * figure.dpi
+    axes.set_box_aspect(span, zoom=0.95 * min(axes.bbox.width / wide, room / high))
+
+
+def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
+    """Width and height in dots of what points (3, N) need about the middle of the box."""
+    axes.apply_aspect()
+    from mpl_toolkits.mplot3d import proj3d
+
+    x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
+    (left, low), (right, high) = axes.viewLim.get_points()  # the middle of the box stands at (0, 0)
+    dots = axes.bbox.width / (right - left), axes.bbox.height / (high - low)
+    return 2 * np.abs(x).max() * dots[0], 2 * np.abs(y).max() * dots[1]
+
+
+def _frame(axes, points: np.ndarray) -> None:
+    """Equal scales about everything that is drawn, a scale bar, and no box."""
+    p = _seen(points)
+    low, high = p.min(axis=1), p.max(axis=1)
+    size = float((high - low).max())
+    span = np.maximum(high - low, 0.12 * size)
+    for name, middle, width in zip("xyz", 0.5 * (low + high), span, strict=True):
+        getattr(axes, f"set_{name}lim")(middle - 0.52 * width, middle + 0.52 * width)
+    axes.set_box_aspect(span)
+    axes.set_proj_type("ortho")
+    axes.view_init(elev=22, azim=-62)
+    axes.set_axis_off()
+    _fill_page(axes, p, span)
+    bar = style.round_length(0.25 * size)
+    at = low - 0.02 * size
+    axes.plot([at[0], at[0] + bar], [at[1]] * 2, [at[2]] * 2, color=style.INK, linewidth=1.5)
+    axes.text(at[0] + 0.5 * bar, at[1], at[2] - 0.05 * size, style.round_text(bar), ha="center", va="top", fontsize=8)

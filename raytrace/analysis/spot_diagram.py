@@ -1,0 +1,389 @@
+"""Spots: the spot of every field and wavelength on the sensor, of rays that are kept or of any number that are not."""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.analysis.panels import first_order_text
+from raytrace.maths import pupil
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
+from raytrace.maths.result import Result, axis, cell, number, numbers
+from raytrace.maths.value import detached, value
+from raytrace.plotting import style
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_label,
+    field_points,
+    field_title,
+    name_of_field,
+    with_wavelengths,
+)
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
+from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
+from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, image_rays, spot_of, spot_of_points
+from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
+from raytrace.words import calling_level
+
+_TRIED = 4096  # rays that tell where all are lost
+_RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
+_DOT_RINGS = 12  # 469 dots of a wavelength
+_INSET = 0.395  # of a panel's width
+_MAGNIFY = 4.0  # a spot smaller than its panel by more than this has an enlargement in it
+_REFERENCES, _WEIGHTS = ("centroid", "chief"), ("area", "equal")
+
+
+def _of_each(name: str) -> property:
+    return property(lambda spots: getattr(spots.each, name), doc=f"(F, W): `{name}` of every spot.")
+
+
+@value
+class Spots(Result):
+    """Spots (F, W) of every field and wavelength on the sensor, mm: what Spot says of them, this says, too.
+
+    each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
+    their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
+    lens, fields: (2, F), what was looked at. The table has a row a spot; `save` writes the rays.
+    """
+
+    lens: Lens
+    fields: Tensor
+    each: Spot | StreamedSpot
+    whole: Spot | StreamedSpot
+    arrivals: Arrivals | None = None
+    reference: str = "centroid"
+    weights: str = "area"
+
+    centroid = _of_each("centroid")
+    mean_square_radius = _of_each("mean_square_radius")
+    rms_radius = _of_each("rms_radius")
+    geometric_radius = _of_each("geometric_radius")
+    rays = _of_each("rays")
+
+    @property
+    def launched(self) -> int:
+        """How many set out for each field and wavelength."""
+        return self.each.launched if self.arrivals is None else self.each.valid.shape[-1]
+
+    def columns(self) -> dict[str, Tensor]:
+        x, y = (axis(component, 0, 2) for component in self.fields)
+        names = ("rms_radius", "geometric_radius", "rays")
+        return {
+            "field_x": x, "field_y": y, "wavelength": self.lens.wavelengths,
+            "centroid_x": self.centroid[0], "centroid_y": self.centroid[1],
+            **{name: getattr(self.each, name) for name in names},
+        }  # fmt: skip
+
+    def units(self) -> dict[str, str]:
+        field = FIELD_UNITS[self.lens.fields.kind]
+        lengths = ("centroid_x", "centroid_y", "rms_radius", "geometric_radius")
+        return {"field_x": field, "field_y": field, "wavelength": "µm", **dict.fromkeys(lengths, "mm")}
+
+    def document(self) -> dict:
+        places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
+        unit = {"field_type": self.lens.fields.kind, "field_unit": FIELD_UNITS[self.lens.fields.kind]}
+        about = {} if self.arrivals is None else {"reference": self.reference, "weights": self.weights}
+        return {**unit, "results": [self._entry(*place) for place in places], **about}
+
+    def _entry(self, f: int, w: int) -> dict:
+        """What JSON says of a spot: null where no ray arrives."""
+        found = {
+            "field": numbers(self.fields[:, f]),
+            "wavelength": number(self.lens.wavelengths[w]),
+            "centroid": numbers(self.centroid[:, f, w]),
+            "rms_radius": number(self.rms_radius[f, w]),
+            "geometric_radius": number(self.geometric_radius[f, w]),
+            "rays": int(self.rays[f, w]),
+        }
+        if self.arrivals is None:
+            found["geometric_bound"] = number(self.each.geometric_bound[f, w])
+        else:
+            found["vignetted"] = int((self.arrivals.status[f, w] == STATUS.index("vignetted")).sum())
+        return {**found, "launched": self.launched}
+
+    def __str__(self) -> str:
+        unit, width = FIELD_UNITS[self.lens.fields.kind], 7 if self.arrivals is not None else 11
+        heads = ("centroid x", "centroid y", "RMS", "GEO"), ("mm", "mm", "µm", "µm")
+        lines = [f"{'field':>10} {'wavelength':>11} {_row(heads[0])} {'rays':>{width}}"]
+        lines += [f"{unit:>10} {'µm':>11} {_row(heads[1])} {'lost':>{width}}"]
+        colours = self.lens.wavelengths.tolist()
+        for f, field in enumerate(self.fields.unbind(1)):
+            for w, wavelength in enumerate(colours):
+                lost = self.launched - int(self.rays[f, w])
+                lines.append(
+                    f"{name_of_field(field):>10} {wavelength:>11g} {_cells(self.each, (f, w))} {lost:>{width}}"
+                )
+            if len(colours) > 1:
+                lines.append(f"{'':>10} {'all':>11} {_cells(self.whole, (f,))}")
+        return "\n".join(lines)
+
+    @style.styled
+    def draw(self):
+        """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
+
+        All panels have the same scale, are centred on the centroid over all wavelengths or on the chief ray of
+        the primary one (`reference`), and print the RMS and the geometric radius about it.
+        """
+        lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
+        about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
+        whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
+        whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
+        fields, wavelengths = style.array(points), style.array(lens.wavelengths)
+        airy = float(airy_radius(lens))
+        half = panel_size(style.array(whole.geometric_radius), airy)
+        columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
+        rows = math.ceil(fields.shape[1] / columns)
+        width = max(2.25 * columns, 5.6)
+        figure = style.new_figure(width, ((width / columns if columns > 1 else 3.4) + 0.55) * rows + 1.05)
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for f, panel in enumerate(axes):
+            if f >= fields.shape[1]:
+                panel.axis("off")
+                continue
+            draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+            panel.set_title(f"{field_title(lens)} {field_label(lens, fields[:, f])}")
+        name = style.fill(lens.name, width, 11, bold=True) or "Lens"
+        figure.suptitle(name, fontsize=11, fontweight="bold")
+        legend = figure.legend(
+            handles=wavelength_handles(wavelengths, airy),
+            title=f"{first_order_text(lens)}\n"
+            f"centred on the {'centroid' if about is None else 'chief ray'}; RMS and GEO (largest) radius about it, "
+            "all wavelengths together",
+            loc="outside lower center", ncols=min(6, int(width / 1.05)), handletextpad=0.3,
+            title_fontproperties={"size": 8}, alignment="center",
+        )  # fmt: skip
+        legend.get_title().set(color=style.GREY, multialignment="center")
+        return figure
+
+    def save(self, path) -> None:
+        """Write the rays as .csv: field, wavelength, pupil point, x, y, weight, status."""
+        self._kept("`output`").save(path)
+
+    def _kept(self, what: str) -> Arrivals:
+        if self.arrivals is None:
+            raise ValueError(f"{what} needs the rays, and `rays` keeps none: leave one out")
+        return self.arrivals
+
+
+def spot(
+    lens: Lens,
+    *,
+    fields: Tensor | Sequence | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    sampling: str = "gauss",
+    rings: int | None = None,
+    points: int | None = None,
+    seed: int = 0,
+    rays: int | None = None,
+    reference: str = "centroid",
+    weights: str = "area",
+    ray_aiming: str | None = None,
+    max_bytes: int | None = None,
+    progress: Callable | None = None,
+) -> Spots:
+    """The spot of every field and wavelength on the sensor, differentiable in every number of the lens.
+
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; wavelengths: µm, alike in weight,
+    the first one primary, by default the lens's. sampling, rings, points, seed: as for `pupil.sampled`; rays: instead,
+    so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
+    and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
+    weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
+    Warns LostRays for fields that lose all their rays, UnfilledStop. Raises ValueError for what is not known.
+    progress: called with (work, unit), gives what is gone through or a bar to update.
+    """
+    for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
+        if word not in known:
+            raise ValueError(f"{name} {word!r}: expected one of {', '.join(known)}")
+    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    fields = field_points(fields, like=lens)
+    warn_of_filling(lens, fields, ray_aiming=ray_aiming)
+    if rays is not None:
+        _refuse_of_many(sampling, rings, points, reference, weights)
+        how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}
+        return _of_many(lens, fields, rays, "random" if sampling == "random" else "sobol", progress, **how)
+    like = lens.surfaces[-2].thickness
+    at, shares = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    if weights == "equal":
+        shares = torch.full_like(shares, 1 / len(shares))
+    else:  # the rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss
+        at, shares = pupil.with_rim(at, shares)
+    each = iter if progress is None else lambda work: progress(work, "field")
+    found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
+    if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
+        told = f"{unaimed} of {found.status.numel()} rays found no way to their point of the stop"
+        warnings.warn(told, LostRays, stacklevel=calling_level())
+    about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
+    spots = spot_of(found.rays, shares, about=about)
+    warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
+    hits, valid = found.rays.position[:2].flatten(2), found.rays.valid.flatten(1)
+    about = None if about is None else about[..., 0]
+    whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
+    return Spots(lens, fields, spots, whole, found, reference, weights)
+
+
+def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:
+    if (reference, weights) != ("centroid", "area"):
+        raise ValueError("`rays` gives radii about the centroid by area: leave `reference` and `weights` out")
+    for name, given in (("rings", rings), ("points", points)):
+        if given is not None:
+            raise ValueError(f"`rays` and `{name}` exclude each other: both are a number of rays")
+    if sampling in ("hexapolar", "square"):
+        raise ValueError(f"`rays` takes `sampling=sobol` (its default) or random, not {sampling}")
+
+
+def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray_aiming, max_bytes) -> Spots:
+    how = {"sampling": sampling, "seed": seed, "rim": _RIM, "ray_aiming": ray_aiming}
+    how["max_bytes"] = MAX_BYTES if max_bytes is None else max_bytes
+    if progress is None:
+        each, whole = stream_spots(lens, rays, fields=fields, **how)
+    else:
+        with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
+            each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
+    tried = pupil.sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
+    warn_of_failures(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
+    return Spots(lens, fields, each, whole)
+
+
+def _row(cells: Sequence[str]) -> str:
+    return " ".join(f"{words:>{width}}" for words, width in zip(cells, (13, 13, 10, 10), strict=True))
+
+
+def _cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
+    """Centroid in mm, RMS and geometric radius in µm of one spot, as the table has them; - where no ray arrives."""
+    x, y = spots.centroid[(slice(None), *at)].tolist()
+    radii = (1000 * float(radius[at]) for radius in (spots.rms_radius, spots.geometric_radius))
+    return " ".join([*(cell(v, ">13.7f") for v in (x, y)), *(cell(v, ">10.4f") for v in radii)])
+
+
+def airy_radius(lens: Lens) -> Tensor:
+    """Radius in mm of the first dark ring, 1.22 λ N: λ the primary wavelength, N the paraxial working F/#."""
+    return 1.22e-3 * lens.primary * axial_f_number(lens)
+
+
+def field_spots(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
+    pupil: tuple[Tensor, Tensor] | None = None,
+    about: Tensor | None = None,
+) -> tuple[Spot, Spot]:
+    """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
+
+    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
+    weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
+    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
+    from where radii count, the centroid by default.
+    """
+    dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
+    points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
+    points, weights = with_rim(points, weights)
+    dots = even_hexapolar(_DOT_RINGS, dtype=dtype, device=device)
+    shares = shares_of(lens, wavelengths, wavelength_weights)
+    with torch.no_grad():
+        rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)
+        weights = torch.cat([weights, torch.zeros_like(dots[0])])
+        hits, valid = rays.position[:2], rays.valid
+        whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten(), about=about)
+        drawn = points.shape[1]
+        return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+
+
+def even_hexapolar(rings: int, **like) -> Tensor:
+    """Points (2, 1 + 3·rings·(rings + 1)) of equal areas of the pupil: the centre, and 6, 12, … on circles.
+
+    The first j rings and the centre fill the radius √((1 + 3j(j + 1))/N) of N points in all; each ring halves its area.
+    """
+    points = hexapolar(rings, **like)[0]
+    ring = torch.round(torch.hypot(*points) * rings)
+    radius = torch.sqrt((1 + 3 * ring * ring) / points.shape[1])
+    return torch.where(ring > 0, points * safe_divide(radius, torch.hypot(*points)), 0.0)
+
+
+def shares_of(lens: Lens, wavelengths: Tensor | None, weights: Tensor | None) -> Tensor:
+    """Weights (W,) of wavelengths: those given, else the lens's for its own wavelengths and equal ones for others."""
+    if weights is not None:
+        return weights.to(lens.wavelengths)
+    return lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+
+
+def panel_size(radii: Sequence[float], airy: float) -> float:
+    """Half width in mm that holds spots of these geometric radii and the Airy disc."""
+    return 1.14 * max(1e-7, *(radius for radius in (*radii, airy) if math.isfinite(radius)))
+
+
+def draw_spot(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float) -> None:
+    """Draw the spot of one field into square axes of ± half mm about its centroid, with its radii below."""
+    draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
+    bar = style.round_length(0.62 * half)
+    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, align="left")
+    if bool(whole.rms_radius[number].isnan()):
+        axes.text(0, 0, "no ray reaches\nthe image", ha="center", va="center", color=style.GREY)
+        axes.set_xlabel(" \n ")
+        return
+    rms, largest = (1e3 * float(r[number]) for r in (whole.rms_radius, whole.geometric_radius))
+    axes.set_xlabel(f"RMS {style.number_text(rms)} µm\nGEO {style.number_text(largest)} µm", labelpad=4)
+
+
+def draw_spot_to_scale(
+    axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+) -> None:
+    """As `draw_spot`, on the scale of other panels; a spot much smaller than its panel is enlarged in a corner of it,
+    with the factor below."""
+    look = {"wavelengths": wavelengths, "airy": airy}
+    draw_spot(axes, whole, dots, number, half=half, **look)
+    size = panel_size([float(whole.geometric_radius[number])], airy)
+    if bool(whole.rms_radius[number].isfinite()) and half > _MAGNIFY * size:
+        inset = axes.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
+        draw_dots(inset, whole, dots, number, half=size, **look)
+        inset.set_facecolor("#fbfbfb")
+        inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
+
+
+def draw_dots(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float) -> None:
+    """The dots and the Airy circle, without words."""
+    centre = style.array(whole.centroid[:, number])
+    size = 2.0 if half > 4 * airy else 2.4
+    for cross in (axes.axhline, axes.axvline):
+        cross(0, color=style.FAINT, linewidth=0.5, zorder=1)
+    for w, colour in enumerate(style.wavelength_colours(wavelengths)):
+        kept = style.array(dots.valid[number, w]).astype(bool)
+        x, y = style.array(dots.points[:, number, w])[:, kept] - centre[:, None]
+        marker = style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)]
+        width = 0.0 if marker not in "+x" else 0.5
+        axes.plot(x, y, marker, color=colour, markersize=size + 2 * width, markeredgewidth=width, zorder=3 + 0.1 * w)
+    if math.isfinite(airy):
+        from matplotlib.patches import Circle
+
+        axes.add_patch(Circle((0, 0), airy, fill=False, edgecolor=style.INK, linewidth=0.9, zorder=4, gid="Airy"))
+    axes.set_xlim(-half, half)
+    axes.set_ylim(-half, half)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+
+
+def wavelength_handles(wavelengths: np.ndarray, airy: float):
+    """What the legend says of colours and of the Airy circle."""
+    handles = [
+        style.legend_entry(
+            linestyle="", marker=style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)], color=colour,
+               markersize=4.5, label=f"{wavelength:.4g} µm")
+        for w, (wavelength, colour) in enumerate(zip(wavelengths, style.wavelength_colours(wavelengths), strict=True))
+    ]  # fmt: skip
+    if math.isfinite(airy):
+        handles.append(
+            style.legend_entry(linestyle="", marker="o", markerfacecolor="none", color=style.INK, markersize=6,
+                   label=f"Airy radius {style.micrometres(airy)}")
+        )  # fmt: skip
+    return handles

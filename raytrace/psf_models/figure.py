@@ -1,0 +1,155 @@
+"""Point spread functions as pictures: one panel a kernel, object distances from left to right."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from raytrace.maths.grid import Grid
+from raytrace.plotting.style import GREY, INK, array, bar_on_dark, fill, framed, new_figure, round_length, styled
+from raytrace.psf_models.closeup import CloseUp
+from raytrace.psf_models.closeup import close_up as light_of
+from raytrace.psf_models.result import Psf
+from raytrace.system.lens import field_label
+
+DECADES = 4  # of light on a logarithmic scale
+_MOST_PIXELS = 16  # across a panel, whose edges are drawn
+
+
+@styled
+def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False):
+    """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
+
+    Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
+    fills, with the edges of the pixels. close_up: that light, if it is there already.
+    Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
+    Below each: the energy inside the window (or that it was normalised by), and that of the brightest pixel.
+    """
+    if close_up is None and not found.framed and found.order is not None:
+        close_up = light_of(found)
+    distances = found.object_distances.tolist()
+    labels = [field_label(found.lens, field) for field in array(found.fields).T]
+    if not found.wavelengths_summed:
+        labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in found.wavelengths.tolist()]
+    title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))
+    energy, kernels = _rows(array(found.energy), 0), _rows(array(found.kernel), 2)
+    notes = [
+        [f"energy {e:.3f}, max {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
+        for row in zip(energy, kernels, strict=True)
+    ]
+    pitch = float(found.grid.pitch)
+    half = 0.5 * pitch * found.grid.columns
+    if close_up is None:
+        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+        return worded(figure, title, [f"{window(found.grid)}; max: light of the brightest pixel", brightness(log)])
+    drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
+    halves = np.repeat(array(close_up.half).T, each, 0)
+    figure, axes = panels(drawn, halves, distances, labels, notes, log)
+    centre = array(found.grid.centre).reshape(2, *(found.grid.centre.shape[1:] or (1, 1)))
+    offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
+    for row, place in zip(axes, offset, strict=True):
+        for d, panel in enumerate(row):
+            _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
+    one = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
+    drawn = f"{one}; energy and brightest pixel (max): of the {window(found.grid)}, outlined where they lie inside"
+    return worded(figure, title, [drawn, brightness(log)])
+
+
+def _rows(values: np.ndarray, kept: int) -> np.ndarray:
+    """(D, F, …) or (D, F, W, …), `kept` axes last, as (F or F·W, D, …)."""
+    values = np.moveaxis(values, 0, values.ndim - kept - 1)
+    return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
+
+
+def panels(kernels, halves, distances, labels, notes, log: bool):
+    """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
+
+    Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
+    its label.
+    """
+    rows, columns = len(labels), len(distances)
+    flows = columns == 1 and rows > 1
+    shape = (-(-rows // 4), min(rows, 4)) if flows else (rows, columns)
+    figure = new_figure(max(4.4, 1.75 * shape[1] + 0.7), (1.85 if max(shape) > 1 else 2.6) * shape[0] + 0.9)
+    grid = figure.subplots(*shape, squeeze=False)
+    axes = grid.reshape(-1, 1)[:rows] if flows else grid
+    alike = len({round(float(half), 12) for row in halves for half in row}) == 1
+    for row, column in np.ndindex(rows, columns):
+        panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
+        tall = half * kernel.shape[0] / kernel.shape[1]
+        extent = (-half, half, -tall, tall)
+        panel.imshow(
+            kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
+        )
+        framed(panel)
+        panel.set(xlim=extent[:2], ylim=extent[2:])
+        panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
+        if not alike or (row, column) == (0, 0):
+            bar_on_dark(panel, -0.88 * half, -0.86 * tall, round_length(0.5 * half))
+        if flows:
+            panel.set_title(labels[row].replace("\n", ", "), color=INK)
+        elif row == 0:
+            panel.set_title(_distance(distances[column]), color=INK)
+        if column == 0:
+            panel.set_ylabel((_distance(distances[0]) if row % 4 == 0 else "") if flows else labels[row])
+    for panel in grid.flat[rows:] if flows else ():
+        panel.axis("off")
+    return figure, axes
+
+
+def _norm(kernel: np.ndarray, log: bool):
+    """Brightness from 0, or four decades below, to the peak."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    peak = float(kernel.max())
+    peak = peak if peak > 0 else 1.0
+    return LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
+
+
+def brightness(log: bool) -> str:
+    return (
+        f"each panel from {10.0**-DECADES:g} of its own peak, logarithmic"
+        if log
+        else "each panel from 0 to its own peak"
+    )
+
+
+def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
+    """Outline the window of a kernel about a centre (2,) mm; and its pixels, where a panel holds only a few."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
+
+    (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
+    corner = centre - 0.5 * pitch * np.array([columns, rows])
+    if pitch * _MOST_PIXELS >= high - low:
+        x, y = (corner[k] + pitch * np.arange(count + 1) for k, count in enumerate((columns, rows)))
+        lines = [[(at, y[0]), (at, y[-1])] for at in x if low < at < high]
+        lines += [[(x[0], at), (x[-1], at)] for at in y if bottom < at < top]
+        panel.add_collection(
+            LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45, gid="pixels"), autolim=False
+        )
+    panel.add_patch(
+        Rectangle(
+            corner, pitch * columns, pitch * rows, fill=False, edgecolor="white", linewidth=0.7, alpha=0.7, gid="window"
+        )
+    )
+    panel.set(xlim=(low, high), ylim=(bottom, top))
+
+
+def worded(figure, title: str, said: Sequence[str]):
+    """The title above and one caption below, both in lines that fit."""
+    width = figure.get_figwidth()
+    figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)
+    figure.supxlabel(fill("; ".join(said), width, 7.5), fontsize=7.5, color=GREY)
+    return figure
+
+
+def window(grid: Grid) -> str:
+    pitch = 1e3 * float(grid.pitch)
+    return f"window of {pitch * grid.columns:.3g} µm, {grid.columns} × {grid.rows} pixels of {pitch:.3g} µm"
+
+
+def _distance(millimetres: float) -> str:
+    if math.isinf(millimetres):
+        return "object at ∞"
+    return f"{millimetres / 1000:g} m" if millimetres >= 1000 else f"{millimetres:g} mm"
