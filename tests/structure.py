@@ -116,8 +116,9 @@ def walks() -> dict[str, Callable[[], object]]:
     camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet(), model="gaussian")
     pictures, distances = torch.rand(2, 84, 84), torch.tensor([2e4, 3e4], dtype=torch.float64)
     rays = rt.Rays(start, along, torch.ones(1, dtype=torch.bool))
-    psf = rt.psf
+    psf, read_lens = rt.psf, rt.read_lens
     return {
+        "read_lens": lambda: read_lens("double_gauss"),
         "refraction": lambda: cross(lens.surfaces[1], rays, None, 1, first, second),
         'psf(lens, "drt")': lambda: psf(lens, "drt"),
         "training step": lambda: (camera(pictures, distances) - camera.target(pictures)).abs().mean().backward(),

@@ -8,8 +8,8 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from systems_beyond import SYSTEMS, error_of, spectrometer
 
-from raytrace.bench import beyond
 from raytrace.bench.measure import (
     SAMPLE,
     Own,
@@ -50,7 +50,7 @@ def document():
     return json.loads(out.getvalue())
 
 
-def test_json_is_one_document_with_errors_beside_every_speed(document):
+def test_json_is_one_document_with_errors_of_every_tracer(document):
     assert document["surfaces"] == 12
     assert document["machine"]["torch threads"] == 1
     rows = document["rows"]
@@ -67,26 +67,15 @@ def test_json_is_one_document_with_errors_beside_every_speed(document):
         assert row["ratio"] is None
 
 
-def test_other_systems_stand_beside_plain_conics(document, capsys):
-    rows = document["beyond"]
-    assert [row["system"] for row in rows] == [name for name in beyond.SYSTEMS for _ in range(4)]
-    for row in rows:
-        assert row["speed"] > 0
-        assert row["ratio"] == 1 if row["system"] == "conics" else row["ratio"] > 0
-        assert row["error"] < BOUNDS[row["dtype"]][0]
-    assert main([*TINY, "--lens", "cooke_triplet", "--json"]) == 0
-    assert "beyond" not in json.loads(capsys.readouterr().out)
-
-
-@pytest.mark.parametrize("name", beyond.SYSTEMS)
+@pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("backend", ["torch", "numpy"])
 def test_a_second_program_traces_the_same_systems(name, backend):
-    """Rays, paths and slopes of toroids, tilts and gratings agree with Optiland's, but for what it is said to lack."""
-    peers = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
-    lens = beyond.SYSTEMS[name]()
+    """Rays, paths and slopes of toroids, tilts and gratings agree with Optiland's, except for what it lacks."""
+    peers = pytest.importorskip("posed_optiland", reason="needs the extra [bench]", exc_type=ImportError)
+    lens = SYSTEMS[name]()
     own, peer = Own(lens, torch.float64, with_path=True), peers.PosedOptiland(lens, torch.float64, backend=backend)
     rays = field_rays(lens, 200)
-    assert beyond.error_of(peer) < 1e-3  # nm
+    assert error_of(peer) < 1e-3  # nm
     (points, path), (_, found) = own.forward(rays), peer.forward(rays)
     paths = [1e3 * (one - one[0]) / peer.wavelength for one in (path, found)]
     differ = float((paths[0] - paths[1]).abs().max())
@@ -99,21 +88,9 @@ def test_a_second_program_traces_the_same_systems(name, backend):
         assert peer.forward(rays)[1].requires_grad is False
 
 
-def test_other_systems_stand_beside_their_peer():
-    peers = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
-    steps = []
-    rows = beyond.measure(100, repeats=1, threads=1, peers_of=peers.posed_peers, progress=steps.append)
-    assert len(rows) == len(steps) == beyond.calls(1, with_peers=True) == 9 * len(beyond.SYSTEMS)
-    for row in rows:
-        assert (row.over_peer is None) == (row.tracer != "raytrace")
-        assert row.error < (1e-3 if row.dtype == "float64" else 100.0)  # nm
-        assert row.ratio == 1 if row.system == "conics" else row.ratio > 0
-    assert "| tilted grating spectrometer | 6 | 100 | forward | float64 | Optiland, numpy |" in beyond.report(rows)[-1]
-
-
 def test_the_spectrometer_disperses_as_its_grating_says():
     """All light arrives, and the image of the slit moves by f · order · frequency · Δλ/cos θ, to aberrations."""
-    lens = beyond.spectrometer()
+    lens = spectrometer()
     rays, moved = field_rays(lens, 200), []
     for wavelength in (0.549, 0.551):
         end = trace_lens(lens, rays, tensor(wavelength))
@@ -184,7 +161,7 @@ def test_one_surface_agrees_with_the_reference(conic, coefficients, is_mirror):
 def test_gradient_about_a_fixed_centroid_is_that_of_the_spot():
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     rays = field_rays(lens, 40)
-    moving, leaves = with_leaves(lens)
+    moving, leaves = with_leaves(lens, variables(lens))
     x, y, _ = trace_lens(moving, rays, lens.primary).position
     centroid = torch.stack([x.mean(), y.mean()])
     fixed = torch.autograd.grad(squared_radius(x, y, centroid.detach()), leaves, retain_graph=True)
@@ -213,7 +190,7 @@ def test_reference_gradient_is_a_derivative():
     ("position", "direction", "curvature", "words"),
     [((0, 30, -5), (0, 0, 1), 0.05, "misses"), ((0, 9, 0), (0, 0.9, 0.1), -0.1, "totally reflected")],
 )
-def test_lost_reference_ray_is_an_error(position, direction, curvature, words):
+def test_failed_reference_ray_is_an_error(position, direction, curvature, words):
     glass = [ReferenceSurface(curvature, index=1.0)]
     with pytest.raises(ValueError, match=words):
         trace_reference(glass, 1.8, position, direction)

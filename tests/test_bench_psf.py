@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import io
 import json
 import math
@@ -10,13 +11,14 @@ import problems
 import pytest
 import torch
 from problems import plano_hyperbolic, scene_of, vector
+from scripts import script
 
 from raytrace.bench import psf as bench
-from raytrace.bench import psf_cases, psf_report
+from raytrace.bench import psf_cases
+from raytrace.bench.figures import psf_figure
 from raytrace.bench.huygens import Sampling, clear_rings, direct_sum, moments, solid_angle
-from raytrace.bench.psf import PsfRow, gradient, measure, random_rows, steps, truth_of, with_all_leaves
-from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
-from raytrace.bench.psf_report import judged, lines, targets
+from raytrace.bench.psf import PsfRow, gradient, measure, report, steps, truth_of, with_all_leaves
+from raytrace.bench.psf_cases import Case, Method, cases
 from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.io import read_lens
@@ -26,6 +28,8 @@ from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture
 
 pytestmark = pytest.mark.usefixtures("threads")
+
+extended = script("bench_psf")
 
 
 @pytest.mark.parametrize("sampling", [Sampling(12, 32, 3), Sampling(80, 0, 3)])
@@ -59,7 +63,7 @@ def test_direct_sum_is_the_wave_models_limit():
     """Off the axis, in coma: two quadratures, two Jacobians, exact and plane wavelets."""
     lens = problems.double_gauss(aperture=("entrance_pupil_diameter", 8.0))
     s = scene_of(lens, 7.0, 25e3)
-    window = grid(0.01, 3, moments(s, 16, 64).centroid)
+    window = grid(0.01, 3, moments(s, 16, 64)[0])
     found = wave.kernels(s, window, order=1)
     rings, arms, nodes = bench.wave_sampling(s, window)
     kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
@@ -88,17 +92,17 @@ def test_moments_are_those_of_many_rings():
     lens = read_lens("double_gauss")
     s = scene_of(lens, 14.0, 1e4)
     s = dataclasses.replace(s, wavelengths=lens.primary[None])
-    found, fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
-    assert torch.allclose(found.variance, fine.covariance[::2, 0, 0, 0], rtol=1e-10)
-    assert torch.allclose(found.centroid, fine.centroid[:, 0, 0, 0], atol=1e-12)
-    assert found.energy == pytest.approx(1.0, abs=1e-14)
+    (centroid, variance, energy), fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
+    assert torch.allclose(variance, fine.covariance[::2, 0, 0, 0], rtol=1e-10)
+    assert torch.allclose(centroid, fine.centroid[:, 0, 0, 0], atol=1e-12)
+    assert energy == pytest.approx(1.0, abs=1e-14)
 
 
 def test_random_histogram_is_one_histogram_however_it_is_cut():
     case = cases([("double_gauss", read_lens("double_gauss"))])[0]
-    window = case.window(moments(case.scene, 6, 24).centroid)
-    whole = random_histogram(case.scene, window, 3000, piece=3000)
-    cut = random_histogram(case.scene, window, 3000, piece=1000)
+    window = case.window(moments(case.scene, 6, 24)[0])
+    whole = extended.random_histogram(case.scene, window, 3000, piece=3000)
+    cut = extended.random_histogram(case.scene, window, 3000, piece=1000)
     assert (whole.kernel - cut.kernel).abs().max() < 1e-12
     reference = drt.reference(case.scene, window, lines=512)[0, 0, 0]
     assert 0.1 < bench.relative_l1(whole.kernel[0, 0, 0], reference) < 0.4  # 0.8 Σ√p/√3000
@@ -111,7 +115,7 @@ def test_usual_cases_and_others():
     assert found[0].distance == 1e4
     assert math.isinf(found[2].distance)
     for case in found[2:]:
-        sigma = float(moments(case.scene, 8, 32).variance.sqrt().max())
+        sigma = float(moments(case.scene, 8, 32)[1].sqrt().max())
         assert 7 * sigma <= psf_cases.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
 
 
@@ -162,8 +166,8 @@ def test_targets_compare_the_quickest_that_come_as_close():
         row(model="drt", sampling="tol 1e-1", forward_s=1e-9, estimate=1e-2, own_error=5e-3),
         row(model="wave", sampling="tol 1e-2", forward_s=1e-9, estimate=1e-2, own_error=2e-2),
     ]
-    assert len(judged(rows)) == 2
-    found = {target.goal: (target.measured, target.met) for target in targets(rows)}
+    assert len(extended.judged(rows)) == 2
+    found = {goal: (measured, met) for goal, _, measured, met in extended.targets(rows)}
     assert [met for _, met in found.values()] == [False, True, True, True, False, False, True]
     words = [measured for measured, _ in found.values()]
     assert words[0] == "9 rays"
@@ -176,8 +180,8 @@ def test_targets_compare_the_quickest_that_come_as_close():
 def test_table_and_report_hold_every_row(tmp_path):
     rows = [row(), row(dtype="float32", l1_error=None), row(model="wave", estimate=1e-3, own_error=1e-4)]
     titles = {("l", 0.0): "l, 0°"}
-    page = lines(rows, targets(rows), titles=titles, about={"torch threads": 1}, repeats=3)
-    found = Measured(rows, page, {}, ("psf_figure", titles))
+    page = report(rows, titles=titles, about={"torch threads": 1}, repeats=3)
+    found = Measured(rows, page, {}, functools.partial(psf_figure, titles=titles))
     found.save_table(tmp_path / "r.csv")
     read = list(csv.DictReader(io.StringIO((tmp_path / "r.csv").read_text())))
     assert [line["l1_error"] for line in read] == ["0.005", "", "0.005"]
@@ -188,13 +192,13 @@ def test_table_and_report_hold_every_row(tmp_path):
 
 
 def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
-    monkeypatch.setattr(psf_report, "RAYS_ERROR", 0.1)
-    monkeypatch.setattr(bench, "_PILOT", 4000)
+    monkeypatch.setattr(extended, "RAYS_ERROR", 0.1)
+    monkeypatch.setattr(extended, "PILOT", 4000)
     case = cases([("double_gauss", read_lens("double_gauss"))])[0]
     window = case.window(vector(0.0, 0.0))
     kernels = {"rays": drt.reference(case.scene, window, lines=512)[0, 0, 0]}
-    truth = bench.Truth(case, kernels, {"rays": window}, vector(0.0, 0.0), moments(case.scene, 6, 24).variance.sqrt())
-    found = random_rows(truth, torch.float64, 1)
+    truth = bench.Truth(case, kernels, {"rays": window}, vector(0.0, 0.0), moments(case.scene, 6, 24)[1].sqrt())
+    found = extended.random_rows(truth, torch.float64, 1)
     assert 0.08 < found[-1].l1_error < 0.12
     assert found[3].rays == pytest.approx(4000 * (found[2].l1_error / 0.1) ** 2, abs=1)  # error ∝ rays^-1/2
 
@@ -209,11 +213,11 @@ def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monke
         now[0] += rays / 100
         return ones * (1 + rays**-0.75), rays
 
-    monkeypatch.setattr(bench, "direct_sum", direct_sum)
-    monkeypatch.setattr(bench, "clock", lambda threads: lambda: now[0])
+    monkeypatch.setattr(extended, "direct_sum", direct_sum)
+    monkeypatch.setattr(extended, "clock", lambda threads: lambda: now[0])
     kernels, windows = {"wave": ones}, {"wave": case.window(vector(0.0, 0.0))}
     truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), rings=40, arms=160, nodes=4)
-    *rings, coarse, fine, far = bench.direct_rows(truth, 1)
+    *rings, coarse, fine, far = extended.direct_rows(truth, 1)
     assert [line.model for line in rings] == ["direct sum, rings"] * 3
     assert (coarse.rays, fine.rays, far.extrapolated) == (64**2, 96**2, True)
     assert far.rays == pytest.approx(1e4, abs=2)
@@ -226,9 +230,9 @@ def few(monkeypatch):
     monkeypatch.setattr(psf_cases, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
     monkeypatch.setattr(psf_cases, "_TOLERANCES", {"fourier": (0.01,)})
     monkeypatch.setattr(bench, "_FINEST_WAVE", 1)
-    monkeypatch.setattr(bench, "_PILOT", 20_000)
-    monkeypatch.setattr(bench, "_PATIENCE", 0.05)
-    monkeypatch.setattr(bench, "_SQUARE", (16, 24))
+    monkeypatch.setattr(extended, "PILOT", 20_000)
+    monkeypatch.setattr(extended, "PATIENCE", 0.05)
+    monkeypatch.setattr(extended, "SQUARE", (16, 24))
     monkeypatch.setattr(psf_cases, "PIXELS", 7)
 
 
@@ -242,13 +246,20 @@ def test_command_writes_everything(few, tmp_path, capsys):
     assert found["gaussian", "float64"]["sigma_error"] < 0.1
     assert found["fourier", "float32"]["both_s"] > 0
     assert document["machine"]["torch threads"] == 1
-    assert {target["case"] for target in document["targets"]} >= {"hubble, 0"}
     assert (tmp_path / "r.png").read_bytes().startswith(b"\x89PNG")
     assert len((tmp_path / "r.csv").read_text().splitlines()) == 1 + len(document["rows"])
     assert "## hubble, 0°" in (tmp_path / "r.md").read_text(encoding="utf-8")
 
 
-def test_progress_adds_up_and_refusals_are_said(few, monkeypatch):
+def test_script_adds_random_rays_direct_sums_and_targets(few, tmp_path, capsys):
+    extended.main(["hubble", "--repeats", "1", "--no-peers", "--json", "--docs", str(tmp_path)])
+    document = json.loads(capsys.readouterr().out)
+    assert {target["case"] for target in document["targets"]} >= {"hubble, 0"}
+    assert {row["model"] for row in document["rows"]} >= {"random rays", "direct sum, rings", "direct sum, grid"}
+    assert "## Targets" in (tmp_path / "tables.md").read_text("utf-8")
+
+
+def test_progress_adds_up_and_refusals_are_reported(few, monkeypatch):
     def refuse(*arguments):
         raise ValueError("too steep")
 
@@ -266,7 +277,7 @@ def test_peer_sees_the_same_kernels():
     """Optiland at full field, coma and all: turned or shifted by a pixel, its kernels would be off by 0.3 and more."""
     peer = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
     case = cases([("double_gauss", read_lens("double_gauss"))])[1]
-    window = case.window(moments(case.scene, 8, 32).centroid)
+    window = case.window(moments(case.scene, 8, 32)[0])
     kernels = {
         "rays": drt.reference(case.scene, window, lines=512)[0, 0, 0],
         "wave": wave.kernels(case.scene, window).kernel[0, 0, 0].detach(),

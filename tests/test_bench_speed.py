@@ -9,11 +9,11 @@ import re
 
 import pytest
 import torch
+from scripts import script
 
 from raytrace.bench import measure as timing
-from raytrace.bench import processes as whole_processes
 from raytrace.bench import speed
-from raytrace.bench.limit import Limit, build
+from raytrace.bench.figures import speed_figure
 from raytrace.bench.measure import (
     Own,
     errors_of,
@@ -22,15 +22,13 @@ from raytrace.bench.measure import (
     leaves_of,
     slope,
     squared_radius,
-    surfaces_of,
-    with_sensor_leaf,
 )
-from raytrace.bench.report import KEPT, Measured
-from raytrace.bench.speed import Bench, Row, Sizes, measure, stages, three_aspheres
-from raytrace.bench.speed_report import document, lines, targets
+from raytrace.bench.report import Measured
+from raytrace.bench.speed import STAGES, Bench, Row, Sizes, document, measure, three_aspheres, with_sensor_leaf
 from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.value import to
+from raytrace.pages import KEPT
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.compiler import NoCompiler
@@ -38,27 +36,32 @@ from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
+extended = script("bench_speed")
+Limit, build = extended.Limit, extended.build
+
 pytestmark = pytest.mark.usefixtures("same_threads")
 
-#: What `raytrace bench speed --json` is read for.
+#: Ratios of `raytrace bench speed --json`.
 KEYS = {
-    "forward_over_limit", "forward_over_optiland", "backward_over_forward", "backward_over_optiland", "bytes_per_ray",
-    "small_batch_ms", "asphere_over_limit", "sensor_step_gain", "spot_process_ratio", "two_process_gain",
-    "forward_over_plain_limit", "small_batch_over_optiland", "asphere_over_optiland",
+    "forward_over_optiland", "backward_over_forward", "backward_over_optiland", "small_batch_ms", "sensor_step_gain",
+    "small_batch_over_optiland", "asphere_over_optiland",
 }  # fmt: skip
-#: Ways of doing less work.
-LESS = {"prefix", "planes", "symmetry", "wavelengths", "object distances"}
-TINY = Sizes(600, (64,), small=16, memory=64, sensor=64, distances=2, window=0.01, less=64)
+#: Those of docs/experiments/bench_speed.py in addition.
+ADDED = {
+    "forward_over_limit", "forward_over_plain_limit", "asphere_over_limit", "bytes_per_ray", "spot_process_ratio",
+    "two_process_gain",
+}  # fmt: skip
+TINY = Sizes(600, (64,), small=16, sensor=64, distances=2)
 #: mm on the image: rounding of 12 surfaces, a hundred millimetres of path.
 AGREES = {torch.float32: 1e-4, torch.float64: 1e-10}
 
 
 @pytest.fixture(autouse=True)
 def processes(monkeypatch):
-    """Stand-ins of what starts processes: other numbers for other dtypes."""
-    monkeypatch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
-    monkeypatch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
-    monkeypatch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
+    """Substitutes for processes: other numbers for other dtypes."""
+    monkeypatch.setattr(extended, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
+    monkeypatch.setattr(extended, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
+    monkeypatch.setattr(extended, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
     monkeypatch.setattr(timing, "SHORTEST", 0.0)  # one call a turn
 
 
@@ -107,8 +110,8 @@ def test_work_of_several_threads_is_that_of_one(built):
 
 
 @pytest.mark.parametrize("dtype", AGREES, ids=str)
-def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
-    """Missed and totally reflected rays go on as axial ones; rays lost before the lens stay lost.
+def test_rays_fail_in_the_safe_limit_too(built, dtype):
+    """Rays that miss or are totally reflected continue as axial ones; rays that failed before stay so.
 
     In float32 rays that graze a surface differ by more: the package takes roots in float64.
     """
@@ -138,8 +141,7 @@ def test_plain_limit_is_the_textbook(built):
 @pytest.mark.parametrize("dtype", AGREES, ids=str)
 def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
     lens = three_aspheres()
-    bench = Bench(dtype, TINY, 1, 1, built)
-    steps = speed.newton_steps(bench, lens)
+    steps = extended.newton_steps(built, lens, dtype)
     assert 3 <= steps <= 6  # strong, but not wild
     rays = field_rays(lens, 1000)
     assert compared(Limit(built, lens, dtype, safe=True, steps=steps), lens, rays) < AGREES[dtype]
@@ -157,7 +159,7 @@ def test_limits_refuse_what_they_do_not_know(built):
     assert "-march=native" in built.words
 
 
-def test_no_compiler_is_said():
+def test_no_compiler_is_an_error():
     with pytest.raises(NoCompiler, match="no-such-compiler"):
         build("no-such-compiler")
 
@@ -244,22 +246,17 @@ class Peer(Own):
 
 @pytest.fixture(scope="module")
 def measured(request):
-    """Rows and ratios of both dtypes on tiny batches, with limits where there is a compiler, and a stand-in peer."""
+    """Rows and ratios of both dtypes on tiny batches, with limits if there is a compiler, and a substitute peer."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
-        patch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
-        patch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
         patch.setattr(timing, "SHORTEST", 0.0)
-        lenses = speed.double_gauss(), three_aspheres()
-        benches = [
-            Bench(dtype, TINY, 1, 1, request.getfixturevalue("built"), *([Peer(lens, dtype)] for lens in lenses))
-            for dtype in speed.DTYPES
-        ]
-        words = []
-        before = torch.get_num_threads()
-        rows, ratios = measure(benches, progress=words.append)
+        lenses, built = (speed.double_gauss(), three_aspheres()), request.getfixturevalue("built")
+        benches = [Bench(dtype, TINY, 1, 1, *([Peer(lens, dtype)] for lens in lenses)) for dtype in speed.DTYPES]
+        steps, before = [], torch.get_num_threads()
+        rows, ratios = measure([extended.with_limits(bench, built)[0] for bench in benches], progress=steps.append)
         torch.set_num_threads(before)
-        assert len(words) == stages(benches)
+        assert len(steps) == len(STAGES) * len(benches)
+        for dtype, numbers in ratios.items():
+            numbers |= extended.of_limits(rows, dtype, TINY)
         return rows, ratios
 
 
@@ -267,11 +264,8 @@ def test_every_ratio_is_there_for_both_dtypes(measured):
     _, ratios = measured
     assert list(ratios) == ["float32", "float64"]
     for dtype, numbers in ratios.items():
-        assert set(numbers) >= KEYS
-        assert all(numbers[key] > 0 for key in KEYS)
-        assert numbers["bytes_per_ray"] == 100 * getattr(torch, dtype).itemsize
-        assert numbers["spot_process_ratio"] == 1.25
-        assert numbers["one_process_speed"] == 10.0 * surfaces_of(speed.double_gauss())
+        assert set(numbers) >= KEYS, dtype
+        assert all(numbers[key] > 0 for key in KEYS), dtype
 
 
 def test_ratios_are_those_of_the_speeds(measured):
@@ -306,18 +300,17 @@ def test_accuracy_stands_beside_every_speed_of_the_tables(measured):
 def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     rows, ratios = measured
     about = {"processor": "one", "torch threads": 2}
-    said = lines(rows, ratios, sizes=TINY, about=about, compiler="cc -O3", repeats=1)
-    found = Measured(rows, said, {}, ("speed_figure",), ("speed.md", "speed"))
+    others = {"bytes_per_ray": 64.0, "bytes_per_ray_rays": 99, "spot_process_ratio": 1.2, "two_process_gain": 1.9}
+    ratios = {dtype: numbers | others | {"asphere_newton_steps": 4} for dtype, numbers in ratios.items()}
+    page = extended.lines(rows, ratios, sizes=TINY, about=about, compiled="cc -O3", repeats=1)
+    found = Measured(rows, page, {}, speed_figure, ("speed.md", "speed"))
     (tmp_path / "speed.md").write_text(f"stale\n{KEPT}\nwords\n")
     found.save_page(tmp_path)
     page = (tmp_path / "speed.md").read_text(encoding="utf-8")
     assert page.endswith(f"{KEPT}\nwords\n")
-    assert "built by cc -O3" in page
+    assert "bench_limit.cpp`, cc -O3" in page
     assert "of time of day; processor one" in page
-    for target in targets(TINY):
-        line = next(line for line in page.splitlines() if line.startswith(f"| {target.words} |"))
-        assert re.search(r"\| (yes|no) \|", line), line
-    assert "| × retracing" not in page
+    assert len(re.findall(r"\| (yes|no) \|", page)) >= len(extended.TARGETS)
     assert len((tmp_path / "speed.csv").read_text().splitlines()) == 1 + len(rows)
     figure = found.plot()
     assert [panel.get_title() for panel in figure.axes] == ["float32", "float64"]
@@ -327,15 +320,20 @@ def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
 
 
 def test_targets_are_judged_on_the_right_side():
-    by_key = {target.key: target for target in targets(Sizes())}
-    assert "2²⁰ rays" in by_key["forward_over_limit"].words
-    assert by_key["forward_over_limit"].met(0.7) is True
-    assert by_key["forward_over_limit"].met(0.69) is False
-    assert by_key["small_batch_ms"].met(0.5) is True
-    assert by_key["small_batch_ms"].met(0.51) is False
-    assert by_key["bytes_per_ray"].met(None) is None
-    assert by_key["bytes_per_ray"].met(math.nan) is None
-    assert set(by_key) | {"forward_over_plain_limit"} == KEYS
+    by_key = {key: (key, bound, at_most) for key, _, bound, at_most in extended.TARGETS}
+
+    def met(key, value, dtype="float32"):
+        return extended.met(*by_key[key], dtype, value)
+
+    assert speed.sizes_in_words(Sizes())["rays"] == "2²⁰"
+    assert met("forward_over_limit", 0.7) is True
+    assert met("forward_over_limit", 0.69) is False
+    assert met("small_batch_ms", 0.5) is True
+    assert met("small_batch_ms", 0.51) is False
+    assert met("bytes_per_ray", 100.0, "float64") is None
+    assert met("bytes_per_ray", None) is None
+    assert met("bytes_per_ray", math.nan) is None
+    assert set(by_key) | {"forward_over_plain_limit"} == KEYS | ADDED
 
 
 def test_document_has_speeds_by_entrant_in_millions():
@@ -352,34 +350,35 @@ COMMAND = ["bench", "speed", "--quick", "--repeats", "1", "--no-peers", "--threa
 
 
 @pytest.mark.slow
-def test_command_without_compiler_and_peers_says_so_and_leaves_their_ratios_out(monkeypatch, tmp_path, capsys):
+def test_command_and_script_write_page_table_and_figure(monkeypatch, tmp_path, capsys):
+    """Without compiler and peers, whose ratios are None."""
+
     def refuse():
         raise NoCompiler("no C++ compiler found")
 
-    monkeypatch.setattr(speed, "build", refuse)
+    monkeypatch.setattr(extended, "build", refuse)
     monkeypatch.setattr(speed, "QUICK", TINY)
     kept = tmp_path / "speed.md"
-    kept.write_text(f"stale\n{KEPT}\nwhat bounds it\n", encoding="utf-8")
-    assert main([*COMMAND, "--json", "--docs", str(tmp_path)]) == 0
-    said = capsys.readouterr()
-    assert "no C++ compiler found: without limits" in said.err
-    found = json.loads(said.out)
-    for dtype in ("float32", "float64"):
-        assert set(found[dtype]) >= KEYS
-        for key in KEYS:
-            absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
-            assert (found[dtype][key] is None) == absent, key
-    assert found["machine"]["torch threads"] == 1
-    assert {kind.partition(":")[0] for kind in (row["what"] for row in found["less_work"])} == LESS
-    page = kept.read_text(encoding="utf-8")
-    assert page.endswith(f"{KEPT}\nwhat bounds it\n")
-    assert "of processor time" in page
-    assert "stale" not in page
-    assert "Newton" not in page
-    section = page.partition("## Less work")[2]
-    assert all(f"| {row['what']} | {row['engine']} |" in section for row in found["less_work"])
-    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "speed.csv").exists()
+    for keys, call in ((KEYS, lambda *options: main([*COMMAND, *options])), (KEYS | ADDED, run_script)):
+        kept.write_text(f"stale\n{KEPT}\nby hand\n", encoding="utf-8")
+        assert not call("--json", "--docs", str(tmp_path))
+        document = json.loads(capsys.readouterr().out)
+        for dtype in ("float32", "float64"):
+            assert set(document[dtype]) >= keys
+            for key in keys:
+                absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
+                assert (document[dtype][key] is None) == absent, key
+        assert document["machine"]["torch threads"] == 1
+        page = kept.read_text(encoding="utf-8")
+        assert page.endswith(f"{KEPT}\nby hand\n")
+        assert "of processor time" in page
+        assert "stale" not in page
+        assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+        assert (tmp_path / "speed.csv").exists()
+
+
+def run_script(*options):
+    extended.main(["--quick", "--repeats", "1", "--no-peers", *options])
 
 
 def test_options_of_other_benchmarks_are_refused(capsys):
@@ -392,10 +391,10 @@ def test_options_of_other_benchmarks_are_refused(capsys):
 @pytest.mark.slow
 def test_processes_answer():
     """Each in its units; the memory of a ray is at least what comes back: 6 numbers and a flag."""
-    found, rays = whole_processes.bytes_per_ray(torch.float32, 2**16, threads=1)
+    found, rays = extended.bytes_per_ray(torch.float32, 2**16, threads=1)
     assert rays == 2**16
     assert 25 < found < 1e5
-    gain, one, two = whole_processes.two_process_gain(torch.float64, 2**12, seconds=0.2, repeats=1)
+    gain, one, two = extended.two_process_gain(torch.float64, 2**12, seconds=0.2, repeats=1)
     assert gain == two / one > 0
-    ratio, spot, bare = whole_processes.spot_process_ratio(1)
+    ratio, spot, bare = extended.spot_process_ratio(1)
     assert ratio == spot / bare > 0.3

@@ -6,25 +6,21 @@ import math
 
 import pytest
 import torch
+from scripts import script
 
-from raytrace.bench import wave as bench
-from raytrace.bench.report import KEPT, Measured
-from raytrace.bench.wave import (
-    ERROR,
-    SITZMANN,
-    WaveRow,
-    agreement,
-    bench_scene,
-    coefficients_of,
-    distance,
-    entrant,
-    gradient,
-    lines,
-    measure,
-    reference,
-    refused,
-    target,
+from raytrace.bench.report import Measured
+from raytrace.pages import KEPT
+
+bench = script("bench_wave")
+ERROR, SITZMANN, WaveRow = bench.ERROR, bench.SITZMANN, bench.WaveRow
+agreement, bench_scene, coefficients_of, distance = (
+    bench.agreement,
+    bench.bench_scene,
+    bench.coefficients_of,
+    bench.distance,
 )
+entrant, gradient, lines, measure = bench.entrant, bench.gradient, bench.lines, bench.measure
+reference, refused, target = bench.reference, bench.refused, bench.target
 
 SMALL = 64  # pixels of 3.69 µm: all of the blur but its rim
 
@@ -99,7 +95,7 @@ def test_target_is_judged_by_the_fastest_within_the_error():
 
 def test_page_and_table_hold_the_figures(tmp_path):
     said = lines(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5)
-    found = Measured(ROWS, said, {}, ("wave_figure",), ("wave_bench.md", "wave/speed"))
+    found = Measured(ROWS, said, {}, bench.wave_figure, ("wave_bench.md", "wave/speed"))
     (tmp_path / "wave_bench.md").write_text(f"stale\n{KEPT}\nwords of a reader\n")
     found.save_page(tmp_path)
     page = (tmp_path / "wave_bench.md").read_text()
@@ -112,6 +108,18 @@ def test_page_and_table_hold_the_figures(tmp_path):
     assert [float(line["both_s"]) for line in read] == [one.both_s for one in ROWS]
     assert read[-1]["predicted"] == ""
     assert len(found.plot().axes) == 2
+
+
+def test_script_writes_the_page(monkeypatch, tmp_path):
+    """A few samplings of small kernels."""
+    few = bench.entrants
+    monkeypatch.setattr(bench, "entrants", lambda: few(size=16, sitzmann=200))
+    for name, value in (("_PUPIL", (128,)), ("_RADIAL", ({"tol": 1e-3},)), ("_REFUSED", ()), ("_TRANSFER", (1700,))):
+        monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(bench, "agreement", lambda scene: 1e-6)
+    bench.main(["--repeats", "1", "--docs", str(tmp_path)])
+    assert "python docs/experiments/bench_wave.py --docs docs" in (tmp_path / "wave_bench.md").read_text("utf-8")
+    assert len((tmp_path / "wave" / "speed_vs_error.csv").read_text().splitlines()) == 9
 
 
 def test_measure_counts_its_progress(scene):

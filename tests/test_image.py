@@ -10,15 +10,18 @@ from raytrace.imaging.image import (
     BOUNDARIES,
     COMPOSITIONS,
     EXTENSIONS,
+    add_noise,
+    add_shot_noise,
     blur,
     blur_adjoint,
     blur_layers,
+    count_electrons,
     depth_masks,
+    digitise,
     extend,
     transfer_functions,
     visible,
 )
-from raytrace.imaging.sensor import add_noise, add_shot_noise, count_electrons, digitise
 
 #: Rounding of an FFT of some hundred pixels of order one.
 ROUNDING = 1e-13

@@ -11,7 +11,7 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, write_lens
 from raytrace.io.codev.glass import _fictitious_error
-from raytrace.io.report import BadSubstitute, substitutes_of
+from raytrace.io.source import BadSubstitute, substitutes_of
 from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
 from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
 from raytrace.system.lens import check_media

@@ -63,9 +63,9 @@ DEFERRED = ("matplotlib", "mpl_toolkits", "pandas")
 #: Modules that alone may import a library at their top.
 RESERVED = {
     "matplotlib": (r"bench\.figures",),
-    "pandas": (r"io\.frames", r"cli", r"bench"),
+    "pandas": (r"io\.frames", r"cli"),
     "tqdm": (r"cli", r"bench"),
-    "optiland": (r"bench\.peers(_\w+)?",),
+    "optiland": (r"bench\.peers",),
 }
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
+from scripts import script
 
 import raytrace as rt
-from raytrace.bench import optimise as bench
 from raytrace.optimization import solver as paths
 from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
@@ -387,7 +387,7 @@ def test_a_file_comes_as_far_as_is_known_from_where_it_stands_and_from_a_moved_s
         assert found.merit_after <= 1.0001 * best
     free = freedom(lens)
     model = Model(free.lens, free.variables, free.solves)
-    factors = bench._factors(known, [name_of(one) for one in free.variables])
+    factors = script("bench_optimise").factors(known, [name_of(one) for one in free.variables])
     moved = rt.optimize(model.lens_at(model.start * factors), seconds=20)
     assert moved.merit_before == pytest.approx(known["from_perturbed"]["mf_start"], rel=1e-3)
     assert moved.merit_after <= 1.01 * best

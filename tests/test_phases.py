@@ -8,7 +8,8 @@ import torch
 from bends import real
 
 import raytrace as rt
-from raytrace.maths.bivariate import fringe, fringe_to_powers, polynomial_xy, powers
+from raytrace.maths.bivariate import fringe_to_powers, polynomial_xy, powers
+from raytrace.maths.zernike import fringe
 from raytrace.system.phases import added_path, power_of
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface

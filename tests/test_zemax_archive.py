@@ -8,8 +8,9 @@ import torch
 from test_catalog import SMALL
 from test_zemax import file as singlet
 
+from raytrace import check
 from raytrace.cli import main
-from raytrace.io import LensFileError, check, convert, read_lens, read_lens_with_report
+from raytrace.io import LensFileError, convert, read_lens, read_lens_with_report
 from raytrace.io.source import MAX_BYTES, Place
 from raytrace.io.zemax import archive as zemax_archive
 from raytrace.io.zemax.archive import Member, members, unpacked

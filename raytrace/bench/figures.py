@@ -1,7 +1,6 @@
-"""The benchmarks as pictures: on logarithmic axes a line for each entrant, a panel for each task, case or dtype."""
+"""Figures of the benchmarks: on logarithmic axes a line for each tracer or model, a panel for each task or case."""
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,7 +9,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from raytrace.plotting import style
 
-#: By the start of an entrant's name: number of its colour (None: grey), dashes, marker.
+#: By name: number of the colour (None: grey), dashes, marker.
 _TRACERS = {
     "raytrace, eager": (0, (0, (4, 2)), "o"),
     "raytrace": (0, "-", "o"),
@@ -34,15 +33,6 @@ _MODELS = {
     "Optiland FFT": (3, "D"),
     "Optiland Huygens": (3, "v"),
 }
-_ROUNDING = 1e-6  # merits below it are drawn as that
-#: Number of the colour, marker and name, by wave engine.
-_ENGINES = {
-    "pupil": (0, "o", "pupil matrix DFT"),
-    "radial": (1, "s", "ring integrals"),
-    "fresnel": (4, "D", "Fresnel transfer, band limit"),
-    "angular_spectrum": (3, "v", "angular spectrum"),
-    "sitzmann": (2, "*", "as Sitzmann 2018"),
-}
 _TASKS = {"forward": "Forward", "forward+backward": "Forward and backward"}
 _LEAST = 1e-9  # errors below are rounding
 
@@ -56,10 +46,10 @@ def trace_figure(rows: Sequence[Mapping]) -> Figure:
     rows = [row for row in rows if row["path"]]
     colours = {tracer: (0, 2, 4)[k % 3] for k, tracer in enumerate(dict.fromkeys(row["tracer"] for row in rows))}
 
-    def look(tracer: str, dtype: str) -> dict:
-        return _look(colours[tracer], "--" if dtype == "float32" else "-", "o", hollow=dtype == "float32")
+    def style_of(tracer: str, dtype: str) -> dict:
+        return look(colours[tracer], "--" if dtype == "float32" else "-", "o", hollow=dtype == "float32")
 
-    return _speeds(rows, "what", _TASKS, lambda row: (row["tracer"], row["dtype"]), look, width=3.6, columns=3)
+    return _speeds(rows, "what", _TASKS, lambda row: (row["tracer"], row["dtype"]), style_of, width=3.6, columns=3)
 
 
 @style.styled
@@ -68,11 +58,11 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
     rows = [row for row in rows if row["what"] == "forward"]
     dtypes = {dtype: dtype for dtype in dict.fromkeys(row["dtype"] for row in rows)}
 
-    def look(tracer: str) -> dict:
+    def style_of(tracer: str) -> dict:
         colour, dashes, marker = _TRACERS.get(tracer, (6, "-", "*"))
-        return _look(colour, dashes, marker, hollow=dashes != "-")
+        return look(colour, dashes, marker, hollow=dashes != "-")
 
-    return _speeds(rows, "dtype", dtypes, lambda row: (row["tracer"],), look, width=3.7, columns=4)
+    return _speeds(rows, "dtype", dtypes, lambda row: (row["tracer"],), style_of, width=3.7, columns=4)
 
 
 def _speeds(
@@ -86,7 +76,7 @@ def _speeds(
         for entrant in dict.fromkeys(map(name, own)):
             points = sorted((row["rays"], row["speed"]) for row in own if name(row) == entrant)
             panel.plot(*zip(*points, strict=True), label=", ".join(entrant), **look(*entrant))
-        _framed(panel, title, "rays")
+        framed(panel, title, "rays")
     _ticks(panels[0], [row["speed"] for row in rows])
     panels[0].set_ylabel("rays × surfaces per second, millions")
     labelled = {label: line for panel in panels for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
@@ -108,8 +98,8 @@ def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str])
     for panel, (case, title) in zip(panels, titles.items(), strict=False):
         for model, (colour, marker) in _MODELS.items():
             own = [row for row in rows if (row["lens"], row["field"], row["model"]) == (*case, model)]
-            _samplings(panel, own, _look(colour, "-", marker, hollow=False))
-        _framed(panel, title, "")
+            _samplings(panel, own, look(colour, "-", marker, hollow=False))
+        framed(panel, title, "")
         for axis in (panel.xaxis, panel.yaxis):
             axis.set_major_locator(LogLocator(numticks=12))
             axis.set_minor_locator(NullLocator())
@@ -120,8 +110,8 @@ def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str])
         panel.set_xlabel("relative L1 error of the kernel" if number + columns >= len(titles) else "")
         panel.set_ylabel("time of one kernel, s" if number % columns == 0 else "")
     shown = {row["model"] for row in rows}
-    handles = [_key(model, **_look(c, "-", m, hollow=False)) for model, (c, m) in _MODELS.items() if model in shown]
-    handles += [*_dtypes(), _key("extrapolated", marker="x", color=style.INK, linestyle="none")]
+    handles = [_key(model, **look(c, "-", m, hollow=False)) for model, (c, m) in _MODELS.items() if model in shown]
+    handles += [*dtype_keys(), _key("extrapolated", marker="x", color=style.INK, linestyle="none")]
     figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
     return figure
 
@@ -140,61 +130,7 @@ def _samplings(panel: Axes, rows: Sequence[Mapping], look: dict) -> None:
             panel.plot(*zip(*far, strict=True), "x", color=look["color"], markersize=5)
 
 
-@style.styled
-def wave_figure(rows: Sequence[Mapping]) -> Figure:
-    """Rows of `bench wave` as mappings: time over error, forward and with the gradient.
-
-    Full marks are float64, open ones float32; crosses are refused samplings.
-    """
-    figure = style.new_figure(7.6, 3.6)
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for panel, key, title in zip(panels, ("forward_s", "both_s"), ("forward", "forward and gradient"), strict=True):
-
-        def places(chosen: Callable[[Mapping], bool], key: str = key) -> tuple[list, list]:
-            own = [row for row in rows if chosen(row)]
-            return [row["error"] for row in own], [1e3 * row[key] for row in own]
-
-        for engine, (colour, marker, label) in _ENGINES.items():
-            for dtype, line in (("float64", "-"), ("float32", ":")):
-                look = _look(colour, line, marker, hollow=dtype == "float32") | {"linewidth": 0.9}
-                kind = (engine, dtype, False)
-                own = places(lambda row, kind=kind: (row["engine"], row["dtype"], row["refused"]) == kind)
-                panel.plot(*own, label=label if dtype == "float64" else None, **look)
-        panel.plot(*places(lambda row: row["refused"]), "x", color=style.field_colour(7), label="refused by the plan")
-        _framed(panel, title, "relative L² error of the kernel")
-    panels[0].set_ylabel("time of one kernel, ms")
-    handles = [*panels[0].get_legend_handles_labels()[0], *_dtypes()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
-    return figure
-
-
-@style.styled
-def optimise_figure(rows: Sequence[Mapping]) -> Figure:
-    """How far every file comes from its moved start, as a part of the merit it had there."""
-    figure = style.new_figure(8.0, 1.2 + 0.28 * max(len(rows), 1))
-    panel = figure.subplots()
-    for place, row in enumerate(rows):
-        ends = [max(row[name], _ROUNDING) for name in ("start_moved", "end_moved")]
-        panel.plot(ends, [place, place], color=style.FAINT, linewidth=3, zorder=1)
-        panel.plot(ends[0], place, "o", color=style.GREY, label="moved start" if place == 0 else None)
-        panel.plot(ends[1], place, "o", color=style.FIELD_COLOURS[0], label="end" if place == 0 else None)
-        if row["best_of_oracle"] > _ROUNDING:
-            label = "best that was known" if place == 0 else None
-            panel.plot(row["best_of_oracle"], place, "|", color=style.FIELD_COLOURS[2], markersize=11, label=label)
-        words = f"{row['seconds_moved']:.2g} s"
-        panel.annotate(words, (ends[0], place), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    panel.set_yticks(range(len(rows)), [Path(row["file"]).stem[:44] for row in rows])
-    panel.invert_yaxis()
-    panel.set_xscale("log")
-    panel.set_xlim(0.5 * _ROUNDING, 2e3)
-    panel.set_xlabel("merit; below 10⁻⁶ only that it is")
-    panel.grid(axis="x", alpha=0.25)
-    if rows:
-        figure.legend(loc="outside lower center", ncols=3)
-    return figure
-
-
-def _look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
+def look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
     return {
         "color": style.GREY if colour is None else style.field_colour(colour),
         "linestyle": line,
@@ -205,7 +141,7 @@ def _look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
     }
 
 
-def _dtypes() -> list[Line2D]:
+def dtype_keys() -> list[Line2D]:
     """What stands for a dtype."""
     look = {"marker": "o", "color": style.INK, "linestyle": "none"}
     return [_key("float64", **look), _key("float32", markerfacecolor="white", **look)]
@@ -215,7 +151,7 @@ def _key(label: str, **look) -> Line2D:
     return Line2D([], [], label=label, **{"markersize": 4} | look)
 
 
-def _framed(panel: Axes, title: str, abscissa: str) -> None:
+def framed(panel: Axes, title: str, abscissa: str) -> None:
     panel.set(xscale="log", yscale="log", title=title, xlabel=abscissa)
     panel.grid(True, which="major", color=style.FAINT, linewidth=0.5)
     panel.set_axisbelow(True)

@@ -1,10 +1,10 @@
-"""The direct Huygens sum: every ray a wavelet on the reference sphere, added up at every point of every pixel.
+"""The direct Huygens sum: every ray a wavelet on the reference sphere, summed at every point of every pixel.
 
     U(p) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi n [W_j/n + |q_j - p| - R]/λ),   kernel = ∫ |U|² over the pixel
 
-It is the reference of the wave model, and shares with it only the traced wavefront W. Distances are exact (the model
-has Debye's plane waves), Ω is taken by differences of neighbouring rays, the rim of the pupil by bisection, no symmetry
-is used, and no sum is separated into x and y. One object distance, one field, one wavelength at a time; no gradients.
+It is the reference of the wave model, and shares only the traced wavefront W with it. Distances are exact (the model
+uses Debye's plane waves), Ω is by differences of neighbouring rays, the rim of the pupil by bisection, no symmetry is
+used. One object distance, field and wavelength; no gradients.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.psf_models.dft import huygens, sub_pixels
 from raytrace.tracing.scene import Scene, trace_scene
-from raytrace.tracing.wavefront import Wavefront, wavefront_of
+from raytrace.tracing.wavefront import wavefront_of
 
 _TERMS = 2**21  # wavelets × points that are added at once
 _STEP = 1e-4  # of the pupil radius, for Ω
@@ -26,10 +26,8 @@ _SCAN, _BISECTIONS = 64, 48
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
-    """How finely a direct sum is made.
-
-    rings, arms: Gauss rings over the clear pupil; with arms = 0 a square grid of `rings` points across instead, as
-    wave-optics programs take it. nodes: points across a pixel, Gauss-Legendre.
+    """rings, arms: Gauss rings over the clear pupil; arms = 0: a square grid of `rings` points across; nodes: points
+    across a pixel, Gauss-Legendre.
     """
 
     rings: int
@@ -45,12 +43,17 @@ class Sampling:
 def direct_sum(scene: Scene, grid: Grid, sampling: Sampling) -> tuple[Tensor, int]:
     """Kernel (rows, columns) of a scene of shape (1, 1, 1), and the number of rays."""
     like = scene.lens.surfaces[-2].thickness
-    points, weights = rule(scene, sampling, like)
+    points, weights = (
+        clear_rings(scene, sampling.rings, sampling.arms)
+        if sampling.arms
+        else square(sampling.rings, dtype=like.dtype, device=like.device)
+    )
     front = wavefront_of(scene, points, weights)
     amplitude = torch.sqrt(front.energy * weights * math.pi * solid_angle(scene, points))[0, 0, 0]
     lit = amplitude > 0
     pupil = (-front.radius * front.direction)[:, 0, 0, 0][:, lit]
-    x, y, share = sub_pixels(_about(grid, front), sampling.nodes)
+    about = Grid(grid.pitch, grid.rows, grid.columns, grid.centre - front.centre[:2, 0, 0, 0])
+    x, y, share = sub_pixels(about, sampling.nodes)
     v, h = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
     wavelength = 1e-3 * front.wavelength[0] / front.index[0]
     path, radius = front.opd[0, 0, 0][lit] / front.index[0], front.radius[0, 0, 0]
@@ -64,16 +67,9 @@ def direct_sum(scene: Scene, grid: Grid, sampling: Sampling) -> tuple[Tensor, in
     return torch.einsum("iajb,a,b->ij", fine, share, share) * grid.pitch**2, points.shape[1]
 
 
-def rule(scene: Scene, sampling: Sampling, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Pupil points (2, P) and weights (P,) of a sampling."""
-    if not sampling.arms:
-        return square(sampling.rings, dtype=like.dtype, device=like.device)
-    return clear_rings(scene, sampling.rings, sampling.arms)
-
-
 @torch.no_grad()
 def clear_rings(scene: Scene, rings: int, arms: int) -> tuple[Tensor, Tensor]:
-    """Gauss rings squeezed, arm by arm, between the radii at which light begins and ceases to pass: (2, P), (P,)."""
+    """Gauss rings of every arm between the inner and outer radius of its clear pupil: (2, P), (P,)."""
     like = scene.lens.surfaces[-2].thickness
     points, weights = gauss_rings(rings, arms, dtype=like.dtype, device=like.device)
     angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
@@ -98,7 +94,7 @@ def clear_rings(scene: Scene, rings: int, arms: int) -> tuple[Tensor, Tensor]:
 
 
 def _bisect(passes, clear: Tensor, dark: Tensor) -> Tensor:
-    """The edge between a radius (arms) that passes and one that does not (the same one, if there is no edge)."""
+    """The edge between a radius (arms) that passes and one that does not (the same one if there is no edge)."""
     for _ in range(_BISECTIONS):
         middle = 0.5 * (clear + dark)
         through = passes(middle[None])[0]
@@ -115,27 +111,14 @@ def solid_angle(scene: Scene, points: Tensor) -> Tensor:
     return (a * d - b * c).abs()
 
 
-def _about(grid: Grid, front: Wavefront) -> Grid:
-    """The grid from the centre of the reference sphere."""
-    return Grid(grid.pitch, grid.rows, grid.columns, grid.centre - front.centre[:2, 0, 0, 0])
-
-
-@dataclasses.dataclass(frozen=True)
-class Moments:
-    """centroid: (2,) mm; variance: (2,) mm² along x and y; energy: share of the entrance pupil's light that arrives."""
-
-    centroid: Tensor
-    variance: Tensor
-    energy: Tensor
-
-
 @torch.no_grad()
-def moments(scene: Scene, rings: int = 96, arms: int = 384) -> Moments:
-    """Converged moments of the rays of a scene of shape (1, 1, 1)."""
+def moments(scene: Scene, rings: int = 96, arms: int = 384) -> tuple[Tensor, Tensor, Tensor]:
+    """Converged moments of the rays of a scene of shape (1, 1, 1): centroid (2,) mm, variance (2,) mm² along x and y,
+    and the share of the entrance pupil's light that arrives."""
     points, weights = clear_rings(scene, rings, arms)
     hits = trace_scene(scene, points)
     passed = torch.where(hits.valid[0, 0, 0], weights, 0.0)
     share = passed / passed.sum()
     x = hits.position[:2, 0, 0, 0]
     centroid = ((x - x[:, :1]) * share).sum(1) + x[:, 0]
-    return Moments(centroid, (share * (x - centroid[:, None]) ** 2).sum(1), passed.sum())
+    return centroid, (share * (x - centroid[:, None]) ** 2).sum(1), passed.sum()

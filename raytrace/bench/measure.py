@@ -1,7 +1,6 @@
-"""What the benchmarks of the trace share: who traces, calls timed in turns, and the error against the reference.
+"""Shared by the benchmarks: tracers, calls timed in turns, and errors against the reference.
 
-A speed is rays × surfaces / s. Surfaces are those a ray is carried to: all of the file but the object, the stop and the
-image among them.
+A speed is rays × surfaces / s. Surfaces are all of the file but the object: stop and image count.
 """
 
 import dataclasses
@@ -27,38 +26,35 @@ from raytrace.tracing.trace import media, trace_lens, trace_surfaces
 
 DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference
-PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
+PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, and all at once
 SHORTEST = 0.02  # s: shorter calls are timed many at a time
 _MOST_CALLS = 200
 
-#: A call to be timed, and what stands before it untimed.
+#: A call that is timed, and its preparation, which is not.
 Job = tuple[Callable[[], object], Callable[[], object]]
 
 
 def nothing(*_) -> None:
-    """What stands before a call that needs no preparation; progress that nobody follows."""
+    """No preparation; no progress."""
 
 
 def name_of(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-# -- who traces --------------------------------------------------------------------------------------------------------
-
-
 class Tracer(Protocol):
-    """A tracer with a lens: name, dtype and whether it computes the optical path are part of it.
+    """A tracer of one lens.
 
-    prepare: called before every timed call, untimed.
-    forward: (positions (2, P) on the image, path (P,) or None) without gradient.
-    gradient: derivatives of the mean squared distance from `centroid` (2,), numbers in the order of `variables`, then
-    by the indices of all media where it takes those.
+    prepare: called before every timed call. forward: positions (2, P) on the image and optical path (P,) or None,
+    without gradient. gradient: derivatives of the mean squared distance from `centroid` (2,) with respect to
+    `variables`, then to the indices of media if it takes those.
     """
 
     name: str
     dtype: torch.dtype
     with_path: bool
     has_gradient: bool
+    most: int | None  # rays it traces in bearable time; None: any number
 
     def prepare(self) -> None: ...
 
@@ -68,12 +64,11 @@ class Tracer(Protocol):
 
 
 class Own:
-    """This package's trace by an engine: "auto" (the program's choice), "eager", or None, the one asked for.
-
-    by_indices: gradients also by the index of every medium.
+    """This package's trace. engine: "auto" (the program's choice), "eager", or None for the engine that is set;
+    by_indices: gradients also with respect to the index of every medium.
     """
 
-    has_gradient = True
+    has_gradient, most = True, None
 
     def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False):
         self.dtype, self.with_path, self.engine = dtype, with_path, engine or engine_asked_for()
@@ -81,8 +76,7 @@ class Own:
         self.lens, self.wavelength = to(lens, dtype=dtype), lens.primary
         self.surfaces, self.indices, self.leaves = leaves_of(self.lens, by_indices=by_indices)
 
-    def prepare(self) -> None:
-        pass
+    prepare = nothing
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
         with torch.no_grad(), trace_engine(self.engine):
@@ -103,53 +97,46 @@ class Own:
 def squared_radius(x: Tensor, y: Tensor, centroid: Tensor) -> Tensor:
     """Mean squared distance from a fixed point.
 
-    About the rays' own centroid its gradient is that of the mean squared spot radius, for the centroid moves by the
-    mean of what the rays move by, and the distances from it sum to zero.
+    At the centroid its gradient is that of the mean squared spot radius: distances from the centroid sum to zero.
     """
     return ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2).mean()
 
 
 def slope(rays: Rays, leaf: Tensor) -> Tensor:
-    """Derivative of the mean squared spot radius by a number of the lens."""
+    """Derivative of the mean squared spot radius with respect to a number of the lens."""
     x, y = rays.position[0], rays.position[1]
     centroid = torch.stack([x.detach().mean(), y.detach().mean()])
     return torch.autograd.grad(squared_radius(x, y, centroid), leaf)[0]
 
 
 def variables(lens: Lens) -> list[tuple[int, str]]:
-    """What gradients are taken by: every modelled curvature and every thickness, as (surface number, name)."""
+    """Variables of gradients: every modelled curvature and every thickness, as (surface number, name)."""
     last = len(lens.surfaces) - 1
     curved = [(i, "curvature") for i in range(1, last + 1) if lens.surfaces[i].curvature is not None]
     return curved + [(i, "thickness") for i in range(1, last)]
 
 
 def with_leaf(lens: Lens, number: int, name: str) -> tuple[Lens, Tensor]:
-    """The lens with one number of a surface a leaf, and the leaf."""
+    """The lens with one number of a surface as a leaf, and the leaf."""
     leaf = getattr(lens.surfaces[number], name).detach().clone().requires_grad_()
     return lens.replace(number, **{name: leaf}), leaf
 
 
-def with_leaves(lens: Lens, chosen: Sequence[tuple[int, str]] | None = None) -> tuple[Lens, list[Tensor]]:
-    """The lens with a leaf for each of the chosen numbers, by default `variables`, and the leaves."""
+def with_leaves(lens: Lens, chosen: Sequence[tuple[int, str]]) -> tuple[Lens, list[Tensor]]:
+    """The lens with a leaf for each of the chosen numbers, and the leaves."""
     leaves = []
-    for number, name in variables(lens) if chosen is None else chosen:
+    for number, name in chosen:
         lens, leaf = with_leaf(lens, number, name)
         leaves.append(leaf)
     return lens, leaves
 
 
-def with_sensor_leaf(lens: Lens) -> tuple[Lens, Tensor]:
-    """The lens with its sensor distance a leaf, and the leaf."""
-    return with_leaf(lens, len(lens.surfaces) - 2, "thickness")
-
-
 def leaves_of(lens: Lens, *, by_indices: bool = True) -> tuple[tuple[Surface, ...], list[Tensor], list[Tensor]]:
     """Surfaces after the object with the leaves of `variables`, the indices of all media, and the leaves.
 
-    by_indices: the indices are leaves, too. Neighbouring gaps of one medium share one: the surface between bends
-    nothing.
+    by_indices: the indices are leaves, too; neighbouring gaps of one medium share one.
     """
-    moving, leaves = with_leaves(lens)
+    moving, leaves = with_leaves(lens, variables(lens))
     fixed = media(lens, lens.primary)
     indices = list(fixed)
     for number, index in enumerate(fixed if by_indices else ()):
@@ -161,15 +148,14 @@ def leaves_of(lens: Lens, *, by_indices: bool = True) -> tuple[tuple[Surface, ..
     return moving.surfaces[1:], indices, leaves
 
 
-# -- rays, and what becomes of them in 50 digits -----------------------------------------------------------------------
+# -- rays and errors ---------------------------------------------------------------------------------------------------
 
 
 def field_rays(lens: Lens, count: int) -> Rays:
     """`count` rays (Sobol points of the pupil) of the lens's middle field at its primary wavelength, float64."""
     field = torch.stack([lens.fields.x, lens.fields.y])[:, len(lens.fields.x) // 2, None]
-    wavelength = lens.primary
     with torch.no_grad():
-        rays = rays_of_field(lens, field, sobol(count)[0], wavelength=wavelength, ray_aiming="off")
+        rays = rays_of_field(lens, field, sobol(count)[0], wavelength=lens.primary, ray_aiming="off")
     return dataclasses.replace(rays, opl=None)
 
 
@@ -179,16 +165,16 @@ def some(rays: Rays, change: Callable[[Tensor], Tensor]) -> Rays:
 
 
 def surfaces_of(lens: Lens) -> int:
-    """Number of surfaces that a ray is carried to."""
+    """Number of surfaces but the object."""
     return len(lens.surfaces) - 1
 
 
 @dataclasses.dataclass(frozen=True)
 class Errors:
-    """What a tracer misses the reference by, largest of the sample. Both are given the same numbers of their dtype.
+    """Errors against the reference, the largest of the sample; both trace the same numbers of the dtype.
 
     position: nm on the image; path: wavelengths, relative to the first ray; gradient: of the mean squared spot radius
-    by curvatures and by thicknesses, |g - g_ref|/|g_ref| in the largest component, the larger of the two.
+    with respect to curvatures and to thicknesses, |g - g_ref|/|g_ref| of the largest component, the larger of both.
     """
 
     position: float | None
@@ -197,10 +183,10 @@ class Errors:
 
 
 def shape_of(surface: Surface, number: int) -> tuple[float, float, list[float]]:
-    """Curvature, conic and terms of r², r⁴, …: the shapes that everyone here knows. Raises ValueError for others."""
+    """Curvature, conic and coefficients of r², r⁴, …. Raises ValueError for other shapes."""
     if not is_even(surface):
-        raise ValueError(f"surface {number} is no conic with even terms: its shape is not handed over")
-    c, k = (0.0 if one is None else float(one) for one in (surface.curvature, surface.conic))
+        raise ValueError(f"surface {number} is no conic with even terms: peers and references cannot trace it")
+    c, k = (0.0 if value is None else float(value) for value in (surface.curvature, surface.conic))
     return c, k, [] if surface.coefficients is None else surface.coefficients.tolist()
 
 
@@ -215,10 +201,10 @@ def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
 
 
 def errors_of(tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradient: bool = True) -> Errors:
-    """Compare a tracer with the reference on a few rays (3, P); both get the numbers as rounded to the dtype.
+    """Errors of a tracer on a few rays (3, P), both with the numbers as rounded to the dtype.
 
-    copies: how often the rays stand in the batch, so that it takes the way of large ones; gradient: whether to compare
-    that, too, where there is one.
+    copies: of the rays in the batch, so that the engine of large batches traces it; gradient: whether to compare that,
+    too.
     """
     lens, rays = to(lens, dtype=tracer.dtype), to(rays, dtype=tracer.dtype)
     surfaces, index = reference_of(lens)
@@ -228,102 +214,84 @@ def errors_of(tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradie
     tracer.prepare()
     points, path = tracer.forward(batch)
     points = points[:, :count]
-    found = Errors(
-        1e6 * max(_worst(points[axis].tolist(), [ray.position[axis] for ray in exact]) for axis in (0, 1)), None, None
-    )
+    position = 1e6 * max(_worst(points[axis].tolist(), [ray.position[axis] for ray in exact]) for axis in (0, 1))
+    path_error = gradient_error = None
     if path is not None:
-        waves = 1e3 / float(lens.primary)
-        own = path[:count].double() - path[0].double()
-        found = dataclasses.replace(
-            found, path=waves * _worst(own.tolist(), [ray.path - exact[0].path for ray in exact])
-        )
+        relative = (path[:count].double() - path[0].double()).tolist()
+        path_error = 1e3 / float(lens.primary) * _worst(relative, [ray.path - exact[0].path for ray in exact])
     if gradient and tracer.has_gradient:
         names = variables(lens)
         expected = spot_gradient(surfaces, index, starts, [(number - 1, name) for number, name in names])
-        own = [float(slope) for slope in tracer.gradient(batch, points.mean(1))][: len(names)]
-        found = dataclasses.replace(found, gradient=_worst_by_kind(own, expected, [name for _, name in names]))
-    return found
+        slopes = [float(slope) for slope in tracer.gradient(batch, points.mean(1))]
+        gradient_error = 0.0
+        for kind in {name for _, name in names}:
+            pairs = [(a, b) for a, b, (_, name) in zip(slopes, expected, names, strict=False) if name == kind]
+            error = _worst(*zip(*pairs, strict=True)) / float(max(abs(b) for _, b in pairs))
+            gradient_error = max(gradient_error, error)
+    return Errors(position, path_error, gradient_error)
 
 
-def _worst_by_kind(found: Sequence[float], expected: Sequence, kinds: Sequence[str]) -> float:
-    """The largest error relative to the largest component of its kind."""
-    worst = 0.0
-    for kind in set(kinds):
-        pairs = [(a, b) for a, b, own in zip(found, expected, kinds, strict=True) if own == kind]
-        worst = max(worst, _worst(*zip(*pairs, strict=True)) / float(max(abs(b) for _, b in pairs)))
-    return worst
-
-
-def _worst(found: Sequence[float], expected: Sequence) -> float:
-    return max(float(abs(a - b)) for a, b in zip(found, expected, strict=True))
+def _worst(values: Sequence[float], expected: Sequence) -> float:
+    return max(float(abs(a - b)) for a, b in zip(values, expected, strict=True))
 
 
 # -- time --------------------------------------------------------------------------------------------------------------
 
 
 def clock(threads: int) -> Callable[[], float]:
-    """Processor time where one thread works, which neighbours on the machine lengthen little; else the time of day."""
+    """Processor time for one thread, which other load of the machine lengthens little; else the time of day."""
     return time.process_time if threads == 1 else time.perf_counter
 
 
 def seconds_of(job: Job, calls: int, threads: int) -> float:
-    """Of one call, the mean of several."""
+    """Mean seconds of several calls."""
     call, prepare = job
     with torch_threads(threads):
         prepare()
         now = clock(threads)
-        began = now()
+        start = now()
         for _ in range(calls):
             call()
-        return (now() - began) / calls
+        return (now() - start) / calls
 
 
 def in_turns(
     jobs: Mapping[object, Job], *, repeats: int, threads: int, progress: Callable[[int], object] = nothing
 ) -> dict[object, list[float]]:
-    """Seconds of each job, one call of each in turn so that a busy machine meets all alike; short calls many at a time.
+    """Seconds of each job. Jobs take turns, so that other load affects all alike; short calls are timed many at a time.
 
     progress: called with 1 for each, `repeats` times the jobs.
     """
     calls = {}
     for name, job in jobs.items():
         seconds_of(job, 1, threads)  # warm up
-        once = seconds_of(job, 1, threads)
-        calls[name] = max(1, min(_MOST_CALLS, math.ceil(SHORTEST / max(once, 1e-6))))
-    taken: dict[object, list[float]] = {name: [] for name in jobs}
+        calls[name] = max(1, min(_MOST_CALLS, math.ceil(SHORTEST / max(seconds_of(job, 1, threads), 1e-6))))
+    seconds: dict[object, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats):
         for name, job in jobs.items():
-            taken[name].append(seconds_of(job, calls[name], threads))
+            seconds[name].append(seconds_of(job, calls[name], threads))
             progress(1)
-    return taken
+    return seconds
 
 
 def in_best_pieces(
-    function: Callable[[Rays], object],
-    rays: Rays,
-    prepare: Callable[[], object],
-    *,
-    sizes: Sequence[int],
-    threads: int,
+    function: Callable[[Rays], object], rays: Rays, prepare: Callable, *, sizes: Sequence[int], threads: int,
     most: int | None = None,
-) -> tuple[Job, int]:
-    """A call on all rays, as many at a time as a trial finds fastest, and how many: of `sizes`, or at most `most`."""
+) -> tuple[Job, int]:  # fmt: skip
+    """A call on all rays in pieces, and their size: the fastest of `sizes` and all at once, ≤ most."""
     count = rays.direction.shape[1]
     whole = min(count, most or count)
-    jobs = {
-        size: (_by_pieces(function, rays, size), prepare) for size in {*(min(size, whole) for size in sizes), whole}
-    }
+
+    def by_pieces(size: int) -> Callable[[], object]:
+        if size >= count:
+            return lambda: function(rays)
+        pieces = [some(rays, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
+        return lambda: [function(piece) for piece in pieces]
+
+    jobs = {size: (by_pieces(size), prepare) for size in {*(min(size, whole) for size in sizes), whole}}
     if len(jobs) == 1:
         return jobs[whole], whole
     for job in jobs.values():
         seconds_of(job, 1, threads)
     best = min(jobs, key=lambda size: min(seconds_of(jobs[size], 1, threads) for _ in range(2)))
     return jobs[best], best
-
-
-def _by_pieces(function: Callable[[Rays], object], rays: Rays, size: int) -> Callable[[], object]:
-    count = rays.direction.shape[1]
-    if size >= count:
-        return lambda: function(rays)
-    pieces = [some(rays, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
-    return lambda: [function(piece) for piece in pieces]

@@ -1,11 +1,13 @@
-"""Peers, as the benchmarks call them: Optiland, its trace and its PSFs, and ray-optics, on the same lens and rays.
+"""Peers: Optiland, its trace and its PSFs, and the trace of ray-optics, on the same lens and rays.
 
-How they trace stands in `peers_trace`. Optiland's PSFs are those of its numpy back end with compiled loops, float64,
-forward only, launching rays included, as in this package's: `IncoherentIrradiance`, the histogram of random rays on the
-pixels of the window; `HuygensPSF`, its direct sum at the midpoints of the parts of every pixel, whose mean a pixel is;
-`FFTPSF`, on its own grid about the chief ray, brought to the same midpoints by bilinear interpolation. Its waves are
-normalised to the peak of a perfect lens, so each kernel is given the energy of the reference in the window: shapes are
-compared.
+Of Optiland's trace `optic.surfaces.trace(rays, skip=1, record=False)` is timed, the loop over surfaces alone: no
+paraxial launch, no ray aiming, no snapshots, media of constant index. Its grad mode is off, so that only the variables
+are leaves of the graph. It always computes the optical path.
+
+Optiland's PSFs are those of its numpy back end, float64, forward only, with the launch of rays as in this package:
+`IncoherentIrradiance`, the histogram of random rays on the pixels of the window; `HuygensPSF`, its direct sum at the
+midpoints of the parts of every pixel; `FFTPSF`, on its own grid about the chief ray, interpolated to these midpoints.
+Kernels are scaled to the energy of the reference in the window: shapes are compared.
 
 Importing this file imports Optiland: it needs the extra [bench].
 """
@@ -14,6 +16,7 @@ import functools
 import importlib
 import importlib.util
 import math
+import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 
@@ -22,21 +25,27 @@ import numpy as np
 import optiland.backend as be
 import torch
 from optiland.analysis import IncoherentIrradiance
+from optiland.materials import IdealMaterial
 from optiland.optic import Optic
 from optiland.physical_apertures import RadialAperture, RectangularAperture
 from optiland.psf import FFTPSF
 from optiland.psf.huygens_fresnel import ScalarHuygensPSF
+from optiland.rays import RealRays
+from torch import Tensor
 
-from raytrace.bench.measure import DTYPES
-from raytrace.bench.peers_trace import Optiland, PosedOptiland, RayOptics
+from raytrace.bench.measure import DTYPES, name_of, nothing, shape_of, squared_radius, variables
 from raytrace.bench.psf import Truth
 from raytrace.bench.psf_cases import Case, Method
 from raytrace.maths.grid import Grid
+from raytrace.maths.value import to
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.rays import Rays
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
+from raytrace.tracing.trace import media
 
+_RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 _RANDOM = (10_000, 100_000, 1_000_000)
 _HUYGENS = ((64, 3), (96, 5))  # rays across the pupil, points across a pixel
 _FFT = ((128, 512), (256, 2048))  # rays across the pupil, points of the transform
@@ -44,42 +53,190 @@ _OPEN = 1e9  # mm: an aperture without an outer edge
 _PARTS = 6  # of a pixel, where the FFT is integrated
 
 
+class Optiland:
+    """A lens in Optiland. backend: "torch" or "numpy" (float64, forward only).
+
+    by_indices: gradients also with respect to the index of every medium.
+    """
+
+    with_path, most = True, None
+
+    def __init__(self, lens: Lens, dtype: torch.dtype, *, backend: str, by_indices: bool = False):
+        self.name = f"Optiland, {backend}"
+        self.dtype, self.backend, self.by_indices = dtype, backend, by_indices
+        self.has_gradient = backend == "torch"
+        self.lens = to(lens, dtype=dtype)
+        self.wavelength = float(lens.primary)
+        self.indices = media(self.lens, self.lens.primary)
+        self._leaves: tuple[list[Tensor], dict[int, Tensor]] | None = None
+        self.prepare()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Optiland and numba
+            self.optic = self._build()
+            self._set_conditions()
+            axis = torch.zeros(3, 2, dtype=dtype)
+            axis[2] = 1.0
+            self.forward(Rays(torch.zeros_like(axis), axis, torch.ones(2, dtype=torch.bool)))  # compiles
+
+    def prepare(self) -> None:
+        """Optiland's back end, precision and grad mode are global."""
+        be.set_backend(self.backend)
+        if self.backend == "torch":
+            be.set_precision(name_of(self.dtype))
+            be.grad_mode.disable()
+
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        if self._leaves is not None:
+            self._without_leaves()
+        with torch.no_grad():
+            end = self._trace(rays)
+        return torch.stack([torch.as_tensor(end.x), torch.as_tensor(end.y)]), torch.as_tensor(end.opd)
+
+    def gradient(self, rays: Rays, centroid: Tensor) -> list[Tensor]:
+        """By Optiland's variables radius, thickness and index; d/dc = -R² d/dR."""
+        if self._leaves is None:
+            self._leaves = self._with_leaves()
+        leaves, thicknesses = self._leaves
+        z = torch.zeros((), dtype=self.dtype)
+        for number in range(1, len(self.lens.surfaces)):
+            self.optic.surfaces[number].geometry.cs.z = z
+            z = z + thicknesses.get(number, 0.0)
+        end = self._trace(rays)
+        slopes = list(torch.autograd.grad(squared_radius(end.x, end.y, centroid), leaves))
+        for place, (_, name) in enumerate(variables(self.lens)):
+            if name == "curvature":
+                slopes[place] = -(leaves[place].detach() ** 2) * slopes[place]
+        return slopes
+
+    def _with_leaves(self) -> tuple[list[Tensor], dict[int, Tensor]]:
+        """The variables as leaves, and those that are thicknesses by surface."""
+        surfaces, leaves, thicknesses = self.optic.surfaces, [], {}
+        for number, name in variables(self.lens):
+            if name == "curvature":
+                leaf = surfaces[number].geometry.radius.detach().clone().requires_grad_()
+                surfaces[number].geometry.radius = leaf
+            else:
+                leaf = self.lens.surfaces[number].thickness.detach().clone().requires_grad_()
+                thicknesses[number] = leaf
+            leaves.append(leaf)
+        leaf = None
+        for number, index in enumerate(self.indices if self.by_indices else ()):
+            if number == 0 or index is not self.indices[number - 1]:
+                leaf = index.detach().reshape(1).clone().requires_grad_()
+                leaves.append(leaf)
+            surfaces[number].material_post.index = leaf
+        return leaves, thicknesses
+
+    def _without_leaves(self) -> None:
+        """Leave no graph behind for the forward runs."""
+        for number in range(1, len(self.lens.surfaces)):
+            surface = self.optic.surfaces[number]
+            surface.geometry.radius = torch.as_tensor(surface.geometry.radius).detach()
+            surface.geometry.cs.z = surface.geometry.cs.z.detach()
+        if self.by_indices:
+            for number in range(len(self.indices)):
+                material = self.optic.surfaces[number].material_post
+                material.index = material.index.detach()
+        self._leaves = None
+
+    def _trace(self, rays: Rays) -> RealRays:
+        x, y, z = rays.position
+        L, M, N = rays.direction
+        columns = [x, y, z, L, M, N, torch.ones_like(x), x.new_full((1,), self.wavelength)]
+        if self.backend == "numpy":
+            columns = [column.numpy() for column in columns]
+        return self.optic.surfaces.trace(RealRays(*columns), skip=1, record=False)
+
+    def _build(self) -> Optic:
+        optic, last = Optic(), len(self.lens.surfaces) - 1
+        for number, surface in enumerate(self.lens.surfaces):
+            curvature, conic, coefficients = shape_of(surface, number)
+            numbers = {"thickness": float(surface.thickness) if number < last else 0.0}
+            if curvature:
+                numbers |= {"radius": 1 / curvature, "conic": conic}
+            if coefficients:
+                numbers["coefficients"] = coefficients
+            optic.surfaces.add(
+                index=number,
+                surface_type="even_asphere" if coefficients else "standard",
+                is_stop=number == self.lens.stop,
+                material="mirror" if surface.is_mirror else IdealMaterial(float(self.indices[number])),
+                **numbers,
+            )
+        return optic
+
+    def _set_conditions(self) -> None:
+        self.optic.set_aperture("EPD", 1.0)
+        self.optic.fields.set_type("angle")
+        self.optic.fields.add(y=0.0)
+        self.optic.wavelengths.add(self.wavelength, is_primary=True)
+
+
+class RayOptics:
+    """ray-optics: one ray at a time, float64, forward. Raises ModuleNotFoundError if it is not installed."""
+
+    name, most = "ray-optics", _RAY_OPTICS_MOST
+    dtype, with_path, has_gradient = torch.float64, True, False
+
+    def __init__(self, lens: Lens):
+        self.trace = importlib.import_module("rayoptics.raytr.raytrace").trace_raw
+        surface = importlib.import_module("rayoptics.elem.surface").Surface
+        sphere = importlib.import_module("rayoptics.elem.profiles").Spherical
+        self.wavelength = 1e3 * float(lens.primary)
+        indices = [float(index) for index in media(lens, lens.primary)]
+        unturned = np.eye(3)
+        self.path = [[surface(), None, (unturned, np.zeros(3)), indices[0], 1]]
+        for number, (element, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1):
+            if element.conic is not None or element.coefficients is not None or element.is_mirror:
+                raise ValueError("ray-optics: expected spheres and planes that refract")
+            shift = unturned, np.array([0.0, 0.0, float(element.thickness)])
+            profile = sphere(c=shape_of(element, number)[0])
+            self.path.append([surface(profile=profile, interact_mode="transmit"), None, shift, index, 1])
+
+    prepare = nothing
+
+    def forward(self, rays: Rays) -> tuple[Tensor, None]:
+        starts = zip(rays.position.T.numpy(), rays.direction.T.numpy(), strict=True)
+        ends = [
+            self.trace(iter(self.path), position, direction, self.wavelength, intersect_obj=False)[0][-1][0]
+            for position, direction in starts
+        ]
+        return torch.as_tensor(np.array(ends).T[:2]), None
+
+
 def set_threads(threads: int) -> None:
     """Threads of Optiland's compiled loops. They may set those of torch too, which are set at every timed call."""
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
 
-def peers(lens: Lens, kind: type[Optiland] = Optiland) -> list[Optiland]:
+def peers(lens: Lens) -> list[Optiland]:
     """For `bench trace`: Optiland in float32 and float64 on torch, and on numpy."""
-    found = [kind(lens, dtype, backend="torch") for dtype in DTYPES]
-    return [*found, kind(lens, torch.float64, backend="numpy")]
-
-
-def posed_peers(lens: Lens) -> list[Optiland]:
-    """The same for a lens of toroids, gratings and tilts."""
-    return peers(lens, PosedOptiland)
+    return [
+        *(Optiland(lens, dtype, backend="torch") for dtype in DTYPES),
+        Optiland(lens, torch.float64, backend="numpy"),
+    ]
 
 
 def rivals(lens: Lens, dtype: torch.dtype) -> list[Optiland | RayOptics]:
-    """For `bench speed`: Optiland on torch in this dtype and on numpy, always float64, gradients by indices, too; and
-    ray-optics, beside float64, of spheres and where it is installed."""
-    found = [Optiland(lens, dtype, backend="torch", by_indices=True), Optiland(lens, torch.float64, backend="numpy")]
-    simple = all(one.coefficients is None and one.conic is None for one in lens.surfaces)
+    """For `bench speed`: Optiland on torch in this dtype, with gradients by indices, and on numpy in float64; and in
+    float64 ray-optics, for spheres if it is installed."""
+    chosen = [Optiland(lens, dtype, backend="torch", by_indices=True), Optiland(lens, torch.float64, backend="numpy")]
+    simple = all(surface.coefficients is None and surface.conic is None for surface in lens.surfaces)
     others = dtype == torch.float64 and simple and importlib.util.find_spec("rayoptics") is not None
-    return [*found, RayOptics(lens)] if others else found
+    return [*chosen, RayOptics(lens)] if others else chosen
 
 
 def versions() -> dict[str, str]:
     """Versions of the peers, for people."""
     names = {"Optiland": "optiland", "numba": "numba", "ray-optics": "rayoptics"}
-    return {word: version(name) for word, name in names.items() if importlib.util.find_spec(name) is not None}
+    return {title: version(name) for title, name in names.items() if importlib.util.find_spec(name) is not None}
 
 
 # -- PSFs --------------------------------------------------------------------------------------------------------------
 
 
 def psf_methods(truth: Truth) -> list[Method]:
-    """Optiland on one case; none where the lens has what is not handed over (an aperture that is not an annulus)."""
+    """Optiland on one case; none for a lens with apertures that are not annuli."""
     optic = optic_of(truth.case)
     if optic is None:
         return []
@@ -91,9 +248,9 @@ def psf_methods(truth: Truth) -> list[Method]:
         run = functools.partial(_run, compute, optic, field, wavelength, sizes, energy.get(against, 1.0))
         return Method(f"Optiland {model}", sampling, run, against, has_gradient=False)
 
-    found = [method("histogram", f"{n:,} rays", "rays", _histogram, n) for n in _RANDOM]
-    found += [method("Huygens", f"{n}² grid, {m}² a pixel", "wave", _huygens, n, m) for n, m in _HUYGENS]
-    return found + [method("FFT", f"{n}² grid, {m}² points", "wave", _fft, n, m) for n, m in _FFT]
+    methods = [method("histogram", f"{n:,} rays", "rays", _histogram, n) for n in _RANDOM]
+    methods += [method("Huygens", f"{n}² grid, {m}² a pixel", "wave", _huygens, n, m) for n, m in _HUYGENS]
+    return methods + [method("FFT", f"{n}² grid, {m}² points", "wave", _fft, n, m) for n, m in _FFT]
 
 
 def optic_of(case: Case) -> Optic | None:

@@ -1,26 +1,26 @@
-"""Speed of PSFs beside their error: time forward and forward + backward of every model against converged references.
+"""Speed of PSFs against their error: time forward and forward + backward of every model, against converged kernels.
 
-Geometric models are compared with `drt.reference` (10⁸ random rays would be no closer), waves with the direct
-Huygens sum, the others with their own limit: Gaussians with that of converged moments, the Fourier model with its
-finest order.
+Limits: `drt.reference` for geometric models (closer than 10⁸ random rays), the direct Huygens sum for waves, the
+Gaussian of converged moments, and the finest order of the Fourier model.
 """
 
 import dataclasses
+import functools
 import math
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from raytrace.bench import psf_report
+from raytrace.bench.figures import psf_figure
 from raytrace.bench.huygens import Sampling, direct_sum, moments
 from raytrace.bench.measure import clock, name_of, nothing, with_leaves
-from raytrace.bench.psf_cases import DIRECT, RANDOM, USUAL, Case, Method, cases, doors, methods, random_histogram
-from raytrace.bench.report import Asked, Measured
+from raytrace.bench.psf_cases import PIXELS, USUAL, Case, Method, cases, methods
+from raytrace.bench.report import Measured, Request, clock_of, in_words, milliseconds, table, yes
 from raytrace.cli.progress import progress
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
@@ -33,25 +33,19 @@ from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.wavefront import wavefront_of
 
-_PIECE = 2**16  # random rays at a time
-_PILOT = 2**17  # random rays that find how many are needed
-_PATIENCE = 20.0  # s: what would take longer is extrapolated
-_LIMIT = 0.4  # s for the repeats of one figure
-_REFERENCE = 0.75  # of the rings and arms of the wave model's order 0 and some more, for the reference
-_LADDER = ((0.65, -1), (0.75, -1), (0.75, 0))  # of its rings and arms, and of its nodes; cheapest first
-_FINEST_WAVE = 3  # order of the wave model that stands for its limit
-_SQUARE = (64, 96)  # points across the square pupil grids that are run
+_LIMIT = 0.4  # s for the repeats of a measurement
+_REFERENCE = 0.75  # of the rings and arms of the wave model's order 0, and some more, for the reference
+_FINEST_WAVE = 3  # order of the wave model that its estimates are compared with
 
 
 @dataclasses.dataclass(frozen=True)
 class PsfRow:
-    """One figure. Errors are relative; None where a quantity does not exist or was not measured.
+    """A measurement. Errors are relative; None where a quantity does not exist.
 
-    forward_s, both_s: median seconds, the second with one backward pass. l1_error: of the kernel against its model's
-    limit; sigma_error: of σx or σy, the larger; centroid_error: in units of σ; estimate: what `psf` says of own_error,
-    the error against the model's own finest order (`gaussian`: of σ and of the energy, else of the kernel);
-    model_error: of the kernel against the direct sum of waves.
-    against: what l1_error counts from; extrapolated: not run, but computed from runs with fewer rays.
+    forward_s, both_s: median seconds, the second with a backward pass. l1_error: of the kernel against the limit
+    `against`; sigma_error: of σx or σy, the larger; centroid_error: in units of σ; estimate: the error that `psf`
+    reports, of own_error, the error against the finest order of the model (`gaussian`: of σ and energy, else of the
+    kernel); model_error: of the kernel against the direct sum of waves; extrapolated: from runs with fewer rays.
     """
 
     lens: str
@@ -72,14 +66,13 @@ class PsfRow:
     extrapolated: bool = False
 
 
-# -- what a case converges to ------------------------------------------------------------------------------------------
+# -- limits ------------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What a case converges to. kernels: (rows, columns) by the name of the limit; windows: their grids.
-
-    centroid: (2,) mm; sigma: (2,) mm of the rays; rings, arms, nodes: the wave model's own sampling at order 0.
+    """Limits of a case. kernels: (rows, columns) by name; windows: their grids; centroid, sigma: (2,) mm of the rays;
+    rings, arms, nodes: sampling of the wave model at order 0.
     """
 
     case: Case
@@ -94,15 +87,15 @@ class Truth:
 
 @torch.no_grad()
 def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
-    """The converged kernels of a case; without those of a model that refuses the lens, which is said."""
+    """The converged kernels of a case. Models that refuse the lens are reported and left out."""
     scene = case.scene
-    light = moments(scene)
-    window = case.window(light.centroid)
-    shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (light.centroid, light.variance)))
+    centroid, variance, energy = moments(scene)
+    window = case.window(centroid)
+    shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (centroid, variance)))
     own = case.window(paraxial.chief_ray_height(scene).flatten())
     kernels = {
         "rays": drt.reference(scene, window)[0, 0, 0],
-        "gaussian": light.energy * shape[0, 0, 0],
+        "gaussian": energy * shape[0, 0, 0],
         "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
     }
     windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), own)
@@ -113,17 +106,16 @@ def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
         say(f"{case.title}: {refusal}")
     try:
         rings, arms, nodes = sampling = wave_sampling(scene, window)
-        finest = Sampling(*_scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2)
-        waves = direct_sum(scene, window, finest)[0]
+        waves, _ = direct_sum(scene, window, Sampling(*scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2))
         kernels["finest wave"] = MODELS["wave"].kernels(scene, window, order=_FINEST_WAVE).kernel[0, 0, 0]
         kernels["wave"] = waves
     except ValueError as refusal:
         say(f"{case.title}: {refusal}")
-    return Truth(case, kernels, windows, light.centroid, torch.sqrt(light.variance), *sampling)
+    return Truth(case, kernels, windows, centroid, torch.sqrt(variance), *sampling)
 
 
 def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
-    """Rings, arms and nodes across a pixel that the wave model takes at order 0, from the phase over the pupil."""
+    """Rings, arms and nodes across a pixel of the wave model at order 0, from the phase over the pupil."""
     front = wavefront_of(scene, *gauss_rings(8, 32))
     offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
     reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
@@ -136,25 +128,39 @@ def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
     )
 
 
-def _scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
+def scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
+    """A part of rings and arms, at least 4 and 8."""
     return max(4, round(part * rings)), max(8, 4 * round(part * arms / 4))
 
 
-# -- the measurement ---------------------------------------------------------------------------------------------------
+# -- measurement -------------------------------------------------------------------------------------------------------
 
 
-def bench(asked: Asked) -> Measured:
+def bench(request: Request) -> Measured:
     """Every method on every case."""
-    found = cases([(Path(name).stem, asked.open_lens(name)) for name in dict.fromkeys(asked.arguments.lenses or USUAL)])
-    repeats = asked.arguments.repeats
-    others = {"peer_methods": asked.peers.psf_methods} if asked.peers else {}
-    with progress(steps(found), what="measuring") as bar:
-        rows = measure(found, repeats=repeats, threads=asked.threads, progress=bar.update, say=bar.write, **others)
-    about = asked.about()
-    titles, goals = {(case.name, case.field): case.title for case in found}, psf_report.targets(rows)
-    lines = psf_report.lines(rows, goals, titles=titles, about=about, repeats=repeats)
-    document = {"repeats": repeats, "machine": about, "targets": [dataclasses.asdict(one) for one in goals]}
-    return Measured(rows, lines, document, ("psf_figure", titles))
+    rows, titles, about = measured_rows(request)
+    lines = report(rows, titles=titles, about=about["machine"], repeats=about["repeats"])
+    return Measured(rows, lines, about, functools.partial(psf_figure, titles=titles))
+
+
+def measured_rows(
+    request: Request, more: Callable[[Truth, int], Sequence[PsfRow]] = lambda truth, threads: ()
+) -> tuple[list[PsfRow], dict, dict]:
+    """Rows, titles of the cases by lens and field, repeats and machine. more: further rows of a case and threads."""
+    names = dict.fromkeys(request.arguments.lenses or USUAL)
+    chosen = cases([(Path(name).stem, request.open_lens(name)) for name in names])
+    repeats, rows = request.arguments.repeats, []
+    with progress(steps(chosen), what="measuring") as bar:
+        how = {"repeats": repeats, "threads": request.threads, "progress": bar.update, "say": bar.write}
+        peer_methods = request.peers.psf_methods if request.peers else lambda truth: ()
+        rows = measure(chosen, peer_methods=peer_methods, more=more, **how)
+    titles = {(case.name, case.field): case.title for case in chosen}
+    return rows, titles, {"repeats": repeats, "machine": request.about()}
+
+
+def steps(cases: Sequence[Case]) -> int:
+    """Number of calls of `progress` by `measure`."""
+    return len(cases) * (2 * len(methods()) + 2)
 
 
 def measure(
@@ -163,129 +169,51 @@ def measure(
     repeats: int,
     threads: int,
     peer_methods: Callable[[Truth], Sequence[Method]] = lambda truth: (),
+    more: Callable[[Truth, int], Sequence[PsfRow]] = lambda truth, threads: (),
     progress: Callable[[int], object] = nothing,
     say: Callable[[str], object] = nothing,
 ) -> list[PsfRow]:
-    """Every method on every case; what a method refuses is said, and left out. progress: of `steps(cases)`."""
+    """Every method on every case. Methods without a limit are left out, and those that refuse the case are reported."""
     rows: list[PsfRow] = []
     for case in cases:
         truth = truth_of(case, say)
         progress(1)
-        for method in (*methods(), *doors()):
-            for dtype in (torch.float64, torch.float32):
-                rows += _kept(truth, method, dtype, repeats, threads, say)
-                progress(1)
-        for dtype in (torch.float64, torch.float32):
-            rows += random_rows(truth, dtype, threads)
-            progress(1)
-        rows += direct_rows(truth, threads) if "wave" in truth.kernels else []
-        progress(1)
-        for method in peer_methods(truth):
-            rows += _kept(truth, method, torch.float64, repeats, threads, say)
+        both = (torch.float64, torch.float32)
+        tasks = [(method, dtype, 1) for method in methods() for dtype in both]
+        for method, dtype, step in [*tasks, *((method, torch.float64, 0) for method in peer_methods(truth))]:
+            if method.against in truth.kernels:
+                try:
+                    rows.append(measured_row(truth, method, dtype, repeats=repeats, threads=threads))
+                except ValueError as refusal:
+                    say(f"{case.title}, {method.model}, {method.sampling}: {refusal}")
+            progress(step)
+        rows += more(truth, threads)
         progress(1)
     return rows
 
 
-def steps(cases: Sequence[Case]) -> int:
-    """How often `measure` reports progress."""
-    return len(cases) * (2 * len([*methods(), *doors()]) + 5)
-
-
-def _kept(truth: Truth, method: Method, dtype: torch.dtype, repeats: int, threads: int, say) -> list[PsfRow]:
-    """The row of a method, or none where it has no limit or refuses the case."""
-    if method.against not in truth.kernels:
-        return []
-    try:
-        return [one_row(truth, method, dtype, repeats=repeats, threads=threads)]
-    except ValueError as refusal:
-        say(f"{truth.case.title}, {method.model}, {method.sampling}: {refusal}")
-        return []
-
-
-def one_row(truth: Truth, method: Method, dtype: torch.dtype, *, repeats: int, threads: int) -> PsfRow:
-    """Time and errors of one method."""
+def measured_row(truth: Truth, method: Method, dtype: torch.dtype, *, repeats: int, threads: int) -> PsfRow:
+    """Time and errors of a method."""
     scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows[method.against], dtype=dtype)
     both = None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotConverged)  # its words are in the row: the estimate
+        warnings.simplefilter("ignore", NotConverged)  # the row holds the estimate
         with torch.no_grad():
-            found = method.run(scene, grid)  # fills caches
+            result = method.run(scene, grid)  # fills caches
             forward = timed(lambda: method.run(scene, grid), repeats, threads)
         if method.has_gradient:
             both = timed(lambda: gradient(method, scene, grid), repeats, threads)
-    errors = errors_of(truth, method.against, found)
-    return _row(truth, method, dtype, found.rays, forward_s=forward, both_s=both, **errors)
+    errors = errors_of(truth, method.against, result)
+    return row_of(truth, method, dtype, result.rays, forward_s=forward, both_s=both, **errors)
 
 
-def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[PsfRow]:
-    """Random rays: some thousands, and as many as bring the histogram to RAYS_ERROR (error ∝ rays^-1/2)."""
-    scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows["rays"], dtype=dtype)
-    wanted = psf_report.RAYS_ERROR
-
-    @torch.no_grad()
-    def run(count: int) -> PsfRow:
-        now = clock(threads)
-        began = now()
-        found = random_histogram(scene, grid, count, piece=_PIECE)
-        seconds = now() - began
-        method = Method(RANDOM, f"{count:,} rays", random_histogram, "rays")
-        return _row(truth, method, dtype, count, forward_s=seconds, **errors_of(truth, "rays", found))
-
-    run(1000)  # fills caches
-    rows = [run(1000), run(10_000), run(_PILOT)]
-    pilot = rows[-1]
-    needed = math.ceil(_PILOT * (pilot.l1_error / wanted) ** 2)
-    if needed <= 1000:
-        return rows
-    if needed * pilot.forward_s / _PILOT > _PATIENCE:
-        return [*rows, _extrapolated(pilot, needed, wanted)]
-    rows.append(run(needed))
-    if wanted < rows[-1].l1_error < 1.5 * wanted:  # errors of random rays scatter; more than that is rounding
-        rows.append(run(math.ceil(1.1 * needed * (rows[-1].l1_error / wanted) ** 2)))
-    return rows
-
-
-def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
-    """Direct sums over Gauss rings, up to the cheapest that meets WAVE_ERROR, and over square grids, extrapolated.
-
-    The error of a square grid falls with a power of its rays: it is that of its ragged rim.
-    """
-    window, rows, wanted = truth.windows["wave"], [], psf_report.WAVE_ERROR
-
-    def run(sampling: Sampling) -> PsfRow:
-        now = clock(threads)
-        began = now()
-        kernel, count = direct_sum(truth.case.scene, window, sampling)
-        seconds = now() - began
-        method = Method(f"{DIRECT}, {'rings' if sampling.arms else 'grid'}", str(sampling), direct_sum, "wave")
-        l1 = relative_l1(kernel, truth.kernels["wave"])
-        return _row(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)
-
-    for part, more in _LADDER:
-        nodes = max(2, truth.nodes + more)
-        rows.append(run(Sampling(*_scaled(truth.rings, truth.arms, part), nodes)))
-        if rows[-1].l1_error <= wanted:
-            break
-    coarse, fine = square = [run(Sampling(across, 0, nodes)) for across in _SQUARE]
-    rows += square
-    if fine.l1_error > wanted and fine.l1_error < coarse.l1_error:
-        power = math.log(coarse.l1_error / fine.l1_error) / math.log(fine.rays / coarse.rays)
-        rows.append(_extrapolated(fine, math.ceil(fine.rays * (fine.l1_error / wanted) ** (1 / power)), wanted))
-    return rows
-
-
-def _extrapolated(row: PsfRow, rays: int, error: float) -> PsfRow:
-    """The same with as many rays as the error needs, and time in proportion to them."""
-    sampling = f"{rays:,} rays" if row.model == RANDOM else f"{round(math.sqrt(4 * rays / math.pi))}² grid"
-    seconds = row.forward_s * rays / row.rays
-    return dataclasses.replace(
-        row, sampling=sampling, rays=rays, forward_s=seconds, l1_error=error, sigma_error=None, centroid_error=None,
-        model_error=None, extrapolated=True,
-    )  # fmt: skip
+def row_of(truth: Truth, method: Method, dtype: torch.dtype, rays: int, **figures) -> PsfRow:
+    case, name = truth.case, name_of(dtype)
+    return PsfRow(case.name, case.field, method.model, method.sampling, name, rays, against=method.against, **figures)
 
 
 def gradient(method: Method, scene: Scene, grid: Grid) -> tuple[Tensor | None, ...]:
-    """Derivatives of a number made of the kernel, by every curvature, conic, coefficient and thickness of the lens."""
+    """Derivatives of a weighted sum of the kernel with respect to all curvatures, conics, coefficients, thicknesses."""
     lens, leaves = with_all_leaves(scene.lens)
     kernel = method.run(dataclasses.replace(scene, lens=lens), grid).kernel
     pattern = torch.cos(torch.arange(kernel.shape[-2] * kernel.shape[-1], dtype=kernel.dtype))
@@ -293,7 +221,7 @@ def gradient(method: Method, scene: Scene, grid: Grid) -> tuple[Tensor | None, .
 
 
 def with_all_leaves(lens: Lens) -> tuple[Lens, list[Tensor]]:
-    """The lens with leaves for every shape that is modelled and every thickness behind surface 1, and the leaves."""
+    """The lens with leaves for all modelled shape parameters and thicknesses of its surfaces, and the leaves."""
     names = ("curvature", "conic", "coefficients", "thickness")
     numbers = [(k, name) for k in range(1, len(lens.surfaces) - 1) for name in names]
     return with_leaves(lens, [(k, name) for k, name in numbers if getattr(lens.surfaces[k], name) is not None])
@@ -303,39 +231,36 @@ def timed(call: Callable[[], object], repeats: int, threads: int) -> float:
     """Median time of a call; slow ones are repeated less often."""
     now, seconds, end = clock(threads), [], time.perf_counter() + _LIMIT
     while not seconds or (len(seconds) < repeats and time.perf_counter() < end):
-        began = now()
+        start = now()
         call()
-        seconds.append(now() - began)
+        seconds.append(now() - start)
     return statistics.median(seconds)
 
 
-def errors_of(truth: Truth, against: str, found: Kernels) -> dict[str, float | None]:
-    """Errors of what a method found; moments only of those that have the rays' moments for a limit."""
-    kernel = found.kernel.detach().double().reshape(found.kernel.shape[-2:])
+def errors_of(truth: Truth, against: str, result: Kernels | Psf) -> dict[str, float | None]:
+    """Errors of the kernel, of the moments if there are some, and of the estimate."""
+    kernel = result.kernel.detach().double().reshape(result.kernel.shape[-2:])
     errors = {"l1_error": relative_l1(kernel, truth.kernels[against])}
     if "wave" in truth.kernels:
         errors["model_error"] = relative_l1(kernel, truth.kernels["wave"])
-    estimate = getattr(found, "error", None)
-    if estimate is not None:
-        errors["estimate"], errors["own_error"] = float(estimate), own_error(truth, against, found)
-    if getattr(found, "covariance", None) is not None and float(truth.sigma.min()) > 0:
-        moments = found.ray_moments if isinstance(found, Kernels) else (found.ray_centroid, found.ray_covariance)
-        centroid, covariance = (moment.detach().double().flatten() for moment in moments)
+    if isinstance(result, Psf):
+        errors["estimate"], errors["own_error"] = float(result.error), own_error(truth, against, result)
+    if result.covariance is not None and float(truth.sigma.min()) > 0:
+        parts = result.ray_moments if isinstance(result, Kernels) else (result.ray_centroid, result.ray_covariance)
+        centroid, covariance = (moment.detach().double().flatten() for moment in parts)
         errors["sigma_error"] = float((torch.sqrt(covariance[::2]) / truth.sigma - 1).abs().max())
-        offset = centroid - truth.centroid
-        errors["centroid_error"] = float(offset.norm() / truth.sigma.norm())
+        errors["centroid_error"] = float((centroid - truth.centroid).norm() / truth.sigma.norm())
     return errors
 
 
-def own_error(truth: Truth, against: str, found: Psf) -> float:
+def own_error(truth: Truth, against: str, result: Psf) -> float:
     """The error that `psf` estimates: of the kernel, or of the variances and the energy of a Gaussian."""
-    kernel = found.kernel.detach().double().reshape(found.kernel.shape[-2:])
+    kernel = result.kernel.detach().double().reshape(result.kernel.shape[-2:])
     if against != "gaussian":
         return relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
     variance = truth.sigma**2
-    width = 0.5 * (found.covariance.detach().double().reshape(3)[::2] - variance).abs().sum() / variance.sum()
-    energy, total = float(kernel.sum()), float(truth.kernels["gaussian"].sum())
-    return max(float(width), abs(energy / total - 1))
+    width = 0.5 * (result.covariance.detach().double().reshape(3)[::2] - variance).abs().sum() / variance.sum()
+    return max(float(width), abs(float(kernel.sum()) / float(truth.kernels["gaussian"].sum()) - 1))
 
 
 def relative_l1(kernel: Tensor, reference: Tensor) -> float:
@@ -343,6 +268,92 @@ def relative_l1(kernel: Tensor, reference: Tensor) -> float:
     return float((kernel - reference).abs().sum() / reference.sum())
 
 
-def _row(truth: Truth, method: Method, dtype: torch.dtype, rays: int, **figures) -> PsfRow:
-    case, name = truth.case, name_of(dtype)
-    return PsfRow(case.name, case.field, method.model, method.sampling, name, rays, against=method.against, **figures)
+# -- report ------------------------------------------------------------------------------------------------------------
+
+
+def report(
+    rows: Sequence[PsfRow], *, titles: Mapping[tuple[str, float], str], about: Mapping, repeats: int,
+    head: Sequence[str] = (),
+) -> list[str]:  # fmt: skip
+    """The page. titles: of the cases, by lens and field; head: further lines above the tables."""
+    lines = [
+        f"Times of one kernel of {PIXELS} × {PIXELS} pixels, ms: median {clock_of(about)} of up to {repeats} warm "
+        "runs.",
+        *("", in_words(about) + ".", "", *head, "## How to read the tables", "", *_LEGEND, ""),
+    ]
+    for case, title in titles.items():
+        pairs: dict[tuple[str, str], list] = {}  # of dtypes, float64 first
+        for row in sorted(rows, key=lambda row: row.dtype == "float32"):
+            if (row.lens, row.field) == case and row.estimate is None:
+                pairs.setdefault((row.model, row.sampling), []).append(row)
+        order = dict.fromkeys((row.model, row.sampling) for row in rows)
+        lines += [f"## {title}", "", *table(_CASE, [pairs[key] for key in order if key in pairs]), ""]
+    estimated = [row for row in rows if row.estimate is not None]
+    columns = {"case": lambda row: titles[row.lens, row.field]} | _ESTIMATES
+    return [*lines, "## Driven by a tolerance", "", *table(columns, estimated)]
+
+
+def bounds(row: PsfRow) -> bool:
+    """Whether the estimate bounds the error."""
+    return row.own_error <= row.estimate
+
+
+def bounds_closely(row: PsfRow) -> bool:
+    """Whether it does so within a factor of 10."""
+    return row.own_error <= row.estimate <= 10 * row.own_error
+
+
+_LEGEND = (
+    "Two values in a cell: float64 / float32. `+ backward`: forward and the gradient with respect to every curvature, "
+    "conic, asphere coefficient and thickness. An asterisk: extrapolated from the lines above it.",
+    "",
+    "- L1 error: Σ|k - r|/Σr of the kernel. `drt`, Sobol and random rays: against 2 million cells of the ray map. "
+    "`wave`, direct sums, Optiland's waves: against the direct Huygens sum. `gaussian`: against the Gaussian of "
+    "converged moments. `paraxial`, `fourier`: against their own finest order.",
+    "- σ error: of σx or σy, the larger; centroid error: in units of σ; both against converged moments of the rays, "
+    "for `paraxial` and `fourier`, too: there they are errors of the model.",
+    "- from wave: L1 difference of the kernel from the direct Huygens sum, the error of the model. `paraxial` and "
+    "`fourier` are compared in a window about their own chief ray, so that distortion does not count twice.",
+    "- Optiland's kernels are scaled to the energy of the reference: shapes are compared.",
+)
+
+
+def _error(number: float | None) -> str:
+    return "" if number is None else "0" if number == 0 else f"{number:.1e}"
+
+
+def _both(name: str, form: Callable[[float | None], str]) -> Callable[[Sequence], str]:
+    """A quantity of both dtypes in one cell."""
+
+    def cell(pair: Sequence) -> str:
+        if all(getattr(row, name) is None for row in pair):
+            return ""
+        alone = "– / " if len(pair) == 1 and pair[0].dtype == "float32" else ""
+        return alone + " / ".join(form(getattr(row, name)) for row in pair)
+
+    return cell
+
+
+_CASE = {
+    "model": lambda pair: pair[0].model,
+    "sampling": lambda pair: pair[0].sampling + ("*" if pair[0].extrapolated else ""),
+    "rays": lambda pair: " / ".join(dict.fromkeys(f"{row.rays:,}" for row in pair)),
+    "forward": _both("forward_s", milliseconds),
+    "+ backward": _both("both_s", milliseconds),
+    "L1 error": _both("l1_error", _error),
+    "σ error": _both("sigma_error", _error),
+    "centroid error": _both("centroid_error", _error),
+    "from wave": lambda pair: _error(pair[0].model_error),
+}
+_ESTIMATES = {
+    "model": lambda row: row.model,
+    "asked": lambda row: row.sampling.removeprefix("tol "),
+    "dtype": lambda row: row.dtype,
+    "estimated": lambda row: _error(row.estimate),
+    "true": lambda row: _error(row.own_error),
+    "bounds": lambda row: yes(bounds(row)),
+    "within ten": lambda row: yes(bounds_closely(row)),
+    "rays": lambda row: f"{row.rays:,}",
+    "forward": lambda row: milliseconds(row.forward_s),
+    "+ backward": lambda row: milliseconds(row.both_s),
+}

@@ -1,4 +1,4 @@
-"""What the PSF benchmark measures: lenses with field, distance and pixels, and the ways to compute their kernels."""
+"""Lenses with field, distance and pixels, and methods that compute their kernels, of the PSF benchmark."""
 
 import dataclasses
 import functools
@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
 from raytrace.psf_models import MODELS, Psf, drt, paraxial, psf
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
@@ -18,8 +17,7 @@ from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.scene import Scene, scene
 
 PIXELS = 21  # across every window
-RANDOM, DIRECT = "random rays", "direct sum"
-#: Field angles in degrees, object distance in mm (None: the lens's own) and pixel pitch in mm of the usual cases.
+#: Field angles in degrees, object distance in mm (None: that of the lens) and pixel pitch in mm of the default cases.
 USUAL = {
     "double_gauss": ((0.0, 14.0), 1e4, 0.005),
     "phone": ((0.0,), None, 0.001),
@@ -37,7 +35,7 @@ _SOBOL = (256, 4096)
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One lens, field, object distance (mm) and pixel pitch (mm): one panel of the figure."""
+    """A lens, field, object distance (mm) and pixel pitch (mm): a panel of the figure."""
 
     lens: Lens
     name: str
@@ -62,9 +60,9 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A way to compute a kernel. run: (scene, grid) -> what holds kernel, centroid, covariance and rays.
+    """A way to compute a kernel. run: (scene, grid) -> kernel, centroid, covariance and rays.
 
-    against: the limit its error counts from: "rays", "wave", or its own: "gaussian", "paraxial", "fourier".
+    against: the limit of its error: "rays", "wave", or its own: "gaussian", "paraxial", "fourier".
     """
 
     model: str
@@ -75,55 +73,33 @@ class Method:
 
 
 def cases(lenses: Sequence[tuple[str, Lens]]) -> list[Case]:
-    """The usual conditions of the lenses of USUAL; for others their own distance, on the axis and at the largest field,
-    with pixels as wide as 7 σ or 8 λN need."""
-    found = []
+    """The default conditions of the lenses of USUAL; others at their own distance, on the axis and at the largest
+    field, with a window of at least 7 σ and 8 λN."""
+    chosen = []
     for name, lens in lenses:
-        own = float(lens.surfaces[0].thickness)
         fields, distance, pitch = USUAL.get(name, (dict.fromkeys((0.0, float(largest_field(lens)[1]))), None, None))
-        distance = own if distance is None else distance
-        found += [Case(lens, name, field, distance, pitch or _pitch(lens, field, distance)) for field in fields]
-    return found
+        distance = float(lens.surfaces[0].thickness) if distance is None else distance
+        chosen += [Case(lens, name, field, distance, pitch or _pitch(lens, field, distance)) for field in fields]
+    return chosen
 
 
 def methods() -> list[Method]:
-    """Every model at the orders that are measured."""
-    found = [Method("paraxial", "closed form", paraxial.kernels, "paraxial")]
+    """Every model at several orders, Sobol rays, and `psf(…, tol=…)` with the estimate of its error."""
+    limits = {model: "rays" if model == "drt" else model for model in _ORDERS}
+    chosen = [Method("paraxial", "closed form", paraxial.kernels, "paraxial")]
     for model, orders in _ORDERS.items():
         for order in orders:
             sampling = f"{order} rings" if model == "gaussian" else f"order {order}"
             run = functools.partial(MODELS[model].kernels, order=order)
-            found.append(Method(model, sampling, run, _limit_of(model)))
-    sobol = (Method("Sobol rays", f"{n} rays", functools.partial(drt.kernels_of_rays, rays=n), "rays") for n in _SOBOL)
-    return [*found, *sobol]
-
-
-def doors() -> list[Method]:
-    """`psf(…, tol=…)` as it is called, the estimate of its error included."""
-    return [
-        Method(
-            model, f"tol {tol:.0e}".replace("e-0", "e-"), functools.partial(_to_tolerance, model, tol), _limit_of(model)
-        )
-        for model, tolerances in _TOLERANCES.items()
-        for tol in tolerances
-    ]
-
-
-def _limit_of(model: str) -> str:
-    return "rays" if model == "drt" else model
-
-
-def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int, seed: int = 0) -> Kernels:
-    """The plain histogram of independent random rays, some at a time."""
-    generator = torch.Generator().manual_seed(seed)
-    sampling = functools.partial(pupil.random, generator=generator)
-    sizes = [min(piece, count - first) for first in range(0, count, piece)]
-    parts = [drt.kernels_of_rays(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
-    centroid, covariance, kernel = (
-        sum(size / count * getattr(part, name) for size, part in zip(sizes, parts, strict=True))
-        for name in ("centroid", "covariance", "kernel")
-    )
-    return Kernels(kernel, grid, centroid, covariance, count)
+            chosen.append(Method(model, sampling, run, limits[model]))
+    for rays in _SOBOL:
+        run = functools.partial(drt.kernels_of_rays, rays=rays)
+        chosen.append(Method("Sobol rays", f"{rays} rays", run, "rays"))
+    for model, tolerances in _TOLERANCES.items():
+        for tol in tolerances:
+            run = functools.partial(_to_tolerance, model, tol)
+            chosen.append(Method(model, f"tol {tol:.0e}".replace("e-0", "e-"), run, limits[model]))
+    return chosen
 
 
 def _to_tolerance(model: str, tol: float, scene: Scene, grid: Grid) -> Psf:
@@ -139,10 +115,9 @@ def _to_tolerance(model: str, tol: float, scene: Scene, grid: Grid) -> Psf:
 
 
 def _pitch(lens: Lens, field: float, distance: float) -> float:
-    """A round pixel whose window of PIXELS holds 7 σ of the rays and 8 λN."""
-    place = Case(lens, "", field, distance, 1.0)
+    """A round pixel pitch whose window of PIXELS holds 7 σ of the rays and 8 λN."""
     with torch.no_grad():
-        light = gaussian_kernels(place.scene, grid(1.0, 1), order=8)
+        light = gaussian_kernels(Case(lens, "", field, distance, 1.0).scene, grid(1.0, 1), order=8)
         width = 7 * float(light.covariance[::2].max().sqrt())
         number = float(first_order(with_object_distance(lens, distance)).paraxial_working_f_number)
         airy = 8e-3 * float(lens.primary) * number

@@ -1,7 +1,7 @@
-"""A textbook ray tracer in mpmath, to check the others by: one ray at a time, one number at a time, 50 digits.
+"""A textbook ray tracer in mpmath with 50 digits, one ray at a time: the reference of all others.
 
-It shares nothing with the tracer it checks but the numbers of the lens. Conics are met by the quadratic in textbook
-form, aspheres by Newton's method, light is bent with unit normals and cosines; 50 digits forgive all of that.
+It shares only the numbers of the lens with them: conics by the quadratic formula, aspheres by Newton's method,
+refraction by unit normals and cosines.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ _STEP = "1e-25"  # of the differences that give gradients: good to about 25 digi
 
 @dataclass(frozen=True)
 class ReferenceSurface:
-    """One surface in machine numbers, each taken as exactly what it is, or in mpmath's; mm.
+    """A surface of exact numbers, mm.
 
     coefficients: of r², r⁴, …; index: of the medium behind it.
     """
@@ -30,7 +30,7 @@ class ReferenceSurface:
 
 @dataclass(frozen=True)
 class ReferenceRay:
-    """Where a ray ends: (x, y, z) mm and (L, M, N) in the frame of the last surface, and its optical path in mm."""
+    """(x, y, z) mm and (L, M, N) in the frame of the last surface, and the optical path in mm."""
 
     position: tuple[mpf, mpf, mpf]
     direction: tuple[mpf, mpf, mpf]
@@ -40,9 +40,9 @@ class ReferenceRay:
 def trace_reference(
     surfaces: Sequence[ReferenceSurface], index: float, position: Sequence[float], direction: Sequence[float]
 ) -> ReferenceRay:
-    """Trace one ray from the frame of the first surface to the last; raises ValueError if it is lost.
+    """Trace one ray from the frame of the first surface to the last. Raises ValueError if it fails.
 
-    index: of the medium in front; position: (x, y, z) mm; direction: (L, M, N), brought to unit length first.
+    index: of the medium in front; position: (x, y, z) mm; direction: (L, M, N) of any length.
     """
     with mp.workdps(_DIGITS):
         p = [mpf(component) for component in position]

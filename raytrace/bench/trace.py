@@ -1,4 +1,4 @@
-"""Speed of the trace over the number of rays, forward and with gradient, beside its error and beside Optiland."""
+"""Speed of the trace over the number of rays, forward and with gradient, against its error and Optiland."""
 
 import dataclasses
 import statistics
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from raytrace.bench import beyond
+from raytrace.bench.figures import trace_figure
 from raytrace.bench.measure import (
     DTYPES,
     PIECES,
@@ -23,7 +23,7 @@ from raytrace.bench.measure import (
     nothing,
     surfaces_of,
 )
-from raytrace.bench.report import Asked, Measured, clock_of, digits, in_words, table
+from raytrace.bench.report import Measured, Request, clock_of, digits, in_words, table
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError
 from raytrace.maths.value import to
@@ -37,7 +37,9 @@ WORK = ("forward", "forward+backward")
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One figure: what was traced, how fast, how well. seconds: median; ratio: speed over that of the peer."""
+    """A measurement. piece: rays at a time; seconds: median; ratio: speed relative to Optiland's torch back end at the
+    same task, None for Optiland or without it.
+    """
 
     tracer: str
     dtype: str
@@ -52,44 +54,27 @@ class Row:
     ratio: float | None = None
 
 
-def bench(asked: Asked) -> Measured:
+def bench(request: Request) -> Measured:
     """One lens, several numbers of rays."""
-    name, counts, repeats = asked.arguments.lens or LENS, asked.arguments.rays or COUNTS, asked.arguments.repeats
-    lens = asked.open_lens(name)
+    arguments = request.arguments
+    name, counts, repeats = arguments.lens or LENS, arguments.rays or COUNTS, arguments.repeats
+    lens = request.open_lens(name)
     if not bool(field_rays(lens, 1000).valid.all()):
-        raise CommandError(f"{name}: not every ray of the middle field starts; choose another lens")
-    tracers = tracers_of(lens, asked.peers.peers(lens) if asked.peers else [])
-    how = {"repeats": repeats, "threads": asked.threads}
-    peers_of = asked.peers.posed_peers if asked.peers else nothing
-    others = 0 if asked.arguments.lens else beyond.calls(repeats, with_peers=bool(asked.peers))
-    with progress(calls(tracers, counts, repeats) + others, "call", what="measuring") as bar:
-        rows = measure(lens, tracers, counts, **how, progress=bar.update)
-        beside = beyond.measure(max(counts), **how, peers_of=peers_of, progress=bar.update) if others else []
-    about = {"lens": name, "surfaces": surfaces_of(lens), "repeats": repeats, "machine": asked.about()}
-    lines = report(rows, **about) + (beyond.report(beside) if others else [])
-    told = about | ({"beyond": [dataclasses.asdict(row) for row in beside]} if others else {})
-    return Measured(rows, lines, told, ("trace_figure",))
-
-
-def tracers_of(lens: Lens, peers: Sequence[Tracer] = ()) -> list[Tracer]:
-    return [*(Own(lens, dtype, with_path=path) for dtype in DTYPES for path in (True, False)), *peers]
-
-
-def calls(tracers: Sequence[Tracer], counts: Sequence[int], repeats: int) -> int:
-    """How many steps of progress `measure` makes."""
-    return len(counts) * repeats * sum(1 + tracer.has_gradient for tracer in tracers)
+        raise CommandError(f"{name}: rays of the middle field fail at launch; choose another lens")
+    tracers = [Own(lens, dtype, with_path=path) for dtype in DTYPES for path in (True, False)]
+    tracers += request.peers.peers(lens) if request.peers else []
+    steps = len(counts) * repeats * sum(1 + tracer.has_gradient for tracer in tracers)
+    with progress(steps, "call", what="measuring") as bar:
+        rows = measure(lens, tracers, counts, repeats=repeats, threads=request.threads, progress=bar.update)
+    about = {"lens": name, "surfaces": surfaces_of(lens), "repeats": repeats, "machine": request.about()}
+    return Measured(rows, report(rows, **about), about, trace_figure)
 
 
 def measure(
-    lens: Lens,
-    tracers: Sequence[Tracer],
-    counts: Sequence[int],
-    *,
-    repeats: int,
-    threads: int,
+    lens: Lens, tracers: Sequence[Tracer], counts: Sequence[int], *, repeats: int, threads: int,
     progress: Callable[[int], object] = nothing,
-) -> list[Row]:
-    """Time every tracer on every number of rays; progress: of `calls(…)`."""
+) -> list[Row]:  # fmt: skip
+    """Time every tracer on every number of rays."""
     errors = [errors_of(tracer, lens, field_rays(lens, SAMPLE)) for tracer in tracers]
     rows = []
     for count in sorted(counts):
@@ -99,8 +84,15 @@ def measure(
             for what in WORK[: 1 + tracer.has_gradient]:
                 jobs[number, what], pieces[number, what] = _job(tracer, what, rays[tracer.dtype], threads)
         for (number, what), seconds in in_turns(jobs, repeats=repeats, threads=threads, progress=progress).items():
-            rows.append(_row(tracers[number], what, lens, count, pieces[number, what], seconds, errors[number]))
-    return [dataclasses.replace(row, ratio=_ratio(row, rows)) for row in rows]
+            tracer, median = tracers[number], statistics.median(seconds)
+            speed = count * surfaces_of(lens) / max(median, 1e-9)
+            task = (tracer.name, name_of(tracer.dtype), what, tracer.with_path, count, pieces[number, what])
+            rows.append(Row(*task, median, min(seconds), speed, errors[number]))
+    peers = {(row.dtype, row.what, row.rays): row.speed for row in rows if row.tracer.endswith("torch")}
+    ratios = [
+        row.speed / peers[row.dtype, row.what, row.rays] if peers and row.tracer == "raytrace" else None for row in rows
+    ]
+    return [dataclasses.replace(row, ratio=ratio) for row, ratio in zip(rows, ratios, strict=True)]
 
 
 def _job(tracer: Tracer, what: str, rays: Rays, threads: int) -> tuple[Job, int]:
@@ -110,22 +102,8 @@ def _job(tracer: Tracer, what: str, rays: Rays, threads: int) -> tuple[Job, int]
     return in_best_pieces(work, rays, tracer.prepare, sizes=PIECES, threads=threads, most=most)
 
 
-def _row(tracer: Tracer, what: str, lens: Lens, count: int, piece: int, seconds: list[float], errors: Errors) -> Row:
-    median = statistics.median(seconds)
-    speed = count * surfaces_of(lens) / max(median, 1e-9)
-    dtype, fastest = name_of(tracer.dtype), min(seconds)
-    return Row(tracer.name, dtype, what, tracer.with_path, count, piece, median, fastest, speed, errors)
-
-
-def _ratio(row: Row, rows: Sequence[Row]) -> float | None:
-    """Speed over that of Optiland's torch back end at the same task; None for Optiland itself or without it."""
-    task = row.dtype, row.what, row.rays
-    peers = [one for one in rows if one.tracer.endswith("torch") and (one.dtype, one.what, one.rays) == task]
-    return row.speed / peers[0].speed if peers and row.tracer == "raytrace" else None
-
-
 def report(rows: Sequence[Row], *, lens: str, surfaces: int, machine: dict, repeats: int) -> list[str]:
-    """The machine, how it was measured, and one line a figure."""
+    """The machine, the measurement, and a line for each row."""
     columns = {
         "rays": lambda row: f"{row.rays:,}",
         "what": lambda row: row.what,
@@ -142,17 +120,16 @@ def report(rows: Sequence[Row], *, lens: str, surfaces: int, machine: dict, repe
     if all(row.ratio is None for row in rows):
         del columns["× Optiland"]
     return [
-        f"Lens `{lens}`: {surfaces} surfaces a ray is carried to (stop and image counted, the object not). Speed in "
-        f"millions of rays × surfaces per second, from the median {clock_of(machine)} of {repeats} runs, the tracers "
-        "in turns.",
+        f"Lens `{lens}`: {surfaces} surfaces (with stop and image, without the object). Speed in millions of rays × "
+        f"surfaces per second, from the median {clock_of(machine)} of {repeats} runs; the tracers take turns.",
         "",
         in_words(machine) + ".",
         "",
         "Forward: positions and directions on the image without a graph. Forward+backward: the gradient of the mean "
-        "squared spot radius by every curvature and every thickness. Rays are traced as many at a time as suits each "
-        f"tracer best (column *at a time*). Errors: the largest over {SAMPLE} of the rays against an independent "
-        "tracer of 50 digits that gets the same rounded numbers: position on the image; optical path relative to the "
-        "first ray; gradient relative to its largest component.",
+        "squared spot radius with respect to every curvature and thickness. Each tracer traces as many rays at a time "
+        f"as is fastest for it (column *at a time*). Errors: the largest of {SAMPLE} rays against an independent "
+        "tracer of 50 digits with the same rounded numbers: position on the image; optical path relative to the first "
+        "ray; gradient relative to its largest component.",
         "",
         *table(columns, rows),
     ]

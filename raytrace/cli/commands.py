@@ -718,26 +718,22 @@ COMMANDS = (
         "bench",
         "measure speed against error",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
-        "PSF model at every sampling against converged ones (minutes); every engine of wave PSFs compared with the "
-        "transfer function it replaces (a minute); the speed targets: the trace compared with limits of the machine "
-        "(C++, built here if there is a compiler), its memory and whole processes (minutes); or optimisation of lens "
-        "files by their own merit functions. With the extra [bench] Optiland is measured too in trace, psf, speed and "
-        "optimise.",
+        "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
+        "with gradients, aspheres and the step of the sensor distance (minutes). With the extra [bench] Optiland and "
+        "ray-optics are measured, too.",
         """
         trace
         psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
         trace --rays 1000 100000 -o bench.md --plot bench.png
-        wave --docs docs
-        optimise designs/*.zmx --docs docs
         speed --quick --repeats 1""",
-        option("what", choices=("trace", "psf", "wave", "speed", "optimise"), help="subject of the measurement"),
+        option("what", choices=("trace", "psf", "speed"), help="subject of the measurement"),
         option(
             "lenses",
             metavar="LENS",
             type=file_name,
             nargs="*",
             help="psf: lenses to measure, on the axis and at the largest field "
-            "(default double_gauss phone hubble, in predefined conditions); optimise: files with a merit function",
+            "(default double_gauss phone hubble, in predefined conditions)",
         ),
         json,
         option("--lens", metavar="LENS", help="trace: lens to trace (default double_gauss)"),
@@ -757,7 +753,7 @@ COMMANDS = (
             "--docs",
             metavar="DOCS",
             type=folder_name,
-            help="wave, speed, optimise: folder for wave_bench.md and wave/, or speed.md or optimise.md, .csv and .png",
+            help="speed: folder for speed.md, speed.csv and speed.png",
         ),
         option("--quick", action="store_true", help="speed: few rays, as a trial; the ratios are not meaningful"),
         partial(plot, what="speed over number of rays, or time over error,"),

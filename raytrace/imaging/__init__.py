@@ -1,9 +1,22 @@
-"""Imaging: a lens or thin element with variables, image formation, sensor noise, restoration and training.
+"""Imaging: cameras of a lens or a phase element, image formation, restoration, training and co-design.
 
-camera (lens, sensor and network as one module), variables (of lenses and elements, thickness limits), image (blur by
-PSFs), sensor (noise), restoration (Wiener filters and their errors), network (RED-Net), training (resumable runs).
-The only `nn.Module`s of the package are here. Tests: test_camera, test_variables, test_held, test_image,
-test_deconvolve, test_network, test_training.
+| module          | contents                                                                                |
+|-----------------|-----------------------------------------------------------------------------------------|
+| camera          | lens, sensor and network as one module                                                  |
+| variables       | of lenses and phase elements, thickness limits                                          |
+| image           | convolution with PSFs, layered scenes; noise and quantisation of the sensor             |
+| restoration     | linear filters (Wiener) and their errors in closed form                                 |
+| network         | RED-Net                                                                                 |
+| pictures        | folders of photographs, dead-leaves images                                              |
+| training        | runs that resume                                                                        |
+| closed_form     | a camera's error behind the best linear filter, and its minimum                         |
+| codesign        | lens and network trained together                                                       |
+| wave_camera     | camera with a phase element: kernels, errors, image quality; octant: of round elements  |
+| wave_design     | design of the phase element                                                             |
+| descent         | L-BFGS-B with exact gradients                                                           |
+
+The only `nn.Module`s are here. Tests: tests/test_MODULE.py, test_held (thickness limits), test_deconvolve
+(restoration), test_study (co-design), test_edof* (phase elements).
 """
 
 from raytrace.imaging.camera import Camera as Camera

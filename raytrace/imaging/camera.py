@@ -20,8 +20,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from raytrace.imaging.image import as_picture, blur
-from raytrace.imaging.sensor import add_noise
+from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.variables import Variables
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide

@@ -1,4 +1,4 @@
-"""Image formation: convolution of images with point spread functions, at one or several depths.
+"""Image formation: convolution with point spread functions, at one or several depths, and noise of the sensor.
 
 Images are floating-point numbers in any unit; integers of 8 or 16 bits are scaled to 0 … 1 (`as_picture`).
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import broadcast_shape, safe_divide
+from raytrace.maths.numerics import broadcast_shape, safe_divide, safe_sqrt
 
 #: Extension beyond the borders of an image: "zero"; "reflect", its mirror image; "taper", a blend of the mirror images
 #: at opposite borders, so that the periodic continuation has no jump.
@@ -57,7 +57,12 @@ def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: st
     _check_kernel(kernel)
     check_axes(picture=picture, kernel=kernel)
     size, spot = picture.shape[-2:], kernel.shape[-2:]
-    _check_origin(boundary, origin, spot)
+    _check_choice(origin, _ORIGINS, "origin")
+    if boundary == "valid" and origin == "grid" and (spot[0] % 2 == 0 or spot[1] % 2 == 0):
+        raise ValueError(
+            f"origin 'grid' with a kernel of {spot[0]} × {spot[1]} pixels and boundary 'valid': half a pixel's shift "
+            "reaches across the whole picture; expected odd sizes, or another boundary"
+        )
     # An extension holds the reach of the kernel on both sides.
     shape = tuple(n + 2 * (m // 2) if boundary in EXTENSIONS else n for n, m in zip(size, spot, strict=True))
     check_fit(spot, shape)
@@ -136,8 +141,8 @@ def depth_masks(depth: Tensor, planes: Tensor, *, softness: float = 0.0, feather
         )
     beyond = depth[..., None, :, :] - (0.5 * (planes[1:] + planes[:-1]))[:, None, None]
     above = torch.sigmoid(beyond / softness) if softness > 0 else (beyond > 0).to(beyond.dtype)
-    all_of_it = torch.ones_like(depth)[..., None, :, :]
-    masks = torch.cat([all_of_it, above], -3) - torch.cat([above, torch.zeros_like(all_of_it)], -3)
+    one = torch.ones_like(depth)[..., None, :, :]
+    masks = torch.cat([one, above], -3) - torch.cat([above, torch.zeros_like(one)], -3)
     if not feather > 0:
         return masks
     reach = math.ceil(4 * feather)
@@ -167,13 +172,10 @@ def blur_layers(
     """
     picture = as_picture(picture)
     _check_kernel(kernels)
-    for what, tensor, axes in (
-        ("picture", picture, "C, H, W"),
-        ("masks", masks, "D, H, W"),
-        ("kernels", kernels, "D, C, h, w"),
-    ):
+    inputs = (("picture", picture, "C, H, W"), ("masks", masks, "D, H, W"), ("kernels", kernels, "D, C, h, w"))
+    for name, tensor, axes in inputs:
         if tensor.dim() < axes.count(",") + 1:
-            raise ValueError(f"{what} of shape {tuple(tensor.shape)}: expected (..., {axes})")
+            raise ValueError(f"{name} of shape {tuple(tensor.shape)}: expected (..., {axes})")
     colours, of_kernels = picture.shape[-3], kernels.shape[-3]
     if colours != of_kernels and 1 not in (colours, of_kernels):
         raise ValueError(f"a picture of {colours} colours and kernels of {of_kernels}: expected one each")
@@ -210,14 +212,12 @@ def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tens
     # Cosine: no kink at the borders.
     fade = 0.5 - 0.5 * torch.cos(math.pi * share) if boundary == "taper" else (share > 0.5).to(picture.dtype)
     fade = fade[:, None] if axis == -2 else fade
-    last, first = (picture.index_select(axis, _mirror(k, count)) for k in (count + place, place - missing))
+    mirrors = []
+    for k in (count + place, place - missing):  # indices of the mirrored continuation: … 1 0 | 0 1 2 | 2 1 …
+        folded = k % (2 * count)
+        mirrors.append(picture.index_select(axis, torch.minimum(folded, 2 * count - 1 - folded)))
+    last, first = mirrors
     return torch.cat([picture, last + fade * (first - last)], axis)
-
-
-def _mirror(place: Tensor, count: int) -> Tensor:
-    """Index of the pixel at position `place` of the mirrored continuation of `count` pixels: … 1 0 | 0 1 2 | 2 1 …"""
-    folded = place % (2 * count)
-    return torch.minimum(folded, 2 * count - 1 - folded)
 
 
 def _half_pixels(kernel: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -260,10 +260,40 @@ def check_fit(small, large, what: str = "a kernel", where: str = "a picture") ->
         raise ValueError(f"{what} of {h} × {w} pixels on {where} of {rows} × {columns}: expected a larger one")
 
 
-def _check_origin(boundary: str, origin: str, spot) -> None:
-    _check_choice(origin, _ORIGINS, "origin")
-    if boundary == "valid" and origin == "grid" and (spot[0] % 2 == 0 or spot[1] % 2 == 0):
-        raise ValueError(
-            f"origin 'grid' with a kernel of {spot[0]} × {spot[1]} pixels and boundary 'valid': half a pixel's shift "
-            "reaches across the whole picture; expected odd sizes, or another boundary"
-        )
+# -- noise and quantisation of the sensor
+
+
+def add_noise(picture: Tensor, sigma: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
+    """Gaussian noise of standard deviation `sigma`, in the unit of the image, broadcast against it."""
+    picture = as_picture(picture)
+    return picture + sigma * _normal(picture, generator)
+
+
+def add_shot_noise(picture: Tensor, electrons: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
+    """Shot noise in the Gaussian approximation, y = x + √(x/N) ξ, differentiable in x and N.
+
+    electrons: N, per pixel at level 1. Levels ≤ 0 have no noise.
+    """
+    picture = as_picture(picture)
+    return picture + safe_sqrt(picture / electrons) * _normal(picture, generator)
+
+
+def count_electrons(picture: Tensor, electrons: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
+    """Poisson shot noise: y = n/N, n of mean N x, 0 for x < 0; the gradient is that of x."""
+    picture = as_picture(picture)
+    counts = torch.poisson((picture.detach() * electrons).clamp(min=0), generator=generator)
+    return picture + (counts / electrons - picture).detach()
+
+
+def digitise(picture: Tensor, bits: int) -> Tensor:
+    """The nearest of 2^bits levels from 0 to 1, saturated beyond; the gradient ignores the quantisation."""
+    if bits < 1:
+        raise ValueError(f"{bits} bits: expected at least 1")
+    picture = as_picture(picture)
+    steps = 2**bits - 1
+    limited = picture.clamp(0.0, 1.0)
+    return limited + ((limited * steps).round() / steps - limited).detach()
+
+
+def _normal(picture: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.randn(picture.shape, dtype=picture.dtype, device=picture.device, generator=generator)

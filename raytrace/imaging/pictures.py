@@ -1,7 +1,7 @@
-"""Pictures to train on: folders of photographs, and dead-leaves images.
+"""Pictures for training: folders of photographs, and dead-leaves images.
 
-Every draw is keyed by whole numbers (seed, epoch, sample), never by the order of calls: a sample is the same on one
-process or on many, in a first run or in a resumed one.
+Random numbers are keyed by whole numbers (seed, epoch, sample), never by the order of calls: a sample is the same with
+one process or many, in a first run or in a resumed one.
 """
 
 import dataclasses
@@ -14,10 +14,8 @@ import numpy as np
 
 from raytrace.io.pictures import SUFFIXES, PictureError, read_grey
 
-_SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # what a draw is for: the last number of its key
-
-
-#: Bare pixels of dead leaves from which on looking at each pixel is faster than at each leaf.
+_SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # last numbers of keys
+#: Number of uncovered pixels of dead leaves above which a loop over leaves is faster than one over pixels.
 _FEW_BARE = 1000
 
 
@@ -37,23 +35,18 @@ class Pictures:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Of each picture its folder: pictures of one are alike. Where there is but one, each is its own class."""
+        """The folder of each picture, whose pictures are alike; the name of each if there is a single folder."""
         folders = tuple(str(Path(name).parent) for name in self.names)
         return folders if len(set(folders)) > 1 else self.names
 
 
 def digest(samples: Sequence[np.ndarray]) -> str:
-    """How many pictures, and a hash of all their pixels: what a run is known by that learns from them."""
-    found = hashlib.blake2b(digest_size=8)
+    """The number of pictures and a hash of their pixels, which identify the training set of a run."""
+    pixels = hashlib.blake2b(digest_size=8)
     for sample in samples:
-        found.update(repr(sample.shape).encode())
-        found.update(np.ascontiguousarray(sample))
-    return f"{len(samples)}, blake2 {found.hexdigest()}"
-
-
-def pictures_of(kind: str) -> str:
-    """What pictures are called that are of a kind, one of leaves or "pictures"."""
-    return kind if kind == "pictures" else f"pictures of {kind}"
+        pixels.update(repr(sample.shape).encode())
+        pixels.update(np.ascontiguousarray(sample))
+    return f"{len(samples)}, blake2 {pixels.hexdigest()}"
 
 
 def draws(*key: int) -> np.random.Generator:
@@ -62,34 +55,31 @@ def draws(*key: int) -> np.random.Generator:
 
 
 def files(folder: str | Path, most: int | None = None) -> list[Path]:
-    """All pictures under a folder, sorted by path, or `most` of them, evenly from all.
-
-    Raises NoPictures for one without any.
-    """
+    """All pictures under a folder, sorted by path, or `most` of them, evenly spaced. Raises NoPictures."""
     folder = Path(folder)
     if not folder.is_dir():
         raise NoPictures(f"{folder}: no such folder; expected one with pictures in it, in any subfolders")
-    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    if not found:
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
         raise NoPictures(f"{folder}: no pictures found; expected {', '.join(SUFFIXES)} files in it or below")
-    count = min(most or len(found), len(found))
-    return [found[i * len(found) // count] for i in range(count)]
+    count = min(most or len(paths), len(paths))
+    return [paths[i * len(paths) // count] for i in range(count)]
 
 
 def read(paths: Sequence[str | Path], *, least: int, bar: Callable[[Iterable], Iterable] = iter) -> Pictures:
     """Pictures of at least `least` × `least` pixels; smaller ones are left out.
 
-    bar: wraps the paths, to show one. Raises PictureError naming a file that is none, NoPictures if none is left.
+    bar: wraps the paths. Raises PictureError with the name of a damaged file, NoPictures if none is left.
     """
     samples = [(read_grey(path), str(path)) for path in bar(paths)]
-    kept = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
-    if not kept:
+    large = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
+    if not large:
         raise NoPictures(f"none of {len(samples)} pictures has {least} × {least} pixels, a patch and its margin")
-    return Pictures(*zip(*kept, strict=True))
+    return Pictures(*zip(*large, strict=True))
 
 
 def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pictures, Pictures]:
-    """Pictures to train on and pictures to test on. Whole ones: crops of one texture never stand on both sides."""
+    """Training and test pictures; all crops of a picture are on one side."""
     if len(pictures) < 2:
         raise NoPictures(f"{len(pictures)} picture cannot be split into training and test ones: give two at least")
     order = draws(seed, _SPLIT).permutation(len(pictures))
@@ -101,7 +91,7 @@ def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pic
 
 
 def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float = 1.0) -> Pictures:
-    """Opaque discs of radii ∝ r⁻³ over one another until nothing shows through: natural statistics without a file.
+    """Opaque discs of density ∝ r⁻³ that cover the picture: natural statistics without a file.
 
     smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang (Int. J. Comput. Vis. 41,
     2001): occlusion alone gives the spectra of natural pictures.
@@ -113,31 +103,35 @@ def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float =
 
 
 def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarray:
-    picture, bare = np.zeros((size, size), np.uint8), np.ones((size, size), bool)
+    picture, bare, largest = np.zeros((size, size), np.uint8), np.ones((size, size), bool), size / 2
     while bare.any():
-        lay = _leaf_by_leaf if bare.sum() > _FEW_BARE else _pixel_by_pixel
-        lay(picture, bare, *_leaf_batch(size, random, smallest))
+        # The next discs, the topmost first; of density ∝ r⁻³, so that 1/r² is uniform.
+        radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, 4096))
+        x, y = random.uniform(-1, 1, (2, 4096)) * (size / 2 + radius) + size / 2
+        discs = radius, x, y, random.integers(0, 256, 4096)
+        cover = _cover_by_disc if bare.sum() > _FEW_BARE else _cover_by_pixel
+        cover(picture, bare, *discs)
     return picture
 
 
-def _leaf_by_leaf(picture: np.ndarray, bare: np.ndarray, *leaves: np.ndarray) -> None:
-    """Every leaf, the topmost first, covers what is bare."""
+def _cover_by_disc(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -> None:
+    """Every disc, the topmost first, covers the bare pixels inside it."""
     size, places = len(picture), np.arange(len(picture))
-    for radius, x, y, shade in zip(*(each.tolist() for each in leaves), strict=True):
+    for radius, x, y, shade in zip(*(values.tolist() for values in discs), strict=True):
         rows = slice(max(0, int(y - radius)), min(size, int(y + radius) + 2))
         columns = slice(max(0, int(x - radius)), min(size, int(x + radius) + 2))
-        open_here = bare[rows, columns]
-        if open_here.any():
+        bare_here = bare[rows, columns]
+        if bare_here.any():
             covered = (places[columns] - x) ** 2 + ((places[rows] - y) ** 2)[:, None] <= radius * radius
-            covered &= open_here
+            covered &= bare_here
             picture[rows, columns][covered] = shade
-            open_here &= ~covered
+            bare_here &= ~covered
 
 
-def _pixel_by_pixel(picture: np.ndarray, bare: np.ndarray, *leaves: np.ndarray) -> None:
-    """The same picture: every bare pixel is of the first leaf that covers it."""
+def _cover_by_pixel(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -> None:
+    """The same picture: every bare pixel has the shade of the first disc that covers it."""
     rows, columns = np.nonzero(bare)
-    for radius, x, y, shade in zip(*(np.split(each, 16) for each in leaves), strict=True):
+    for radius, x, y, shade in zip(*(np.split(values, 16) for values in discs), strict=True):
         covers = (columns[:, None] - x) ** 2 + (rows[:, None] - y) ** 2 <= radius * radius
         covered = covers.any(1)
         picture[rows[covered], columns[covered]] = shade[covers[covered].argmax(1)]
@@ -145,18 +139,10 @@ def _pixel_by_pixel(picture: np.ndarray, bare: np.ndarray, *leaves: np.ndarray) 
         rows, columns = rows[~covered], columns[~covered]
 
 
-def _leaf_batch(size: int, random: np.random.Generator, smallest: float) -> tuple[np.ndarray, ...]:
-    """Radius, place and shade of the next leaves, the topmost first; of density ∝ r⁻³, so that 1/r² is even."""
-    count, largest = 4096, size / 2
-    radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, count))
-    x, y = random.uniform(-1, 1, (2, count)) * (size / 2 + radius) + size / 2
-    return radius, x, y, random.integers(0, 256, count)
-
-
 def crop(pictures: Pictures, sample: int, *, epoch: int, size: int, crops: int = 4, seed: int = 0) -> np.ndarray:
-    """Patch (size, size) in [0, 1] of a sample of an epoch of `crops` patches a picture, turned and mirrored by chance.
+    """Patch (size, size) in [0, 1] of a sample of an epoch of `crops` patches a picture, in one of eight orientations.
 
-    sample: 0 … crops · len(pictures) - 1; the pictures come in an order of the epoch's own.
+    sample: 0 … crops · len(pictures) - 1; every epoch has another order of the pictures.
     """
     number = int(order(len(pictures) * crops, epoch=epoch, seed=seed)[sample]) // crops
     picture, random = pictures.samples[number], draws(seed, epoch, sample, _CROP)

@@ -1,13 +1,11 @@
 """Lens files: the suffix of a file selects its format; reading gives a Lens, writing brings every number back exactly.
 
-    io/source.py        text, numbers, records, errors with file, line and surface
-    io/report.py        requested glass substitutes, the report of every keyword
-    io/materials.py     glasses by name
-    io/assembly.py      a neutral draft of a lens, checked once for all readers
+    io/source.py        text, numbers, records, errors with file, line and surface; the report of every keyword
+    io/assembly.py      glasses by name; a neutral draft of a lens, checked once for all readers
     io/zemax, codev, oslo, ray_optics, table        a format each: keyword tables, reader, writer
     io/frames.py, ray_tables.py, pictures.py        pandas tables, tables of rays, images
 
-A new format is a row of FORMATS and a folder with a reader: text -> records with places -> LensDraft -> `assemble`.
+A new format is a row of FORMATS and a module with a reader: text -> records with places -> LensDraft -> `assemble`.
 Tests: tests/test_formats.py for all formats, and a file for each format.
 """
 
@@ -21,14 +19,25 @@ from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
 from raytrace.io import oslo, ray_optics
+from raytrace.io.assembly import changes
 from raytrace.io.codev import read as codev_read
 from raytrace.io.codev import write as codev_write
-from raytrace.io.report import NONE, Draft, Substitutes, Varied, operand_uses, substitutes_of
-from raytrace.io.report import BadSubstitute as BadSubstitute
-from raytrace.io.report import ImportReport as ImportReport
+from raytrace.io.source import (
+    NONE,
+    Draft,
+    Place,
+    Substitutes,
+    Varied,
+    decode,
+    operand_uses,
+    read_content,
+    read_text,
+    substitutes_of,
+)
+from raytrace.io.source import BadSubstitute as BadSubstitute
+from raytrace.io.source import ImportReport as ImportReport
 from raytrace.io.source import LensFileError as LensFileError
 from raytrace.io.source import LensFileWarning as LensFileWarning
-from raytrace.io.source import Place, decode, read_content, read_text, shown
 from raytrace.io.source import UnsupportedSurface as UnsupportedSurface
 from raytrace.io.table import read as table_read
 from raytrace.io.table import write as table_write
@@ -39,7 +48,6 @@ from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
 from raytrace.system.optimization_data import OptimizationData
@@ -123,7 +131,7 @@ def read_lens(
     strict: raise where the file holds an unknown keyword or an assumption is needed, instead of one LensFileWarning.
     configuration: of a multi-configuration file, from 1; by default the one that was active when it was saved.
     `lens.configurations` are all of them. substitute: glasses in place of those of the file, each reported in a
-    warning: {"SSK4": "SSK4A"}, or "nearest" for every unknown glass, by the nd and Vd of the file (`io.report`).
+    warning: {"SSK4": "SSK4A"}, or "nearest" for every unknown glass, by the nd and Vd of the file (`io.source`).
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface; and
     BadSubstitute.
     """
@@ -211,27 +219,10 @@ def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
 # -- checking and conversion ------------------------------------------------------------------------------------------
 
 
-def check(
-    path: str | os.PathLike,
-    *,
-    catalogs: Sequence[str | Path] = (),
-    strict: bool = False,
-    configuration: int | None = None,
-    substitute: Substitute = None,
-    evaluated: Collection[str] | None = None,
-) -> ImportReport:
-    """The report of a lens file: keywords that were read and left out, the source of each glass, notes and warnings.
-
-    strict: raise where something was assumed. configuration: that which must be traceable. evaluated: as for
-    `read_lens_with_report`. Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
-    """
-    return checked(path, catalogs, strict, configuration, substitute, evaluated)[1]
-
-
 def checked(
     path, catalogs, strict: bool, configuration: int | None, substitute: Substitute, evaluated
 ) -> tuple[Lens, ImportReport]:
-    """The lens of `check` and the report."""
+    """A lens and its report, as `read_lens_with_report`. Raises LensFileError for a lens that cannot be traced."""
     options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
     lens, report = read_lens_with_report(path, **options, evaluated=evaluated)
     try:
@@ -293,8 +284,8 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(str(error), Place(str(path))) from error
     form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
-    changed = _changes(lens, content, form, path, catalogs)
-    if changed:
+    again = _read_again(content, form, path, catalogs)
+    if again is not None and (changed := changes(lens, again)):
         message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
         warnings.warn(message, LensFileWarning, stacklevel=calling_level())
     try:
@@ -303,33 +294,13 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(error.strerror or str(error), Place(str(path))) from error
 
 
-def _changes(lens: Lens, content: bytes, form: Format, path: Path, catalogs: Sequence[Path]) -> list[str]:
-    """The texts and optimisation data that the content does not bring back. Raises LensFileError if it is not read."""
+def _read_again(content: bytes, form: Format, path: Path, catalogs: Sequence[Path]) -> Lens | None:
+    """The lens of a written content; None without its catalogs. Raises LensFileError where it cannot be read."""
     try:
-        again, _ = form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)
+        return form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)[0]
     except UnknownGlass:  # of a catalog that is unavailable
-        return []
+        return None
     except LensFileError as error:
         reason = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
         message = f"the file would not be read again: {reason}"
         raise LensFileError(message, Place(str(path), None, error.surface)) from error
-    pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
-    pairs += [(f"the catalog {name}", name, "") for name in lens.catalogs if name not in again.catalogs]
-    surfaces = zip(lens.surfaces, again.surfaces, strict=True)
-    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(surfaces)]
-    if count(lens.operands) != count(again.operands):
-        pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
-    else:
-        pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
-    data, read_again = lens.optimization_data, again.optimization_data
-    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
-        if read_again is not None:
-            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
-            both = zip(data.variables, read_again.variables, strict=False)
-            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
-            if unbound and free[0] == free[1]:
-                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
-                read_again = dataclasses.replace(read_again, variables=data.variables)
-        if read_again != data:
-            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
-    return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

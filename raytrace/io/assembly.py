@@ -13,8 +13,7 @@ from pathlib import Path
 import torch
 from torch.utils import _pytree as pytree
 
-from raytrace.io.report import FORMULA, NEAREST, Draft
-from raytrace.io.source import LensFileError, Place, double, shown
+from raytrace.io.source import FORMULA, NEAREST, Draft, LensFileError, Place, double, shown
 from raytrace.materials.catalogs import (
     SAME_INDEX,
     SHIPPED,
@@ -32,6 +31,7 @@ from raytrace.materials.catalogs import (
 from raytrace.materials.environment import Environment
 from raytrace.materials.glass import Glass, constant, mil_glass, model_glass
 from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.poses import Pose
 from raytrace.system.surface import SHAPE, Surface
@@ -378,3 +378,27 @@ def _refuse_overflow(lens: Lens, file: str) -> None:
     distance = lens.surfaces[0].thickness
     if torch.isnan(distance) or distance == -torch.inf:
         raise LensFileError("the object distance is too large once converted to mm", Place(file, None, 0))
+
+
+def changes(lens: Lens, again: Lens) -> list[str]:
+    """The texts, configurations and optimisation data of a lens that its file does not bring back."""
+    pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
+    pairs += [(f"the catalog {name}", name, "") for name in lens.catalogs if name not in again.catalogs]
+    surfaces = zip(lens.surfaces, again.surfaces, strict=True)
+    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(surfaces)]
+    if count(lens.operands) != count(again.operands):
+        pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
+    else:
+        pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
+    data, read_again = lens.optimization_data, again.optimization_data
+    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
+        if read_again is not None:
+            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
+            both = zip(data.variables, read_again.variables, strict=False)
+            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
+            if unbound and free[0] == free[1]:
+                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
+                read_again = dataclasses.replace(read_again, variables=data.variables)
+        if read_again != data:
+            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
+    return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

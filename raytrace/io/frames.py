@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from raytrace.io.report import Draft
-from raytrace.io.source import LensFileError, Place
+from raytrace.io.source import Draft, LensFileError, Place
 from raytrace.io.table.read import build
 from raytrace.io.table.system import written
 from raytrace.io.table.text import Table, add_metadata, add_row, header

@@ -32,9 +32,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.io.assembly import LensDraft, assemble, listed_glass, pose_of
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import (
+    IGNORED,
+    READ,
+    UNKNOWN,
     Block,
+    Draft,
     LensFileError,
     Place,
     Record,

@@ -23,8 +23,12 @@ class PictureError(ValueError):
 
 def read_grey(path: str | Path) -> np.ndarray:
     """An image as (H, W) luma of 8 bits (ITU-R BT.601). Raises PictureError naming the file."""
+    return _pixels(path, "L")
+
+
+def _pixels(path: str | Path, mode: str) -> np.ndarray:
     try:
-        return np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert("L"))
+        return np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert(mode))
     except (OSError, ValueError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         message = f"{path}: cannot be read as a picture ({reason}); remove it or convert it"
@@ -56,11 +60,7 @@ def read_channels(path: str | Path, channels: int) -> np.ndarray:
     """
     if channels not in (1, 3):
         raise PictureError(f"{path}: a picture has 1 or 3 channels, not one for each of {channels} wavelengths")
-    try:
-        picture = np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert("L" if channels == 1 else "RGB"))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise PictureError(f"{path}: cannot be read as a picture ({reason}); remove it or convert it") from error
+    picture = _pixels(path, "L" if channels == 1 else "RGB")
     return np.atleast_3d(picture).transpose(2, 0, 1) / 255.0
 
 

@@ -26,11 +26,21 @@ from typing import NamedTuple
 
 import torch
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, listed_glass
-from raytrace.io.report import IGNORED, READ, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, UnsupportedSurface, double, shown
+from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_aperture, listed_glass, pose_of
+from raytrace.io.source import (
+    IGNORED,
+    MAX_SURFACES,
+    READ,
+    Draft,
+    LensFileError,
+    Place,
+    UnsupportedSurface,
+    double,
+    nonzero,
+    shown,
+)
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
-from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
 from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose, undone
@@ -190,14 +200,24 @@ def _profile(interface: Part, profiles: object, unit: float, report: Draft) -> d
     if profile.kind not in _PROFILES:
         known = ", ".join(_PROFILES)
         raise profile.unsupported(f"a profile of class {profile.kind[:40]} is not modelled; modelled are {known}")
-    curvature = profile.number("cv", 0.0) / unit
-    shape = {"curvature": double(curvature) if curvature else None}
-    return shape | _PROFILES[profile.kind](profile, unit)
+    shape = {"curvature": nonzero(profile.number("cv", 0.0) / unit)}
+    step = _PROFILES[profile.kind]
+    if step is None:
+        return shape
+    round_conic = profile.number("ec", 1.0) - 1.0 if step == 1 else profile.number("cc", 0.0)
+    shape["conic"], terms = nonzero(round_conic), _terms(profile, step, unit) if step else []
+    if profile.kind == "YToroid":  # a section in y, with even terms, turned about an axis along y
+        if len(terms) > 7:
+            raise profile.unsupported("terms of a toroid beyond y^14 are not modelled")
+        curvature_x = profile.number("cR", 0.0) / unit
+        return shape | {"kind": "toroidal", "coefficients": double([curvature_x, *terms])}
+    if step == 1 and any(terms[::2]):
+        return shape | {"kind": "odd asphere", "coefficients": double(terms)}
+    return shape | ({"coefficients": double(terms[1::2] if step == 1 else terms)} if terms else {})
 
 
-def _conic(profile: Part) -> dict:
-    conic = profile.number("cc", 0.0)
-    return {"conic": double(conic) if conic else None}
+#: Profiles, and the step in the powers of r of their terms: 0 without terms, None without a conic constant.
+_PROFILES = {"Spherical": None, "Conic": 0, "EvenPolynomial": 2, "RadialPolynomial": 1, "YToroid": 2}
 
 
 def _terms(profile: Part, step: int, unit: float) -> list[float]:
@@ -208,39 +228,6 @@ def _terms(profile: Part, step: int, unit: float) -> list[float]:
     while listed and not listed[-1]:
         listed.pop()
     return [c / unit ** (step * j - 1) for j, c in enumerate(listed, 1)]
-
-
-def _even(profile: Part, unit: float) -> dict:
-    terms = _terms(profile, 2, unit)
-    return _conic(profile) | ({"coefficients": double(terms)} if terms else {})
-
-
-def _radial(profile: Part, unit: float) -> dict:
-    """Terms of r, r², …: an even asphere where only even ones are there."""
-    conic, terms = profile.number("ec", 1.0) - 1.0, _terms(profile, 1, unit)
-    shape = {"conic": double(conic) if conic else None}
-    if not terms:
-        return shape
-    if not any(terms[::2]):
-        return shape | {"coefficients": double(terms[1::2])}
-    return shape | {"kind": "odd asphere", "coefficients": double(terms)}
-
-
-def _toroid(profile: Part, unit: float) -> dict:
-    """A section in y, with even terms, turned about an axis along y."""
-    terms = _terms(profile, 2, unit)
-    if len(terms) > 7:
-        raise profile.unsupported("terms of a toroid beyond y^14 are not modelled")
-    return _conic(profile) | {"kind": "toroidal", "coefficients": double([profile.number("cR", 0.0) / unit, *terms])}
-
-
-_PROFILES = {
-    "Spherical": lambda profile, unit: {},
-    "Conic": lambda profile, unit: _conic(profile),
-    "EvenPolynomial": _even,
-    "RadialPolynomial": _radial,
-    "YToroid": _toroid,
-}
 
 
 def _phase(element: Part, unit: float, report: Draft) -> RadialPhase:
@@ -269,16 +256,14 @@ def _poses(decentre: Part, unit: float) -> tuple[Pose | None, Pose | None]:
         raise decentre.unsupported("a point of rotation other than the vertex is not modelled")
     numbers = dict(zip(("x", "y", "z"), (unit * value for value in dec), strict=True))
     numbers |= {"tilt_x": -euler[0], "tilt_y": -euler[1], "tilt_z": euler[2]}
-    modelled = {name: double(number) for name, number in numbers.items() if number}
-    if not modelled:
-        return None, None
-    pose, tilts = Pose(**modelled), {name: number for name, number in modelled.items() if name.startswith("tilt")}
-    if kind == "decenter":
+    modelled = {name: number for name, number in numbers.items() if number}
+    pose, tilts = pose_of(modelled), {name: number for name, number in modelled.items() if name.startswith("tilt")}
+    if pose is None or kind == "decenter":
         return pose, None
     if kind == "dec and return" and (not tilts or len(tilts) == len(modelled)):
         return pose, undone(pose)
     if kind == "bend" and len(tilts) <= 1:
-        return pose, Pose(**tilts) if tilts else None
+        return pose, pose_of(tilts)
     message = f"{shown(kind)} of {', '.join(modelled)} is not modelled; modelled are decenter, "
     raise decentre.unsupported(f"{message}dec and return of a decentre or of tilts, and bend about one axis")
 
@@ -296,10 +281,9 @@ def _clear(aperture: Part, unit: float) -> Aperture:
     shape, names = _SHAPES[aperture.kind]
     sizes = tuple(abs(aperture.number(name)) * unit for name in names)
     sizes = (0.0, *sizes) if shape == "circular" else sizes
-    if wrong := SHAPES[shape].objection(sizes):
-        raise aperture.error(wrong)
     centre = tuple(aperture.number(name, 0.0) * unit for name in ("x_offset", "y_offset"))
-    return Aperture(shape, sizes, bool(aperture.attributes.get("is_obscuration")), centre)
+    obscures = bool(aperture.attributes.get("is_obscuration"))
+    return clear_aperture(shape, sizes, obscures, centre, f"{aperture.path}:", aperture.place)
 
 
 # -- media ------------------------------------------------------------------------------------------------------------

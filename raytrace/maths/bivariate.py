@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.maths.zernike import fringe
+
 
 class Bivariate(NamedTuple):
     """A function (...) of x and y with its slopes and second derivatives; those above the highest asked for are 0."""
@@ -71,23 +73,9 @@ def _horner(coefficients: list[Tensor], x: Tensor, highest: int) -> tuple[Tensor
     return p, dp, 2 * half
 
 
-def fringe(number: int) -> tuple[int, int]:
-    """(n, m) of Zernike's fringe term 1, 2, …, 37: m > 0 goes with cos mφ, m < 0 with sin |m|φ, φ from the x axis.
-
-    Terms follow by n + |m|, then by falling |m|, cosine first; term 37 is the pure 12th order. Source: the numbering
-    of the University of Arizona, as optical design programs print it.
-    """
-    if number == 37:
-        return 12, 0
-    half = math.isqrt(number - 1)  # (n + |m|)/2
-    place = number - 1 - half * half
-    m = half - place // 2
-    return 2 * half - m, m if place % 2 == 0 else -m
-
-
 def fringe_to_powers(count: int) -> tuple[np.ndarray, np.ndarray]:
     """`zernike_to_powers` of the first `count` fringe terms: the matrix (K, count), and the constants (count,)."""
-    return zernike_to_powers(tuple(fringe(number) for number in range(1, count + 1)))
+    return zernike_to_powers(tuple(fringe(j) for j in range(1, count + 1)))
 
 
 @functools.lru_cache(maxsize=8)

@@ -70,14 +70,9 @@ def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
     recurrence of the Jacobi polynomials (DLMF 18.9.2): no digits lost at high orders, no angle, finite
     derivatives at the centre.
     """
-    t = 2 * (x * x + y * y) - 1
-    harmonics, radial = _harmonics(orders, x, y), {}
-    result = []
-    for n, m in orders:
-        k, size = _degree(n, m), abs(m)
-        _jacobi(radial, size, k, t)
-        result.append(norm(n, m) * radial[size][k] * harmonics[size][0 if m >= 0 else 1])
-    return torch.stack(result)
+    t, pairs, known = 2 * (x * x + y * y) - 1, harmonics(orders, x, y), {}
+    terms = [norm(n, m) * jacobi(known, n, m, t)[0] * pairs[abs(m)][0 if m >= 0 else 1] for n, m in orders]
+    return torch.stack(terms)
 
 
 def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,18 +80,15 @@ def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Te
 
     ∇(P H) = H P' 4 (x, y) + P ∇H with d(x + iy)^|m| = |m| (x + iy)^(|m| - 1) (dx + i dy); P' by its recurrence.
     """
-    t = 2 * (x * x + y * y) - 1
-    harmonics, radial, slopes = _harmonics(orders, x, y), {}, {}
+    t, pairs, known = 2 * (x * x + y * y) - 1, harmonics(orders, x, y), {}
     along_x, along_y = [], []
     for n, m in orders:
-        k, size = _degree(n, m), abs(m)
-        _jacobi(radial, size, k, t)
-        _jacobi_slopes(slopes, radial[size], size, k, t)
-        c, s = harmonics[max(size - 1, 0)]
+        size, (value, slope) = abs(m), jacobi(known, n, m, t, 1)
+        c, s = pairs[max(size - 1, 0)]
         by_x, by_y = (c, -s) if m >= 0 else (s, c)
-        bent = 4 * slopes[size][k] * harmonics[size][0 if m >= 0 else 1]
-        along_x.append(norm(n, m) * (bent * x + size * radial[size][k] * by_x))
-        along_y.append(norm(n, m) * (bent * y + size * radial[size][k] * by_y))
+        bent = 4 * slope * pairs[size][0 if m >= 0 else 1]
+        along_x.append(norm(n, m) * (bent * x + size * value * by_x))
+        along_y.append(norm(n, m) * (bent * y + size * value * by_y))
     return torch.stack(along_x), torch.stack(along_y)
 
 
@@ -153,45 +145,38 @@ def _refuse_few(points: int, coefficients: int) -> None:
         raise ValueError(f"{points} points of positive weight cannot fit {coefficients} coefficients")
 
 
-def _degree(n: int, m: int) -> int:
-    """k = (n - |m|)/2. Raises ValueError if there is no such polynomial."""
+def harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Real and imaginary part of (x + iy)^|m|, from 0 to the largest |m|."""
+    pairs = [(torch.ones_like(x), torch.zeros_like(x))]
+    for _ in range(max((abs(m) for _, m in orders), default=0)):
+        c, s = pairs[-1]
+        pairs.append((c * x - s * y, c * y + s * x))
+    return pairs
+
+
+def jacobi(
+    known: dict[int, list[tuple[Tensor, ...]]], n: int, m: int, t: Tensor, highest: int = 0
+) -> tuple[Tensor, ...]:
+    """P_k^(0, |m|)(t), k = (n - |m|)/2, and its derivatives up to the highest, by the recurrence; extends `known`.
+
+    Raises ValueError if no polynomial has the order (n, m).
+    """
     k, odd = divmod(n - abs(m), 2)
     if k < 0 or odd:
         raise ValueError(f"no Zernike polynomial has n = {n}, m = {m}: n - |m| must be even and not negative")
-    return k
-
-
-def _harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Real and imaginary part of (x + iy)^|m|, from 0 to the largest |m|."""
-    found = [(torch.ones_like(x), torch.zeros_like(x))]
-    for _ in range(max((abs(m) for _, m in orders), default=0)):
-        c, s = found[-1]
-        found.append((c * x - s * y, c * y + s * x))
-    return found
-
-
-def _jacobi(known: dict[int, list[Tensor]], m: int, k: int, t: Tensor) -> None:
-    """Extend known[m] up to P_k^(0, m)(t)."""
-    found = known.setdefault(m, [torch.ones_like(t)])
-    for i in range(len(found), k + 1):
+    m, zero = abs(m), torch.zeros_like(t)
+    rows = known.setdefault(m, [(torch.ones_like(t), zero, zero)[: highest + 1]])
+    for i in range(len(rows), k + 1):
         if i == 1:
-            found.append(0.5 * ((m + 2) * t - m))
+            rows.append((0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), zero)[: highest + 1])
             continue
-        a = 2 * i + m
-        ahead = (a - 1) * (a * (a - 2) * t - m * m) * found[-1] - 2 * (i - 1) * (i + m - 1) * a * found[-2]
-        found.append(ahead / (2 * i * (i + m) * (a - 2)))
-
-
-def _jacobi_slopes(known: dict[int, list[Tensor]], values: list[Tensor], m: int, k: int, t: Tensor) -> None:
-    """Extend known[m] up to the derivative of P_k^(0, m) at t: that of the recurrence of the values."""
-    found = known.setdefault(m, [torch.zeros_like(t)])
-    for i in range(len(found), k + 1):
-        if i == 1:
-            found.append(torch.full_like(t, 0.5 * (m + 2)))
-            continue
-        a = 2 * i + m
-        ahead = (a - 1) * (a * (a - 2) * (t * found[-1] + values[i - 1]) - m * m * found[-1])
-        found.append((ahead - 2 * (i - 1) * (i + m - 1) * a * found[-2]) / (2 * i * (i + m) * (a - 2)))
+        a, before, last = 2 * i + m, rows[-2], rows[-1]
+        factor, row = a * (a - 2) * t - m * m, []
+        for order, (p, q) in enumerate(zip(last, before, strict=True)):
+            lead = factor * p if order == 0 else factor * p + order * a * (a - 2) * last[order - 1]
+            row.append(((a - 1) * lead - 2 * (i - 1) * (i + m - 1) * a * q) / (2 * i * (i + m) * (a - 2)))
+        rows.append(tuple(row))
+    return rows[k]
 
 
 def _at_least(j: int, first: int, name: str) -> None:

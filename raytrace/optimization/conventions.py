@@ -1,4 +1,4 @@
-"""Conventions: how operands are taken whose meaning the field's own program leaves open."""
+"""Conventions of operands whose meaning the field's own program leaves open."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,20 +9,19 @@ from raytrace.words import did_you_mean
 
 @dataclasses.dataclass(frozen=True)
 class Conventions:
-    """Which convention of an operand counts; the first choice of each is the default. Raises ValueError for another.
+    """Conventions of operands. The first choice of each is the default. Raises ValueError for others.
 
-    opd_tilt: of OPDX, whether a tilt is fitted for every wavelength of a field, or one that all have in common.
-    opd_chief: whose chief ray the reference sphere is about, that of the row's own wavelength or of the primary one.
-    opd_sign: whether a longer or a shorter path than the chief ray's is a positive OPD.
-    boundary: what a row over several surfaces is off by, the sum of what they lack or the largest of it.
-    behind_mirrors: whether least and largest thicknesses are compared with those behind an odd number of mirrors
-        reversed, along the light, or signed, as the lens has them.
-    focal_length: of EFFL, whether it is that in image space, n'/power, or that in air, 1/power.
-    total_track: of TOTR, whether it reaches from the leftmost vertex to the rightmost, or sums up the thicknesses.
+    opd_tilt: of OPDX, a tilt is fitted for every wavelength of a field, or one that all have in common.
+    opd_chief: the reference sphere is about the chief ray of the row's own wavelength or of the primary one.
+    opd_sign: a longer or a shorter path than the chief ray's is a positive OPD.
+    boundary: a row over several surfaces is off by the sum of their violations or by the largest.
+    behind_mirrors: thicknesses behind an odd number of mirrors are compared reversed, along the light, or signed, as
+        the lens has them.
+    focal_length: of EFFL, in image space, n'/power, or in air, 1/power.
+    total_track: of TOTR, from the leftmost vertex to the rightmost, or the sum of the thicknesses.
     colour: of AXCL and LACL, which of the two wavelengths counts positive.
-    seidel: of SPHA to DIST, whether waves are counted of Seidel's coefficients, or of the wavefront: S1/8, S2/2, S3/2,
-        S4/4, S5/2.
-    f_theta: of DISC, whether its fields are 30 steps from the axis, which is left out, or 29 from it.
+    seidel: of SPHA to DIST, waves of Seidel's coefficients, or of the wavefront: S1/8, S2/2, S3/2, S4/4, S5/2.
+    f_theta: of DISC, 30 fields at steps from the axis, which is left out, or 29 and the axis.
     """
 
     opd_tilt: str = "per wavelength"
@@ -42,7 +41,7 @@ class Conventions:
                 raise ValueError(f"convention `{name}` {getattr(self, name)!r}: expected one of {', '.join(known)}")
 
 
-#: The conventions of each name, the one that is taken by itself first.
+#: The choices of each convention, the default first.
 CHOICES = {
     "opd_tilt": ("per wavelength", "common"),
     "opd_chief": ("own", "primary"),
@@ -58,10 +57,10 @@ CHOICES = {
 
 
 def conventions_of(words: "Conventions | str | Sequence[str] | None") -> Conventions:
-    """Conventions from words, "opd_tilt=common focal_length=in-air"; None gives the defaults."""
+    """Conventions from text, "opd_tilt=common focal_length=in-air"; None gives the defaults."""
     if isinstance(words, Conventions):
         return words
-    given = {}
+    choices = {}
     for word in joined(words or "").split():
         name, sign, choice = word.partition("=")
         if name not in CHOICES or not sign:
@@ -69,5 +68,5 @@ def conventions_of(words: "Conventions | str | Sequence[str] | None") -> Convent
             raise ValueError(
                 f"`conventions`: {word!r}: expected one of {known}, = and a choice{did_you_mean(name, CHOICES)}"
             )
-        given[name] = choice.replace("-", " ")
-    return Conventions(**given)
+        choices[name] = choice.replace("-", " ")
+    return Conventions(**choices)

@@ -1,12 +1,12 @@
-"""Default merit functions, for a lens whose file has none: what rays of all fields and wavelengths are to do.
+"""Default merit functions: spots, wavefronts, directions or MTF of all fields and wavelengths.
 
-A ray of the Gaussian rule of n rings and m arms counts by
+The weight of a ray of the Gaussian rule of n rings and m arms is
 
     w = π g v f / (W F a)
 
-with g the weight of its ring (Σ g = 1), v and f the weights of its wavelength and field, W and F how many there are of
-either, and a the arms that are traced: of a lens that is round about its axis one for the field there, half of them for
-a field above it, else all. They lie half a step off the y axis. The weights v and f stay as the lens has them.
+with g the weight of its ring (Σ g = 1), v and f the weights of its wavelength and field, W and F their numbers, and a
+the number of arms that are traced: of a lens of revolution one for the field on the axis, half of them for a field on
+y, else all. They lie half a step off the y axis. The weights v and f are those of the lens, not normalised.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -162,12 +162,12 @@ def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
             share = np.pi * weight * field_weight / (len(colours) * len(fields) * len(angles))
             for angle in angles if share else ():
                 for radius, g in zip(np.sqrt(0.5 * (nodes + 1)), 0.5 * weights, strict=True):
-                    pupil = _clean(radius * np.cos(angle)), _clean(radius * np.sin(angle))
+                    pupil = (round(float(radius * part), 15) + 0.0 for part in (np.cos(angle), np.sin(angle)))
                     yield Row(operand, (0, wavelength), (*field, *pupil), weight=float(share * g))
 
 
 def _by_frequencies(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
-    """A row for every field and frequency, all wavelengths together; the best that there is is 1."""
+    """A row for every field and frequency, all wavelengths together, with a target of 1."""
     fields = _fields(lens, settings)
     _refuse_many(len(fields) * len(settings.frequencies), f"{len(settings.frequencies)} `frequencies`")
     for number, (_, weight) in enumerate(fields, 1):
@@ -185,16 +185,16 @@ def _fields(lens: Lens, settings: DefaultMerit) -> list[tuple[tuple[float, float
     return [(tuple(point), weight) for point, weight in zip(points.tolist(), weights, strict=True)]
 
 
-def _weights(own, given: Sequence[float] | None, what: str) -> list[float]:
-    """The weights of fields or wavelengths: those of the lens, or those given, one each."""
-    if given is None:
-        return own.detach().tolist()
-    given = np.atleast_1d(given).tolist()
-    if len(given) != len(own):
-        raise BadMerit(f"`{what}_weights`: {len(given)} weights, and the lens has {len(own)} {what}s")
-    if min(given) < 0 or not sum(given) > 0:
-        raise BadMerit(f"`{what}_weights`: expected 0 or more, not all of them 0")
-    return [float(weight) for weight in given]
+def _weights(of_lens, weights: Sequence[float] | None, kind: str) -> list[float]:
+    """The weights of fields or wavelengths, by default those of the lens. Raises BadMerit."""
+    if weights is None:
+        return of_lens.detach().tolist()
+    weights = np.atleast_1d(weights).astype(float).tolist()
+    if len(weights) != len(of_lens):
+        raise BadMerit(f"`{kind}_weights`: {len(weights)} weights, and the lens has {len(of_lens)} {kind}s")
+    if not (min(weights) >= 0 and sum(weights) > 0):
+        raise BadMerit(f"`{kind}_weights`: expected 0 or more, not all of them 0")
+    return weights
 
 
 def _refuse_many(rows: int, what: str) -> None:
@@ -204,7 +204,7 @@ def _refuse_many(rows: int, what: str) -> None:
 
 
 def _arm_count(lens: Lens, field: tuple[float, float], arms: int) -> int:
-    """How many arms are traced at a field: of a round lens half of them, and one on the axis."""
+    """Number of arms traced at a field: of a lens of revolution half of them, and one on the axis."""
     if not is_round_about_axis(lens) or bool(lens.fields.x.any()):
         return arms
     return arms // 2 if field != (0.0, 0.0) else 1
@@ -214,11 +214,6 @@ def _arms(lens: Lens, field: tuple[float, float], arms: int) -> np.ndarray:
     """The angles of the arms in radians, clockwise from the first right of the y axis."""
     count = _arm_count(lens, field, arms)
     return np.deg2rad(90 - (np.arange(count) + 0.5) * (360 / arms)) if count > 1 else np.zeros(1)
-
-
-def _clean(number: float) -> float:
-    """Without what rounding leaves of 0."""
-    return round(float(number), 15) + 0.0
 
 
 KINDS = {

@@ -1,4 +1,4 @@
-"""Evaluating: what a lens is worth by a merit function, row by row."""
+"""The value of a merit function of a lens, row by row."""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -19,9 +19,8 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.launch import warn_of_filling
 
-_WHOLE = 40  # rows that are listed one by one
+_WHOLE = 40  # rows up to which each has a line
 _TOGETHER = 3  # rows of one field that share a line in longer tables
-
 _BARS = 16  # of the figure
 
 
@@ -30,10 +29,10 @@ class MeritResult(Result):
     """A merit function of a lens.
 
     merit: √(Σ w (v - t)²/Σ w), in its unit of length: `unit` mm. function: all its rows. row: (R,) the numbers, from 1,
-    of those that have a value; values: (R,) mm, radians, waves … as operands have them, lengths in its unit; targets,
-    weights: (R,); contributions: (R,) parts of the square of the merit, which add up to 1; lost: (R,) bool, whether a
-    ray that the row needs does not arrive; configurations: (R,) of the rows. skipped: numbers of rows of unknown
-    operands, which are left out. each: whether the text lists every row.
+    of those that have a value; values: (R,) mm, radians, waves … of the operands, lengths in its unit; targets,
+    weights: (R,); contributions: (R,) parts of the square of the merit, which add up to 1; lost: (R,) bool, rows with a
+    lost ray; configurations: (R,) of the rows. skipped: numbers of rows of unknown operands, which are left out. each:
+    whether the text lists every row.
     """
 
     lens: Lens
@@ -51,13 +50,13 @@ class MeritResult(Result):
     each: bool = False
 
     def columns(self) -> dict[str, Tensor]:
-        kinds, said = self.words()["operand"], self.words()["arguments"]
-        rows = self.valued()
+        words, valued = self.words(), self.valued()
+        operands = [words["operand"].index(row.name) for row in valued]
         return {
             "row": self.row,
             "configuration": self.configurations,
-            "operand": torch.tensor([kinds.index(row.name) for row in rows], dtype=torch.int64),
-            "arguments": torch.tensor([said.index(arguments(row)) for row in rows], dtype=torch.int64),
+            "operand": torch.tensor(operands, dtype=torch.int64),
+            "arguments": torch.tensor([words["arguments"].index(arguments(row)) for row in valued], dtype=torch.int64),
             "target": self.targets,
             "weight": self.weights,
             "value": self.values,
@@ -66,10 +65,10 @@ class MeritResult(Result):
         }
 
     def words(self) -> dict[str, Sequence[str]]:
-        rows = self.valued()
+        valued = self.valued()
         return {
-            "operand": [*dict.fromkeys(row.name for row in rows)],
-            "arguments": [*dict.fromkeys(map(arguments, rows))],
+            "operand": [*dict.fromkeys(row.name for row in valued)],
+            "arguments": [*dict.fromkeys(map(arguments, valued))],
         }
 
     def valued(self) -> list[Row]:
@@ -78,11 +77,11 @@ class MeritResult(Result):
 
     def document(self) -> dict:
         words = self.words()
-        told = [{**one, **{name: words[name][int(one[name])] for name in words}} for one in rows(self.columns())]
-        for one in told:
-            one |= {"row": int(one["row"]), "configuration": int(one["configuration"]), "lost": bool(one["lost"])}
+        results = [{**row, **{name: words[name][int(row[name])] for name in words}} for row in rows(self.columns())]
+        for row in results:
+            row |= {"row": int(row["row"]), "configuration": int(row["configuration"]), "lost": bool(row["lost"])}
         head = {"merit": float(self.merit), "unit": self.unit, "skipped": [*self.skipped]}
-        return {"analysis": "merit", **head, "results": told}
+        return {"analysis": "merit", **head, "results": results}
 
     def __str__(self) -> str:
         counted, unit = int((self.weights != 0).sum()), "" if self.unit == 1 else f", lengths in {self.unit:g} mm"
@@ -92,45 +91,42 @@ class MeritResult(Result):
             lines.append(f"left out, unknown: rows {left}")
         if lost := int(self.lost.sum()):
             lines.append(f"{lost} rows have lost their ray")
-        several = len({*self.configurations.tolist()}) > 1
-        groups = [*self.groups()]
-        width = max((len(arguments(self.function[group[0]])) for group in groups), default=0) + 2
-        width = max(width, 18)
+        several, valued, groups = len({*self.configurations.tolist()}) > 1, self.valued(), [*self._groups()]
+        width = max(18, *(len(arguments(valued[group[0]])) + 2 for group in groups))
         head = f"{'row':>9}  {'operand':<8}{'arguments':<{width}}{'target':>12}{'weight':>12}{'value':>14}{'part':>9}"
         lines.append((f"{'conf.':>5}" if several else "") + head)
-        lines += [(f"{self._configuration(g):>5}" if several else "") + self._line(g, width) for g in groups]
+        for group in groups:
+            number = f"{int(self.configurations[group[0]]):>5}" if several else ""
+            lines.append(number + self._line(valued[group[0]], group, width))
         return "\n".join(lines)
 
-    def groups(self) -> Iterator[list[int]]:
-        """Rows, from 0 in `function`, that share a line of the text: in long tables rays of one field."""
-        numbers = [number - 1 for number in self.row.tolist()]
-        if self.each or len(numbers) <= _WHOLE:
-            yield from ([number] for number in numbers)
+    def _groups(self) -> Iterator[list[int]]:
+        """Places of the rows that share a line of the text: in long tables rays of one field."""
+        valued, configurations = self.valued(), self.configurations.tolist()
+        if self.each or len(valued) <= _WHOLE:
+            yield from ([k] for k in range(len(valued)))
             return
-        for _, together in groupby(numbers, self._shared):
+
+        def shared(k: int) -> tuple:
+            row = valued[k]
+            alone = () if row.weight and any(row.numbers[2:]) else (k,)
+            return (row.operand, row.integers[0], row.numbers[:2], row.target, configurations[k], *alone)
+
+        for _, together in groupby(range(len(valued)), shared):
             alike = [*together]
-            yield from [alike] if len(alike) >= _TOGETHER else ([one] for one in alike)
+            yield from [alike] if len(alike) >= _TOGETHER else ([k] for k in alike)
 
-    def _shared(self, number: int) -> tuple:
-        row = self.function[number]
-        alone = () if row.weight and any(row.numbers[2:]) else (number,)
-        return (row.operand, row.integers[0], row.numbers[:2], row.target, self._configuration([number]), *alone)
-
-    def _configuration(self, group: list[int]) -> int:
-        return int(self.configurations[self.row.tolist().index(group[0] + 1)])
-
-    def _line(self, group: list[int], width: int) -> str:
-        row, places = self.function[group[0]], [self.row.tolist().index(number + 1) for number in group]
-        weight, v = self.weights[places], self.values[places]
+    def _line(self, row: Row, group: list[int], width: int) -> str:
+        weight, v, first = self.weights[group], self.values[group], int(self.row[group[0]])
         if len(group) == 1:
-            name, said, shown = str(group[0] + 1), arguments(row), cell(float(v), ">14.6g")
+            name, words, number = str(first), arguments(row), float(v)
         else:
-            name = f"{group[0] + 1}-{group[-1] + 1}"
-            said = f"field {row.numbers[0]:.4g} {row.numbers[1]:.4g}, {len(group)} rays"
-            shown = cell(float((weight * v**2).sum().div(weight.sum()).sqrt()), ">14.6g")
-        part, lost = float(self.contributions[places].sum()), "  lost" if bool(self.lost[places].any()) else ""
-        told = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{shown}{100 * part:>8.2f}%{lost}"
-        return f"{name:>9}  {row.name:<8}{said:<{width}}{told}"
+            name = f"{first}-{int(self.row[group[-1]])}"
+            words = f"field {row.numbers[0]:.4g} {row.numbers[1]:.4g}, {len(group)} rays"
+            number = float((weight * v**2).sum().div(weight.sum()).sqrt())
+        part, lost = float(self.contributions[group].sum()), "  lost" if bool(self.lost[group].any()) else ""
+        numbers = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{cell(number, '>14.6g')}{100 * part:>8.2f}%{lost}"
+        return f"{name:>9}  {row.name:<8}{words:<{width}}{numbers}"
 
     @styled
     def draw(self):
@@ -167,59 +163,46 @@ def evaluate(
     configuration: int | None = None,
     each: bool = False,
 ) -> MeritResult:
-    """What the lens is worth by a merit function, row by row.
+    """The merit of a lens and the values of the rows of its merit function.
 
     merit: `Merit`, `DefaultMerit`, rows, or a kind of default one ("spot", "wavefront", "angular", "mtf"); by default
     the file's. configuration: its rows alone. each: list every row in the text. Raises BadMerit, UnknownOperand.
     """
     function = merit_for(lens, merit, configuration and [configuration])
     warn_of_filling(lens, field_points(None, like=lens))
-    where = configurations_of(function, lens.current_configuration)
+    of_rows = configurations_of(function, lens.current_configuration)
     if configuration is not None:
-        apart = {number: 0.0 for number, at in enumerate(where, 1) if at != configuration}
-        function = function.with_weights(apart)
-    planned = Evaluation(
-        Model(lens),
-        function.rows,
-        unit=function.unit,
-        skip_unknown=function.skip_unknown,
-        conventions=function.conventions,
-    )
+        function = function.with_weights({k: 0.0 for k, at in enumerate(of_rows, 1) if at != configuration})
+    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
+    evaluation = Evaluation(Model(lens), function.rows, **options)
     shown = [
-        k for k, row in enumerate(function) if row.operand in OPERANDS and where[k] in (configuration or where[k],)
+        k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
-    return _result(lens, function, planned, shown, [where[k] for k in shown], each)
-
-
-def _result(
-    lens: Lens, function: Merit, planned: Evaluation, shown: list[int], where: list[int], each: bool
-) -> MeritResult:
-    """shown: the rows, from 0, that have a value; where: the configuration of each."""
-    found, like = planned(np.zeros(0)), torch.float64
-    squares = np.bincount(found.of_row, found.residuals**2, minlength=len(function))[shown]
+    evaluated, like = evaluation(np.zeros(0)), torch.float64
+    squares = np.bincount(evaluated.of_row, evaluated.residuals**2, minlength=len(function))[shown]
     return MeritResult(
         lens=lens,
-        merit=torch.tensor(found.merit, dtype=like),
+        merit=torch.tensor(evaluated.merit, dtype=like),
         function=function.rows,
         row=torch.tensor([k + 1 for k in shown], dtype=torch.int64),
-        values=torch.as_tensor(found.values[shown], dtype=like),
-        targets=torch.as_tensor(planned.targets[shown], dtype=like),
-        weights=torch.as_tensor(planned.weights[shown], dtype=like),
+        values=torch.as_tensor(evaluated.values[shown], dtype=like),
+        targets=torch.as_tensor(evaluation.targets[shown], dtype=like),
+        weights=torch.as_tensor(evaluation.weights[shown], dtype=like),
         contributions=torch.as_tensor(squares / max(squares.sum(), 1e-300), dtype=like),
-        lost=torch.as_tensor(found.lost[shown]),
-        configurations=torch.tensor(where, dtype=torch.int64),
+        lost=torch.as_tensor(evaluated.lost[shown]),
+        configurations=torch.tensor([of_rows[k] for k in shown], dtype=torch.int64),
         unit=function.unit,
-        skipped=planned.skipped,
+        skipped=evaluation.skipped,
         each=each,
     )
 
 
-def _shares(found: MeritResult) -> dict[str, tuple[str, float]]:
+def _shares(result: MeritResult) -> dict[str, tuple[str, float]]:
     """Operand and part of every bar by its name."""
-    several = len({*found.configurations.tolist()}) > 1
+    several = len({*result.configurations.tolist()}) > 1
     shares: dict[str, tuple[str, float]] = {}
-    numbers = (found.row, found.configurations, found.weights, found.contributions)
-    for row, number, at, weight, part in zip(found.valued(), *(n.tolist() for n in numbers), strict=True):
+    numbers = (result.row, result.configurations, result.weights, result.contributions)
+    for row, number, at, weight, part in zip(result.valued(), *(n.tolist() for n in numbers), strict=True):
         if weight:
             name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
             shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)

@@ -1,4 +1,4 @@
-"""Merit functions as values: the rows of a file, of a list or of a default, which can be joined and weighed anew.
+"""Merit functions as values: the rows of a file, of a list or of a default, which can be joined and reweighted.
 
 rt.Merit.of(lens)                      the merit function of the file
 rt.Merit.default(lens, "spot")         a default one, of the settings `DefaultMerit`
@@ -74,10 +74,10 @@ class Merit:
         return iter(self.rows)
 
     def __add__(self, other: "Merit | Sequence[Row]") -> "Merit":
-        """The rows of both, in the unit of the first; mere rows are in mm.
+        """The rows of both, in the unit of the first; rows without a `Merit` are in mm.
 
-        Rows of the second are of the first configuration until they say otherwise, and rows of arithmetic keep to
-        their rows. Raises BadMerit.
+        Rows of the second up to its first CONF are of configuration 1, and rows of arithmetic keep their references.
+        Raises BadMerit.
         """
         unit = other.unit if isinstance(other, Merit) else 1.0
         behind = (in_unit(row, unit, self.unit) for row in other)
@@ -113,18 +113,18 @@ class Merit:
         for number in by_row:
             if not 1 <= number <= len(self.rows):
                 raise BadMerit(f"no row {number}; there are rows 1 to {len(self.rows)}")
-        given = [by_row.get(number, by_operand.get(row.name)) for number, row in enumerate(self.rows, 1)]
-        changed = (
-            row if number is None else dataclasses.replace(row, **{name: float(number)})
-            for row, number in zip(self.rows, given, strict=True)
-        )
-        return dataclasses.replace(self, rows=tuple(changed))
+
+        def changed(number: int, row: Row) -> Row:
+            value = by_row.get(number, by_operand.get(row.name))
+            return row if value is None else dataclasses.replace(row, **{name: float(value)})
+
+        return dataclasses.replace(self, rows=tuple(changed(*pair) for pair in enumerate(self.rows, 1)))
 
     def __str__(self) -> str:
         lines = [f"{'row':>5}  {'operand':<8}{'arguments':<40}{'target':>14}{'weight':>14}"]
         for number, row in enumerate(self.rows, 1):
-            told = "" if row.text else f"{row.target:>14.6g}{row.weight:>14.6g}"
-            lines.append(f"{number:>5}  {row.name:<8}{arguments(row) or row.text:<40}{told}".rstrip())
+            numbers = "" if row.text else f"{row.target:>14.6g}{row.weight:>14.6g}"
+            lines.append(f"{number:>5}  {row.name:<8}{arguments(row) or row.text:<40}{numbers}".rstrip())
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -161,7 +161,7 @@ def merit_of_options(
 
 
 def arguments(row: Row) -> str:
-    """The arguments of a row in words: what its whole numbers name, where they are known, and its four numbers."""
+    """The arguments of a row as text: its integers with their meaning, if known, and its four numbers."""
     operand = OPERANDS.get(row.operand)
     takes = operand.takes if operand is not None else ("", "")
     named = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
@@ -171,12 +171,12 @@ def arguments(row: Row) -> str:
 
 
 def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
-    """The configuration (from 1) that every row is of; current: that of the rows before the first that says so."""
-    found = []
+    """The configuration (from 1) of every row; current: that of the rows before the first CONF."""
+    configurations = []
     for row in rows:
         current = row.integers[0] if row.operand == "CONF" else current
-        found.append(current)
-    return found
+        configurations.append(current)
+    return configurations
 
 
 def in_unit(row: Row, before: float, after: float) -> Row:
@@ -186,7 +186,7 @@ def in_unit(row: Row, before: float, after: float) -> Row:
 
 
 def _moved(row: Row, by: int) -> Row:
-    """A row that stands further down; one of arithmetic takes the values of the same rows, further down as well."""
+    """A row moved down with the rows that it refers to."""
     operand = OPERANDS.get(row.operand)
     if operand is None or operand.refers is None:
         return row

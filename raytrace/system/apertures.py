@@ -1,7 +1,7 @@
-"""Aperture: the part of a surface that passes light, and one row for every shape that it may have.
+"""Aperture: the part of a surface that passes light, with a row for every shape.
 
-A shape is told by its edges, each a measure of a point and the limit of it: what lies within, how far from the edge,
-how a figure shows it and what files call it is in the row, and nowhere else but in tracing/cpp/apertures.h.
+A shape is defined by its edges, each a measure of a point and its limit. A new shape is a row of SHAPES, and its lines
+in tracing/cpp/apertures.h.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Configurations: one lens in several states, a zoom lens at its ends, say, told by the numbers that differ.
+"""Configurations: one lens in several states, as a zoom lens at its ends, by the numbers that differ.
 
-An operand is a number of the lens with a value for every configuration. What no operand names is shared: a curvature
-that changes, changes in all of them. Configurations are counted from 1.
+An operand is a number of the lens with a value for every configuration; all other numbers are shared. Configurations
+are counted from 1.
 """
 
 import dataclasses
@@ -119,7 +119,7 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
             place = ScaledPath(("surfaces", surface, name))
             operands.append(Operand(_NAMES[name], surface, paths=(place,), numbers=numbers))
     if len({operand.numbers.shape for operand in operands}) > 1 or any(one.numbers.ndim != 1 for one in operands):
-        raise ValueError("the configurations are told by lists of values, as many for one number as for another")
+        raise ValueError("expected lists of values of one length, a value a configuration")
     return with_operands(dataclasses.replace(lens, operands=tuple(operands)), 1)
 
 

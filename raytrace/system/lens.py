@@ -352,7 +352,7 @@ def _reference(like: Tensor) -> Environment:
 
 
 def with_field_kind(lens: Lens, kind: str) -> Lens:
-    """The lens with the same numbers for its fields, told as another kind of FIELD_UNITS."""
+    """The lens with the same field numbers, of another kind of FIELD_UNITS."""
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind))
 
 

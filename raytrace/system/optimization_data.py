@@ -1,8 +1,7 @@
 """Optimisation data of a lens: variables, solves, pickups and the merit function.
 
-A lens file stores solved values beside the rule that made them. The numbers of a `Lens` are always those values; the
-rules stand here, and hold while the lens is optimised. None of it is a tensor: two sets are equal where their parts
-are.
+A lens file stores solved values and their rules. The numbers of a `Lens` are those values; the rules are here, and hold
+while the lens is optimised. Nothing here is a tensor, so that two sets compare by their parts.
 """
 
 from collections import Counter
@@ -16,9 +15,9 @@ class Vary:
 
     surface: of the file; quantity: "thickness", "curvature", or another name of `parameter_paths`, as "conic", "a4",
     "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass.
-    configuration, operand: of a number that differs from one configuration to the next, which (from 1), and which of
-    `lens.operands` (from 0) it belongs to; surface and quantity are those of the operand. 0 and None: the lens's own.
-    bounds: smallest and largest value, in mm; () where none are told.
+    configuration, operand: of a number that differs between configurations, the configuration (from 1) and its place in
+    `lens.operands` (from 0); surface and quantity are those of the operand. 0 and None: of the lens itself.
+    bounds: smallest and largest value, in mm; () if there are none.
     """
 
     surface: int
@@ -34,7 +33,7 @@ class Vary:
 
 @dataclass(frozen=True, slots=True)
 class Solve:
-    """A number that follows from others, at every moment.
+    """A number that follows from others, at every step of an optimisation.
 
     surface, quantity: as for `Vary`. kind, a key of `optimization.lens_state.SOLVES`, and its numbers:
 
@@ -54,9 +53,8 @@ class Solve:
 
     All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):
 
-    "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" of a "semi_diameter", the latter: over the
-        configurations.
-    others, named as the file has them.
+    "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" (over configurations) of a "semi_diameter";
+        others, named as in the file.
 
     configuration, operand: as for `Vary`. A "pickup" of those follows configuration `source`, there operand numbers[0];
         its offset is in `OptimizationData.unit`.
@@ -90,16 +88,15 @@ def _where(one: Vary | Solve) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of a merit function: an operand, its arguments, and what it is meant to be.
+    """One row of a merit function: an operand, its arguments, target and weight.
 
-    operand: its name, as "TRAC", a key of `optimization.operands.table.OPERANDS` where it is known, or a function
-    from a lens to a
-        tensor () or (k,), which may be a `optimization.operands.custom.Measure`; `name` is a word for either.
-    integers, numbers: its arguments as the field's programs write them: surfaces, a wavelength (from 1, 0 the primary
-        one) or rows; Hx, Hy, Px, Py or data.
+    operand: its name, as "TRAC", a key of `optimization.operands.table.OPERANDS` if it is known, or a function from a
+        lens to a tensor () or (k,), which may be a `optimization.operands.custom.Measure`; `name` names either.
+    integers, numbers: its arguments in the order of OpticStudio: surfaces, a wavelength (from 1, 0 the primary one) or
+        rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
-    text: what a line of text says, and words behind the numbers; further: numbers behind those.
-    Lengths in `OptimizationData.unit`: a merit of lengths and pure numbers depends on the unit: rows stay as written.
+    text: of a row of text, and words after the numbers; further: numbers after those.
+    Lengths in `OptimizationData.unit`, unconverted: a merit of lengths and pure numbers depends on the unit.
     """
 
     operand: str | Callable
@@ -112,7 +109,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Of the operand, also where that is a function."""
+        """Name of the operand, or of its function."""
         if isinstance(self.operand, str):
             return self.operand
         return getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
@@ -120,14 +117,13 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class OptimizationData:
-    """Everything that a lens file says about how the lens is to be optimised.
+    """The optimisation data of a lens file.
 
-    variables, solves: of the numbers of the lens, in the order of surfaces; kept: rules that are kept with the file and
-    not followed: their numbers stay as they are. merit: the lines of its merit function, in order, text included: row i
-    of the function is merit[i - 1]; tolerances: lines as they stand; unit: mm in the unit of length of both, in which a
-    file of the lens is written.
-    semi_diameters: surfaces whose semi-diameter is given; it follows the rays at all others, larger by
-    semi_diameter_margin: per cent, and mm.
+    variables, solves: of the numbers of the lens, in the order of surfaces; kept: rules that are stored and not
+    followed: their numbers stay fixed. merit: the rows of its merit function, in order, text included: row i of the
+    function is merit[i - 1]; tolerances: lines of the file; unit: mm in the unit of length of both, in which a file of
+    the lens is written.
+    semi_diameters: surfaces of fixed semi-diameter; all others follow the rays; semi_diameter_margin: per cent, and mm.
     """
 
     variables: tuple[Vary, ...] = ()

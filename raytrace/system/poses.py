@@ -1,10 +1,10 @@
-"""Pose: where the axes of a surface stand, decentred and tilted, and vectors told in them.
+"""Pose: position and tilt of the axes of a surface, and vectors in them.
 
     old = d + Rx Ry Rz new          decentre first, the usual order
     old = Rz Ry Rx (new + d)        tilts first, which undoes the other with every number negated
 
 d = (x, y, z), and R turn about the axes of x, y and z by right-handed angles: OpticStudio's coordinate break of order 0
-and 1. What is None is not modelled, and costs nothing.
+and 1. Numbers that are None are not modelled, and cost nothing.
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ Vector = Sequence[Tensor]
 
 
 def point_in(pose: Pose | Turn, point: Vector) -> Vector:
-    """A point (x, y, z) of (...) mm each, told in the new axes."""
+    """A point (x, y, z) of (...) mm each, in the new axes."""
     if isinstance(pose, Turn):
         return [at + step for at, step in zip(direction_in(pose, point), pose.shift, strict=True)]
     if pose.tilts_first:
@@ -67,7 +67,7 @@ def point_in(pose: Pose | Turn, point: Vector) -> Vector:
 
 
 def direction_in(pose: Pose | Turn, direction: Vector) -> Vector:
-    """A direction, by components (...), told in the new axes."""
+    """A direction, by components (...), in the new axes."""
     if isinstance(pose, Turn):
         return [sum(r * d for r, d in zip(row, direction, strict=True)) for row in pose.rotation]
     for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
@@ -78,12 +78,12 @@ def direction_in(pose: Pose | Turn, direction: Vector) -> Vector:
 
 
 def point_out(pose: Pose, point: Vector) -> Vector:
-    """A point told in the new axes, told in the old ones: `point_in` undone."""
+    """A point of the new axes in the old ones: inverse of `point_in`."""
     return point_in(undone(pose), point)
 
 
 def direction_out(pose: Pose, direction: Vector) -> Vector:
-    """A direction told in the new axes, told in the old ones: `direction_in` undone."""
+    """A direction of the new axes in the old ones: inverse of `direction_in`."""
     return direction_in(undone(pose), direction)
 
 

@@ -23,7 +23,7 @@ class Rays:
     opl: (...) mm, the *reduced* optical path: Σ n·path less the path n·T·σ of the axial ray in every gap of
         thickness T (σ = ±1, its sign changed by every mirror), and less that of the object's distance. None when
         the path is not asked for, and then not computed.
-    wavelength: µm, broadcast against the batch shape; None where what traces the rays is told it.
+    wavelength: µm, broadcast against the batch shape; None if the wavelength is passed to the tracer.
     """
 
     position: Tensor

@@ -1,26 +1,17 @@
-"""Sag terms: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
+"""Sag terms: D(x, y), added to the conic and even terms of a surface, z = S(r²) + D(x, y).
 
-    GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
-    SplineSag    the same by its coefficients c, found once
-    ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
-    FringeSag    the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
-
-Slopes and second derivatives are written out, and autograd may differentiate them further. What rays need of a
-sag_terms are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`, where the
-polynomials in x and y of `polynomials` have theirs too.
-
-
-Polynomials: sag_terms that are sums of powers of x and y, linear in their coefficients.
-
+    GridSag         D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
+    SplineSag       the same by its coefficients c, computed once
+    ZernikeSag      D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
+    FringeSag       the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
     PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
     IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
     TiltSag         D = x tan_x + y tan_y
-
-The other two are made into the first (`as_polynomial`), by linear maps that autograd follows. For the compiled trace
-all three, and Zernike's polynomials, are made into powers about a centre:
-
     PowerSag        D = h + Σ_k c_k E_k(u, v),  u = (x - x_0)/R,  v = (y - y_0)/R
 
+Slopes and second derivatives are written out, and autograd may differentiate them further. Functions take the tensors
+of sag terms in float64; each kind is a row of `shapes.SAG_TERMS`. IrregularSag and TiltSag are converted to
+PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linear maps that autograd follows.
 """
 
 import functools
@@ -33,7 +24,7 @@ from torch import Tensor
 from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
 from raytrace.maths.numerics import polynomial
 from raytrace.maths.value import value
-from raytrace.maths.zernike import Order, fringe, noll, norm
+from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
 
 _LEAST = 4  # points along a side of a grid: a cubic
@@ -220,74 +211,29 @@ def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) ->
 def _summed(terms: Sequence[tuple[Order, Tensor]], radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
     """Σ_m (Σ_k c_mk P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
     x, y = torch.broadcast_tensors(x / radius, y / radius)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    harmonics, radial = _harmonics([order for order, _ in terms], x, y), _radial(terms, 2 * (x * x + y * y) - 1)
-    z, zx, zy, zxx, zxy, zyy = (zero,) * 6
-    for m, (p, dp, d2p) in radial.items():
-        h, hx, hy, hxx, hxy = (one, zero, zero, zero, zero) if m == 0 else harmonics[m]
+    t, known, radial = 2 * (x * x + y * y) - 1, {}, {}
+    for (n, m), c in terms:
+        parts = [c * p for p in jacobi(known, n, m, t, highest)]
+        radial[m] = [a + b for a, b in zip(radial[m], parts, strict=True)] if m in radial else parts
+    pairs = harmonics([order for order, _ in terms], x, y)
+    z, zx, zy, zxx, zxy, zyy = (torch.zeros_like(x),) * 6
+    for m, (p, *slopes) in radial.items():
+        size = abs(m)
+        # H of m > 0 is Re (x + iy)^m, and of m < 0 Im (x + iy)^|m| = Re (-i (x + iy)^|m|).
+        lower = [pairs[max(size - j, 0)] for j in range(3)]
+        (h, _), (c, s), (cc, ss) = lower if m >= 0 else [(im, -re) for re, im in lower]
         z = z + p * h
         if highest > 0:
+            dp, hx, hy = slopes[0], size * c, -size * s
             zx = zx + 4 * x * dp * h + p * hx
             zy = zy + 4 * y * dp * h + p * hy
         if highest > 1:
+            d2p, hxx, hxy = slopes[1], size * (size - 1) * cc, -size * (size - 1) * ss
             both = 4 * dp * h
             zxx = zxx + both + 16 * x * x * d2p * h + 8 * x * dp * hx + p * hxx
             zxy = zxy + 16 * x * y * d2p * h + 4 * dp * (x * hy + y * hx) + p * hxy
             zyy = zyy + both + 16 * y * y * d2p * h + 8 * y * dp * hy - p * hxx
     return Sag(z, zx / radius, zy / radius, *(s / radius**2 for s in (zxx, zxy, zyy)))
-
-
-def _harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]:
-    """H, H_x, H_y, H_xx, H_xy of m > 0, Re (x + iy)^m, and of -m, Im (x + iy)^m."""
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    powers = [(one, zero)]
-    found = {}
-    for m in range(1, max((abs(m) for _, m in orders), default=0) + 1):
-        re, im = powers[-1]
-        powers.append((re * x - im * y, re * y + im * x))
-        below = powers[m - 2] if m > 1 else (zero, zero)
-        second = m * (m - 1)
-        found[m] = powers[m][0], m * re, -m * im, second * below[0], -second * below[1]
-        found[-m] = powers[m][1], m * im, m * re, second * below[1], second * below[0]
-    return found
-
-
-def _radial(terms: Sequence[tuple[Order, Tensor]], t: Tensor) -> dict[int, list[Tensor]]:
-    """Σ_k c N P_k^(0,|m|)(t) with two derivatives by t, for every signed m of the Noll terms 1 … J.
-
-    P_i = (α t + β) P_{i-1} - γ P_{i-2} (DLMF 18.9.2), and the same derived once and twice.
-    """
-    known: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
-    sums: dict[int, list[Tensor]] = {}
-    for (n, m), coefficient in terms:
-        size, k = abs(m), (n - abs(m)) // 2
-        _extend(known.setdefault(size, []), size, k, t)
-        total = sums.setdefault(m, [torch.zeros_like(t)] * 3)
-        sums[m] = [torch.add(s, coefficient * p) for s, p in zip(total, known[size][k], strict=True)]
-    return sums
-
-
-def _extend(found: list[tuple[Tensor, Tensor, Tensor]], m: int, k: int, t: Tensor) -> None:
-    zero = torch.zeros_like(t)
-    for i in range(len(found), k + 1):
-        if i == 0:
-            found.append((torch.ones_like(t), zero, zero))
-        elif i == 1:
-            found.append((0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), zero))
-        else:
-            a = 2 * i + m
-            below = 2 * i * (i + m) * (a - 2)
-            alpha, beta = (a - 1) * a * (a - 2) / below, -(a - 1) * m * m / below
-            gamma = 2 * (i - 1) * (i + m - 1) * a / below
-            (p, dp, d2p), (q, dq, d2q) = found[-1], found[-2]
-            slope = alpha * t + beta
-            found.append(
-                (
-                    slope * p - gamma * q,
-                    slope * dp + alpha * p - gamma * dq,
-                    slope * d2p + 2 * alpha * dp - gamma * d2q,
-                )
-            )
 
 
 @value

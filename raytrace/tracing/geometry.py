@@ -3,8 +3,7 @@
 A surface whose conic closes before its semi-diameter h, |c| h √(1+k) ≥ 1; a negative gap, or surfaces that cross,
 between two surfaces that refract, reflect or diffract, along the light; glass whose edge thickness is negative.
 
-
-Frames: where the vertex of every surface stands, and how it is turned, in the axes that rays start in.
+Frames: position and rotation of every surface in the axes that rays start in.
 """
 
 import dataclasses
@@ -198,15 +197,15 @@ class Frame:
     axes: Tensor
 
     def outside(self, point: Tensor) -> Tensor:
-        """A point (3, ...) mm of the surface, told in the axes that rays start in."""
+        """A point (3, ...) mm of the surface in the axes that rays start in."""
         return self.along(point) + self.origin.reshape(3, *(1,) * (point.dim() - 1))
 
     def along(self, direction: Tensor) -> Tensor:
-        """A direction (3, ...), told in the axes that rays start in."""
+        """A direction (3, ...) in the axes that rays start in."""
         return torch.tensordot(self.axes, direction, dims=1)
 
     def inside(self, point: Tensor) -> Tensor:
-        """A point (3, ...) mm, told in the axes of the surface."""
+        """A point (3, ...) mm in the axes of the surface."""
         moved = point - self.origin.reshape(3, *(1,) * (point.dim() - 1))
         return torch.tensordot(self.axes.T, moved, dims=1)
 

@@ -1,28 +1,18 @@
 """Launch: from field points and pupil points to rays in front of surface 1.
 
 Rays start on the plane of the paraxial entrance pupil (at the primary wavelength), wherever it lies; an object 10¹² mm
-away costs no digits. With ray aiming they are steered until they fill the stop, whose radius is that of the paraxial or
-of the real marginal ray; where the axis bends they set out for what the stop looks like along the base ray.
+away loses no precision. With ray aiming they fill the stop, whose radius is that of the paraxial or of the real
+marginal ray; where the axis bends they start towards the image of the stop about the base ray.
 
+Vignetting factors make an affine map of the pupil, p' = V + M p. Between the fields of a lens maps are interpolated,
+exact at its fields, continuous, and constant beyond the last one:
 
-Vignetting factors: the part of the entrance pupil that a field fills, an ellipse, and how it changes over the field.
+- fields on one half-line from the axis (0, 14, 20 degrees along y): linearly in the distance from the axis, where the
+  pupil is whole if no field is listed there, and the ellipse turns with the field, as in a lens of revolution;
+- fields on both sides of the axis on one line: linearly along that line, at the foot of the perpendicular;
+- others: by weights 1/distance² of all fields (Shepard, 1968).
 
-The factors of a field make an affine map of the pupil, p' = V + M p. Between the fields of a lens, maps are
-interpolated:
-
-- all fields on one half-line from the axis (0, 14, 20 degrees along y): linearly in the distance from the axis, where
-  the pupil is whole if no field is listed there, and the ellipse turns with the field, as in a lens of revolution;
-- all on one line through the axis, on both sides of it: linearly along that line, at the foot of the perpendicular;
-- elsewhere: by weights 1/distance² of all fields (Shepard, 1968).
-
-Each is exact at the fields of the lens, continuous, and beyond the last field stays what it is there.
-
-
-Filling: how far the rays of each field miss the points of the stop that they stand for.
-
-Without ray aiming, rays go through the paraxial entrance pupil. Its aberrations move them on the stop: the chief ray
-leaves its centre, and marginal rays fall short of its rim or beyond it.
-
+Without ray aiming, pupil aberrations move rays on the stop: `filling` measures by how much.
 """
 
 import dataclasses
@@ -31,11 +21,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.dual import select
-from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
+from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit, varies
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import detached, value
 from raytrace.system.lens import (
@@ -51,12 +40,12 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop, aiming_of, at_stop, is_bent
 from raytrace.tracing.base_ray import Entrance, entrance_of
-from raytrace.tracing.paraxial import FirstOrder, field_scale, first_order
+from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
 from raytrace.words import calling_level, named_value
 
 
 class MarginalRayLost(UserWarning):
-    """The real marginal ray does not reach the stop, whose size it was to tell."""
+    """The real marginal ray does not reach the stop, so that it cannot define its radius."""
 
 
 def rays(
@@ -69,29 +58,21 @@ def rays(
 ) -> Rays:
     """Rays (3, F, W, P) of every field, wavelength and pupil point in front of surface 1, each with its wavelength.
 
-    fields: y, or (x, y), or (2, F) in the lens's own kind of field; wavelengths: µm; both by default the lens's own.
+    fields: y, or (x, y), or (2, F) in the lens's kind of field; wavelengths: µm; both by default those of the lens.
     pupil: points (2, P) of the unit disc, or a rule (points, weights), as `gauss_rings(6)` (default); ray_aiming: a key
-    of RAY_AIMING, by default the lens's own. Raises ValueError for what is none of these.
+    of RAY_AIMING, by default the lens's. Raises TypeError, ValueError for other arguments.
     """
-    pupil = (
-        gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device) if pupil is None else pupil
-    )
-    points = _points(pupil)
-    wavelengths = wavelengths_of(lens, wavelengths)
-    fields = field_points(fields, like=lens)
-    found = launch(lens, points, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
-    return dataclasses.replace(found, wavelength=wavelengths[:, None])
-
-
-def _points(pupil: Tensor | tuple[Tensor, Tensor]) -> Tensor:
-    """Points (2, P) of a rule (points, weights), or as they are. Raises TypeError, ValueError for others."""
+    if pupil is None:
+        pupil = gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device)
     points = pupil[0] if isinstance(pupil, (tuple, list)) and pupil else pupil
     expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.gauss_rings(6)"
     if not isinstance(points, Tensor):
         raise TypeError(f"rays: `pupil` is {named_value(pupil)}; {expected}")
     if points.dim() != 2 or len(points) != 2:
         raise ValueError(f"rays: `pupil` has the shape {tuple(points.shape)}; {expected}")
-    return points
+    wavelengths = wavelengths_of(lens, wavelengths)
+    launched = launch(lens, points, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
+    return dataclasses.replace(launched, wavelength=wavelengths[:, None])
 
 
 def launch(
@@ -104,9 +85,8 @@ def launch(
 ) -> Rays:
     """Rays of every field, wavelength and pupil point: batch shape (F, W, P).
 
-    pupil: (2, P) on the unit disc; fields: (2, F) in the lens's own kind of field, by default those of the lens with
-    their vignetting factors (other fields get those that `raytrace.tracing.launch` interpolates);
-    wavelengths: (W,) µm, by default those of the lens; ray_aiming: a key of RAY_AIMING, by default the lens's.
+    pupil: (2, P) on the unit disc; fields: (2, F) in the lens's kind of field, wavelengths: (W,) µm, ray_aiming: a key
+    of RAY_AIMING, by default those of the lens. Vignetting factors are interpolated for other fields.
     """
     fields = field_points(fields, like=lens)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
@@ -124,8 +104,8 @@ def rays_of_field(
     """Rays of field points through pupil points; everything broadcasts.
 
     field: (2, ...) degrees or mm, as `lens.fields.kind` says; pupil: (2, ...) fractions of the entrance pupil, or of
-    the stop with ray aiming; wavelength: (...) µm. An aimed ray that finds no way to its stop point is lost.
-    Position, direction and validity have axes of 1 where the wavelength makes no difference to them.
+    the stop with ray aiming; wavelength: (...) µm. A ray that cannot be aimed is invalid. Position, direction and
+    validity have axes of 1 where they do not depend on the wavelength.
     """
     lens = with_ray_aiming(lens, ray_aiming)
     paraxial = first_order(lens)
@@ -193,12 +173,18 @@ def is_at_infinity(lens: Lens) -> bool:
 def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm.
 
-    And whether there are such (...): no chief ray may reach a real image height; then the axis comes.
+    And whether there are such (...): where no chief ray reaches a real image height, the field is on the axis.
     """
-    if lens.fields.kind == "real_image_height":
-        return _field_of_real_height(lens, field, paraxial_field(lens, field, paraxial), paraxial)
-    found = paraxial_field(lens, field, paraxial)
-    return found, torch.ones_like(found[0], dtype=torch.bool)
+    estimate = paraxial_field(lens, field, paraxial)
+    if lens.fields.kind != "real_image_height":
+        return estimate, torch.ones_like(estimate[0], dtype=torch.bool)
+    index, entrance = index_behind(lens, 0, lens.primary).to(field.dtype), _entrance(lens)
+
+    def through(field: Tensor, pupil: Tensor) -> Rays:
+        return _through_entrance_pupil(lens, field, pupil, paraxial, index, entrance)
+
+    radius = _aimed_radius(lens, paraxial, entrance) if _is_aimed(lens) else None
+    return aim_at_image(lens, through, field, estimate, radius)
 
 
 def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
@@ -235,7 +221,7 @@ def _is_aimed(lens: Lens) -> bool:
 
 
 def _entrance(lens: Lens) -> Entrance | None:
-    """Where aimed rays set out for in a lens whose axis bends; None: for the paraxial entrance pupil."""
+    """The entrance pupil of aimed rays in a lens whose axis bends; None: the paraxial one."""
     return entrance_of(lens) if _is_aimed(lens) and is_bent(lens) else None
 
 
@@ -246,7 +232,7 @@ def _turned(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
-    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None."""
+    """The lens with another kind of ray aiming, a key of RAY_AIMING; None: unchanged."""
     if ray_aiming in (None, lens.ray_aiming):
         return lens
     if ray_aiming not in RAY_AIMING:
@@ -257,15 +243,14 @@ def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
 def stop_radius(lens: Lens) -> Tensor:
     """Radius in mm of the stop: where the axial ray through the edge of the entrance pupil meets it.
 
-    The paraxial ray where rays are aimed by it, or where the real one does not reach the stop; else the real one. At
-    the primary wavelength. Where the axis bends it counts from the base ray.
+    The paraxial ray with paraxial ray aiming, or where the real one does not reach the stop; else the real one. At the
+    primary wavelength. Where the axis bends it is measured from the base ray.
     """
     return _stop_radius(lens, first_order(lens), _entrance(lens))[0]
 
 
 def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
-    """The points (2, ...) mm of the stop that pupil points (2, ...) stand for where rays are aimed, as in this lens,
-    and the radius of the stop, mm."""
+    """The points (2, ...) mm of the stop that rays of pupil points (2, ...) are aimed at; and its radius, mm."""
     paraxial, entrance = first_order(lens), _entrance(lens)
     radius = _stop_radius(lens, paraxial, entrance)[0]
     target = pupil if entrance is None else _turned(entrance.turn, pupil)
@@ -273,7 +258,7 @@ def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
-    """And whether the real marginal ray tells it, None where that is not asked."""
+    """And whether the real marginal ray reaches the stop; None if that is not traced."""
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value, None
     estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
@@ -284,15 +269,12 @@ def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) ->
 
 
 def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
-    """The radius of the stop with the sign of `FirstOrder.stop_height`.
-
-    Where the axis bends an `Entrance` tells what an inverted image of the stop turns, and the sign is +.
-    """
+    """The radius with the sign of `FirstOrder.stop_height`; an `Entrance` inverts by its `turn`."""
     return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
 
 
 def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
-    """The radius of the stop with its sign, as `_signed`; warns MarginalRayLost."""
+    """As `_signed`; warns MarginalRayLost."""
     radius, arrives = _stop_radius(lens, paraxial, entrance)
     if arrives is not None and not bool(arrives.all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
@@ -319,8 +301,13 @@ def _through_entrance_pupil(
     at_infinity = is_at_infinity(lens)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
     if lens.fields.telecentric:
-        # The pupil is at infinity: cones of equal rays about a chief ray parallel to the axis.
-        radius, depth = _telecentric_radius(lens, paraxial, index), torch.zeros_like(distance)
+        # The pupil is at infinity: equal cones about chief rays parallel to the axis.
+        if lens.aperture.kind not in CONES:
+            raise ValueError(
+                "object space is telecentric, which needs an aperture given as object NA or cone angle, not "
+                f"{lens.aperture.kind}"
+            )
+        radius, depth = distance * torch.tan(cone_angle(lens, index)), torch.zeros_like(distance)
         aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
     elif entrance is not None:
         aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
@@ -354,31 +341,6 @@ def _towards_the_lens(point: Tensor, aim: Tensor, index: Tensor) -> Rays:
     )
 
 
-def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tensor:
-    distance, kind, number = lens.surfaces[0].thickness, lens.aperture.kind, lens.aperture.value
-    if kind == "object_na":
-        return distance * torch.tan(torch.asin(number / index))
-    if kind == "object_cone_angle":
-        return distance * torch.tan(torch.deg2rad(number))
-    raise ValueError(
-        f"object space is telecentric, which needs an aperture given as object NA or cone angle, not {kind}"
-    )
-
-
-def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
-    """The field (2, ...) whose real chief ray meets the image at `height` (2, ...) mm, and whether there is one."""
-    wavelength = lens.primary
-    index = index_behind(lens, 0, wavelength).to(height.dtype)
-
-    entrance = _entrance(lens)
-
-    def through(field: Tensor, pupil: Tensor) -> Rays:
-        return _through_entrance_pupil(lens, field, pupil, paraxial, index, entrance)
-
-    radius = _aimed_radius(lens, paraxial, entrance) if _is_aimed(lens) else None
-    return aim_at_image(lens, through, height, estimate, radius)
-
-
 def _scaled(field: Tensor, factor: Tensor) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
@@ -401,21 +363,13 @@ def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
     """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...)."""
     listed = torch.stack([lens.fields.x, lens.fields.y]).reshape(2, -1, *(1,) * (field.dim() - 1))
-    maps = _maps(lens.fields.vignetting).reshape(5, *listed.shape[1:])
+    vdx, vdy, vcx, vcy, angle = lens.fields.vignetting
+    angle = torch.deg2rad(angle)
+    maps = torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy])
+    maps = _rotated(maps, torch.cos(angle), torch.sin(angle)).reshape(5, *listed.shape[1:])
     same = (listed == field[:, None]).all(0)
     first = same & (same.to(torch.int64).cumsum(0) == 1)
-    own = torch.where(first, maps, 0.0).sum(1)
-    return torch.where(same.any(0), own, _between(listed, maps, field[:, None]))
-
-
-def _maps(factors: Tensor) -> Tensor:
-    """The maps (5, F) of vignetting factors (5, F): VDX, VDY, VCX, VCY, VAN."""
-    vdx, vdy, vcx, vcy, angle = factors
-    return _rotated(torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy]), *_cos_sin(angle))
-
-
-def _cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.cos(torch.deg2rad(degrees)), torch.sin(torch.deg2rad(degrees))
+    return torch.where(same.any(0), torch.where(first, maps, 0.0).sum(1), _between(listed, maps, field[:, None]))
 
 
 def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
@@ -450,10 +404,10 @@ def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Ten
     """Linear in the distance from the axis, turned with the field; an axis that is not listed has the whole pupil."""
     axis = torch.where((radius == 0).any(0, keepdim=True), -1.0, 0.0).to(radius.dtype)
     whole = maps.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0]).reshape(5, *(1,) * (maps.dim() - 1))
-    asked = safe_sqrt(dot_2(field, field))
-    found = _linear(torch.cat([axis, radius]), torch.cat([whole.expand(5, *axis.shape), maps], 1), asked)
-    cosine = torch.where(asked > 0, safe_divide(dot_2(line, field), asked), 1.0)
-    return _rotated(found, cosine[0], safe_divide(_cross(line, field), asked)[0])
+    size = safe_sqrt(dot_2(field, field))
+    interpolated = _linear(torch.cat([axis, radius]), torch.cat([whole.expand(5, *axis.shape), maps], 1), size)
+    cosine = torch.where(size > 0, safe_divide(dot_2(line, field), size), 1.0)
+    return _rotated(interpolated, cosine[0], safe_divide(_cross(line, field), size)[0])
 
 
 def _by_distance(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
@@ -481,25 +435,24 @@ def _linear(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
     return ((1 - share) * first + share * last)[:, 0]
 
 
-#: What the beam may miss the stop by without a warning, of the stop's semi-diameter.
+#: Deviation of the beam from the stop without a warning, as a fraction of its semi-diameter.
 TOLERANCE = 0.02
 
-MOST_FIELDS = 64  # that are measured of one call: a map of a field asks for thousands
+MOST_FIELDS = 64  # measured per call: a map of the field has thousands
 
 
 class UnfilledStop(UserWarning):
     """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
 
-    of_result = True  # said of a result: an error that ends the command stands alone
+    of_result = True  # about a result: not printed with an error that ends the command
 
 
 @value
 class Filling:
     """How far rays miss the stop, fractions of its semi-diameter; inf for a ray that does not reach it.
 
-    chief: (F,) chief ray from the centre. marginal: (F,) the worst of four marginal rays, from its point of the rim; of
-    a field with vignetting factors from the point that these leave. lost: (F,) whether no ray reaches the stop; radius:
-    () mm, semi-diameter of the stop.
+    chief: (F,) chief ray from the centre. marginal: (F,) the worst of four marginal rays, from its point of the rim, or
+    of the vignetted rim. lost: (F,) whether no ray reaches the stop; radius: () mm, semi-diameter of the stop.
     """
 
     chief: Tensor
@@ -512,7 +465,7 @@ class Filling:
 def filling(lens: Lens, fields: Tensor) -> Filling:
     """How far the rays of fields (2, F) miss the stop as the lens launches them, at the primary wavelength.
 
-    Five rays a field are traced to the stop. The stop is as wide as the real marginal ray of the axial beam makes it.
+    Five rays a field are traced. The real marginal ray of the axial beam defines the semi-diameter of the stop.
     """
     lens, fields = detached(lens), fields.detach()
     wavelength = lens.primary
@@ -528,27 +481,26 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
     """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
 
-    Of more than MOST_FIELDS so many are measured, evenly spread over them, and the largest one.
-    A field that loses all its rays in front of the stop is left to LostRays. Nothing is traced where rays are aimed,
-    where chief rays are parallel in object space, and in optimisation: where numbers of the lens or fields require a
-    gradient or are inside a transform of torch.func.
+    Of more than MOST_FIELDS fields so many are measured, and the largest one. Fields without rays at the stop are left
+    to LostRays. Nothing is traced if rays are aimed, if object space is telecentric, and where a derivative by numbers
+    of the lens or fields may be requested.
     """
     lens = with_ray_aiming(lens, ray_aiming)
-    if _is_being_optimised((lens, fields)) or lens.fields.telecentric or aiming_of(lens) != "off":
+    if any(map(varies, pytree.tree_leaves((lens, fields)))) or lens.fields.telecentric or aiming_of(lens) != "off":
         return
     if fields.shape[1] > MOST_FIELDS:
         spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
         fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
-    found = filling(lens, fields)
-    worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
-    if not bool((worst > TOLERANCE).any() & (found.radius > 1e-9)):  # a point has no rim
+    beams = filling(lens, fields)
+    worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
+    if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
         return
     at = int(worst.argmax())
     named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
     many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
     warnings.warn(
-        f"field {named}: rays miss the stop, whose semi-diameter is {float(found.radius):.4g} mm: the chief ray "
-        f"{_words(found.chief[at], 'centre')}, marginal rays {_words(found.marginal[at], 'rim')}"
+        f"field {named}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
+        f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
         f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
         UnfilledStop,
         stacklevel=calling_level(),
@@ -556,10 +508,4 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
 
 
 def _words(missed: Tensor, place: str) -> str:
-    """How far from its place of the stop a ray passes, of the semi-diameter."""
     return f"by {100 * float(missed):.3g} % of it from the {place}" if bool(missed.isfinite()) else "altogether"
-
-
-def _is_being_optimised(numbers: tuple[Lens, Tensor]) -> bool:
-    leaves = [leaf for leaf in pytree.tree_leaves(numbers) if isinstance(leaf, Tensor)]
-    return any(is_functorch_wrapped_tensor(leaf) or leaf.requires_grad for leaf in leaves)

@@ -52,8 +52,8 @@ def remarks(surface: Surface) -> list[str]:
     if surface.is_break:
         return [*found, "coordinate break", *_pose(surface.before)]
     for where, pose in (("before", surface.before), ("behind", surface.after)):
-        told = _pose(pose)
-        found += [f"{where}: {told[0]}", *told[1:]] if told else []
+        if words := _pose(pose):
+            found += [f"{where}: {words[0]}", *words[1:]]
     return found
 
 

@@ -304,7 +304,7 @@ def _tan_cone(lens: Lens, n_object: Tensor) -> Tensor | None:
 
 
 def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
-    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, as the largest field is told."""
+    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, by the kind of field."""
     largest = torch.hypot(*largest_field(lens))[0]
     if lens.fields.kind == "angle":
         return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()

@@ -1,4 +1,4 @@
-"""Losses: where the rays of every field and wavelength end, and why; and what is said of those that all are lost."""
+"""Ray failures: where the rays of every field and wavelength fail or are vignetted, and messages about them."""
 
 import warnings
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import Crossing, lens_steps
 from raytrace.words import calling_level
 
-#: What becomes of a ray, by its number, and how that is said of a surface.
+#: Status of a ray, and its wording at a surface.
 FATES = {
     "ok": "arrived",
     "vignetted": "vignetted at surface {}",
@@ -26,7 +26,7 @@ FATES = {
 }
 STATUS = tuple(FATES)
 _OK = STATUS.index("ok")
-#: What may happen to a ray at a surface, in the order that it is told.
+#: Failures of a ray at a surface, in the order of reports.
 LOST = ("miss", "tir", "vignetted")
 _RINGS = 8  # of the rays that try a field
 
@@ -114,7 +114,7 @@ def warn_of_failures(
     """Warn LostRays for every field that loses all its rays at a wavelength, where and why; and of too wide a beam.
 
     pupil: (2, P), through which rays are traced once more; dark: (F, W), which of the fields (2, F) and wavelengths
-    (W,), the lens's by default; at: what else is told of the place, as the object distance.
+    (W,), the lens's by default; at: prefix of the message, as the object distance.
     """
     if not bool(dark.any()):
         return
@@ -144,16 +144,16 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     F, P = tried.shape[1], pupil.shape[1]
     afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what follows tells itself what aiming has to say
+        warnings.simplefilter("ignore")  # of aiming: the failures are reported below
         found = ray_failures(lens, pupil, fields=tried, wavelengths=primary)
     dark = (found.arrived[:, 0] == 0).nonzero()[:, 0].tolist()
-    told = [
+    messages = [
         f"no ray of field {_named(lens, tried[:, f])} reaches the sensor: {found.words(f, 0)}; {_help(lens, fields)}"
         for f in dark
     ]
     if dark and (every or len(dark) == tried.shape[1]):
-        raise OutOfReach(told[0])
-    for words in told:
+        raise OutOfReach(messages[0])
+    for words in messages:
         _warn(words)
 
 

@@ -1,4 +1,4 @@
-"""Traced: rays on the image that can tell how they came there, surface by surface."""
+"""Ray listing: rays on the image, with the table of their way there, surface by surface."""
 
 import csv
 import dataclasses
@@ -156,8 +156,8 @@ def trace(
         begun, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
-            told = "`object_distances` and `fields` change nothing: the rays of a table begin where it says"
-            warnings.warn(told, ChangesNothing, stacklevel=calling_level())
+            message = "`object_distances` and `fields` change nothing: a table defines where its rays start"
+            warnings.warn(message, ChangesNothing, stacklevel=calling_level())
         begun = rays if isinstance(rays, Rays) else read_rays(rays, lens)
     if begun.wavelength is None:
         begun = dataclasses.replace(begun, wavelength=_chosen(lens, wavelengths).squeeze())
@@ -184,8 +184,8 @@ def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_a
         parts = (torch.stack([getattr(one, name) for one in each], axis) for name, axis in _AXES.items())
         found = Rays(*parts, wavelength=wavelengths[:, None])
     if unaimed := int((~found.valid).sum()):
-        told = f"{unaimed} rays found no way to their point of the stop and are left out"
-        warnings.warn(told, LostRays, stacklevel=calling_level())
+        message = f"{unaimed} rays could not be aimed at their points of the stop and are left out"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
     labels = (distance, *fields[:, :, None, None], wavelengths[:, None], *pupil)
     return found, torch.stack([label.detach().expand(found.shape) for label in labels])
 

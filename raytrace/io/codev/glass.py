@@ -17,8 +17,19 @@ import torch
 
 from raytrace.io.assembly import by_figures, catalogs_in_folder, catalogs_of_lens, is_code, is_left_out, listed_glass
 from raytrace.io.codev.keywords import unquoted
-from raytrace.io.report import FORMULA, Draft
-from raytrace.io.source import LensFileError, Place, Record, double, exact, exact_list, is_number, number, shown
+from raytrace.io.source import (
+    FORMULA,
+    Draft,
+    LensFileError,
+    Place,
+    Record,
+    double,
+    exact,
+    exact_list,
+    is_number,
+    number,
+    shown,
+)
 from raytrace.materials.catalogs import Catalog, UnknownGlass, find_glass, plain_names, same_catalog
 from raytrace.materials.glass import AIR, FORMULAS, LINES, Glass, constant, from_table, mil_glass, refractive_index
 

@@ -10,9 +10,12 @@ from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import (
+    IGNORED,
+    READ,
+    UNKNOWN,
     Block,
+    Draft,
     LensFileError,
     Place,
     Record,

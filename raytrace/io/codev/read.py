@@ -45,9 +45,9 @@ from raytrace.io.codev.keywords import (
     sections,
     unquoted,
 )
-from raytrace.io.report import Draft
 from raytrace.io.source import (
     Block,
+    Draft,
     LensFileError,
     Place,
     Record,

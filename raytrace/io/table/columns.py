@@ -11,8 +11,7 @@ import unicodedata
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import MILLIMETRES, LensFileError, Place, shown
+from raytrace.io.source import IGNORED, MILLIMETRES, READ, UNKNOWN, Draft, LensFileError, Place, shown
 from raytrace.materials.glass import LINES
 from raytrace.system.shapes import KINDS
 

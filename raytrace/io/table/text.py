@@ -8,8 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from raytrace.io.report import READ, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, is_infinite, is_number, plain_text, shown
+from raytrace.io.source import (
+    MAX_SURFACES,
+    READ,
+    Draft,
+    LensFileError,
+    Place,
+    is_infinite,
+    is_number,
+    plain_text,
+    shown,
+)
 from raytrace.io.table.columns import UNREAD, columns, is_header, order, squeezed
 
 #: Header keys, each with its further spellings; a note may occur more than once.

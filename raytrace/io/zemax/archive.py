@@ -15,8 +15,18 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import MAX_BYTES, LensFileError, Place, decode, read_content, shown
+from raytrace.io.source import (
+    IGNORED,
+    MAX_BYTES,
+    READ,
+    UNKNOWN,
+    Draft,
+    LensFileError,
+    Place,
+    decode,
+    read_content,
+    shown,
+)
 from raytrace.io.zemax import read as zemax_read
 from raytrace.materials import agf
 from raytrace.materials.catalogs import Catalog, CatalogError

@@ -24,8 +24,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import Block, LensFileError, Place, Record, double, exact, is_infinite, is_number, plain, shown
+from raytrace.io.source import (
+    IGNORED,
+    READ,
+    UNKNOWN,
+    Block,
+    Draft,
+    LensFileError,
+    Place,
+    Record,
+    double,
+    exact,
+    is_infinite,
+    is_number,
+    plain,
+    shown,
+)
 from raytrace.io.zemax.surfaces import FIELD_LISTS, Sections, aperture_keywords, glass_source, is_blank
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass

@@ -29,8 +29,20 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.io.report import IGNORED, READ, Draft
-from raytrace.io.source import Block, LensFileError, Place, Record, double, is_number, one_line, plain, read_text
+from raytrace.io.source import (
+    IGNORED,
+    READ,
+    Block,
+    Draft,
+    LensFileError,
+    Place,
+    Record,
+    double,
+    is_number,
+    one_line,
+    plain,
+    read_text,
+)
 from raytrace.io.zemax.configurations import cell_of
 from raytrace.io.zemax.surfaces import (
     BLANK,
@@ -43,6 +55,7 @@ from raytrace.io.zemax.surfaces import (
     Sections,
     SurfaceType,
     in_millimetres,
+    measured,
     numbers_of,
     records,
     type_name,
@@ -223,11 +236,11 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
             yield typed.solve("thickness", row.kind, numbers, source=source)
     if record := typed.block.last("PZUP"):
         source = _source([record.number(0, "surface")], typed.number)
-        scale, offset = record.number(1, "factor", 1.0), record.number(2, "offset", 0.0)
+        scale, offset = record.number(1, "factor", 1.0), measured(record, 2, "offset", millimetres, 0.0)
         if source is None or record.number(3, "column", 0.0):
             yield typed.solve("thickness", "PZUP", _with_offset(_solve_numbers(record, 0), 1, millimetres))
         else:
-            pickup = {"source": source, "scale": scale, "offset": offset * millimetres}
+            pickup = {"source": source, "scale": scale, "offset": offset}
             yield Solve(typed.number, "thickness", "pickup", **pickup)
     if record := typed.block.last("VDSZ"):
         if math.isinf(float(typed.surface.thickness)):
@@ -311,7 +324,9 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
     merit, tolerances = merit_rows(tail, report), _tolerances(tail, report)
     margin = sections.system.last("SDMA")
-    percent, length = (margin.number(k, "margin of semi-diameters", 0.0) if margin else 0.0 for k in (0, 2))
+    percent, length = (
+        measured(margin, k, "margin of semi-diameters", millimetres, 0.0) if margin else 0.0 for k in (0, 2)
+    )
     data = OptimizationData(
         variables,
         tuple(solve for solve in solves if _is_followed(solve)),
@@ -321,7 +336,7 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
         semi_diameters=tuple(
             k for k, typed in enumerate(surfaces) if typed.surface.semi_diameter and typed.code("DIAM") == _FIXED
         ),
-        semi_diameter_margin=(percent, length * millimetres),
+        semi_diameter_margin=(percent, length),
         kept=kept,
     )
     sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)

@@ -18,8 +18,17 @@ from functools import partial
 from pathlib import Path
 
 from raytrace.io.assembly import MOST_POINTS, AtHand, LensDraft, assemble, catalogs_of_lens
-from raytrace.io.report import Draft
-from raytrace.io.source import MILLIMETRES, Block, LensFileError, Record, UnsupportedSurface, shown
+from raytrace.io.source import (
+    MILLIMETRES,
+    Block,
+    Draft,
+    LensFileError,
+    Record,
+    UnsupportedSurface,
+    in_lines,
+    refuse_few,
+    shown,
+)
 from raytrace.io.zemax import configurations, optimization
 from raytrace.io.zemax.surfaces import (
     AIMINGS,
@@ -30,6 +39,7 @@ from raytrace.io.zemax.surfaces import (
     SYSTEM_APERTURES,
     Sections,
     build,
+    measured,
     refuse_unsupported,
     sections,
 )
@@ -122,11 +132,8 @@ def _refuse_incomplete(parts: Sections) -> None:
     if mode and mode.words[:1] != ("SEQ",):
         message = f"MODE {' '.join(mode.words)[:40]}: only sequential files (MODE SEQ) are modelled"
         raise UnsupportedSurface(message, mode.place)
-    surfaces = parts.surfaces
-    if len(surfaces) < 3:
-        message = f"{len(surfaces)} surfaces, expected at least object, one surface and image; file cut off?"
-        raise LensFileError(message, surfaces[-1].place)
-    image = surfaces[-1].last("DISZ")
+    refuse_few(parts.surfaces)
+    image = parts.surfaces[-1].last("DISZ")
     if image and image.words and image.words[0].strip("+-0.eE") != "":
         message = f"the last surface has thickness {image.words[0][:40]}, but the image has DISZ 0; image cut off?"
         raise LensFileError(message, image.place)
@@ -163,13 +170,12 @@ def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, repo
         raise LensFileError("no system aperture; expected one of ENPD, FNUM, OBNA, FLOA", system.place)
     record = records[-1]
     if len({other.keyword for other in records}) > 1:
-        names = " and ".join(f"{other.keyword} in line {other.place.line}" for other in records)
-        report.warn(f"several system apertures ({names}); the last is used", record.place)
+        report.warn(f"several system apertures ({in_lines(records)}); the last is used", record.place)
     if record.keyword == "FLOA":
         if not stop_semi_diameter:
             raise LensFileError("FLOA (float by stop size), but the stop surface has no DIAM", record.place)
         return "float_by_stop", stop_semi_diameter, record
-    size = record.number(0, "size of the aperture")
+    size = measured(record, 0, "size of the aperture", unit)
     flag = None if record.keyword == "ENPD" else record.integer(1, "kind of the aperture", 0)
     kind = next((kind for kind, row in SYSTEM_APERTURES.items() if row == (record.keyword, flag)), None)
     if kind is None:
@@ -180,7 +186,7 @@ def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, repo
         )
         limit = f"within {180 - size:g} degrees of the axis, and cover less of a reflector"
         report.warn(f"{message}, {limit}", record.place)
-    return kind, size * unit if flag is None else size, record
+    return kind, size, record
 
 
 def _count(system: Block, position: int, quantity: str) -> int | None:

@@ -12,32 +12,37 @@ Reader, writer, unit conversion, variables and pickups use the same row. Lengths
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from decimal import Context, Decimal
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from raytrace.io.assembly import by_figures, is_code, listed_glass
-from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
+from raytrace.io.assembly import by_figures, clear_aperture, is_code, listed_glass, pose_of
 from raytrace.io.source import (
-    MAX_SURFACES,
+    IGNORED,
+    READ,
+    UNKNOWN,
     Block,
+    Draft,
     LensFileError,
     Place,
     Record,
     UnsupportedSurface,
+    by_word,
     double,
     is_infinite,
+    nonzero,
+    refuse_surplus,
     shown,
     warn_of_repeats,
 )
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.configurations import same
 from raytrace.system.parameter_paths import ParameterPath, parameter_paths
 from raytrace.system.phases import Facets, FringePhase, Grating, Hologram, IdealLens, PolynomialPhase, RadialPhase
 from raytrace.system.poses import Pose, undone
@@ -45,31 +50,27 @@ from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, Ti
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
-
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
 #: Keywords of the system and of a surface that are read; apertures have theirs in `apertures.SHAPES`.
-SYSTEM_READ = _words(
-    "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
-    " FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
+SYSTEM_READ = by_word(
+    {
+        "read": "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD"
+        " YFLD FWGT FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT"
+        " WWGN"
+    }
 )
-_SURFACE_READ = _words(
-    "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR PPAR PZUP"
-    " MAZH TOLE EDGE"
+_SURFACE_READ = by_word(
+    {
+        "read": "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR"
+        " PPAR PZUP MAZH TOLE EDGE"
+    }
 )
 
 #: Keywords that may occur more than once in the system or in one surface.
 _REPEATED = ("NOTE", "WAVM", "FEFD", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
 
 
-def _by_word(rows: dict[str, str]) -> dict[str, str]:
-    return {word: reason for reason, words in rows.items() for word in words.split()}
-
-
 #: Keywords that are known and left out, with the reason.
-SYSTEM_IGNORED = _by_word(
+SYSTEM_IGNORED = by_word(
     {
         "setting of the program, independent of the lens": "PFIL LANG HYPR ROPD PICB EERA LUID IWDP STUD FSVY",
         "how mechanical semi-diameters are recomputed": "OMMA",
@@ -86,7 +87,7 @@ SYSTEM_IGNORED = _by_word(
         "number of fields, which FTYP states": "FENF",
     }
 )
-SURFACE_IGNORED = _by_word(
+SURFACE_IGNORED = by_word(
     {
         "setting of the program, independent of the lens": "FIMP",
         "how the program draws it": "HIDE SCOL",
@@ -205,7 +206,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
     The merit function, tolerances and configurations after the last surface are reported by their readers.
     """
-    lines, surface_read = list(records(text, file)), _SURFACE_READ | aperture_keywords().keys()
+    lines, surface_read = list(records(text, file)), {*_SURFACE_READ, *aperture_keywords()}
     start = next((position for position, record in enumerate(lines, 1) if record.keyword == "SURF"), None)
     if start is None:
         hint = "is it a sequential lens file of OpticStudio (.zmx)?"
@@ -216,9 +217,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     for record in lines:
         word = record.keyword
         if word == "SURF":
-            if len(surfaces) >= MAX_SURFACES:
-                message = f"more than {MAX_SURFACES} surfaces; no sequential lens has so many"
-                raise LensFileError(message, record.place)
+            refuse_surplus(surfaces, record.place)
             if record.integer(0, "surface number") != len(surfaces):
                 message = f"SURF {shown(record.words[0])} where surface {len(surfaces)} should follow"
                 raise LensFileError(f"{message}; lines lost or reordered?", record.place)
@@ -234,13 +233,13 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         else:
             block = system
             _sort(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
-    once = (SYSTEM_READ | surface_read) - {*_REPEATED}
+    once = {*SYSTEM_READ, *surface_read} - {*_REPEATED}
     warn_of_repeats([system, *surfaces], once.__contains__, report)
     _join_fields(system)
     return Sections(system, surfaces, tail)
 
 
-def _sort(record: Record, block: Block, read: frozenset[str], ignored: dict[str, str], report: Draft) -> None:
+def _sort(record: Record, block: Block, read: Collection[str], ignored: dict[str, str], report: Draft) -> None:
     word = record.keyword
     if word not in read and word not in ignored:
         report.met(word[:40], UNKNOWN, record.place)
@@ -294,6 +293,29 @@ def in_millimetres(number: float, power: int, millimetres: float) -> float:
     return number * millimetres**power if power >= 0 else number / millimetres**-power
 
 
+#: Powers of length of the words of a line, from 1, by its keyword; others have none. Apertures have their sizes first.
+POWERS = {
+    "ENPD": {1: 1},
+    "SDMA": {3: 1},
+    "CURV": {1: -1},
+    "DISZ": {1: 1},
+    "DIAM": {1: 1},
+    "VDSZ": {1: 1, 2: 1},
+    "PZUP": {3: 1},
+    "OBDC": {1: 1, 2: 1},
+    "UDAD": {2: 1, 3: 1},
+    "SCBD": {4: 1, 5: 1},
+}
+
+
+def measured(record: Record, position: int, quantity: str, millimetres: float, default: float | None = None) -> float:
+    """The number of a record at a position, in powers of mm."""
+    shape, _ = aperture_keywords().get(record.keyword, ("", False))
+    is_size = bool(shape) and position < SHAPES[shape].sizes
+    power = 1 if is_size else POWERS.get(record.keyword, {}).get(position + 1, 0)
+    return in_millimetres(record.number(position, quantity, default), power, millimetres)
+
+
 # -- the rows of the types --------------------------------------------------------------------------------------------
 
 
@@ -329,12 +351,6 @@ class Parameter(NamedTuple):
     power: int | None = 0
     is_integer: bool = False
     followers: Mapping[ParameterPath, float] = {}
-
-
-def _parameter(path: str, power: int | None = 0, is_integer: bool = False, **followers: float) -> Parameter:
-    return Parameter(
-        _place(path), power, is_integer, {_place(name.replace("__", ".")): f for name, f in followers.items()}
-    )
 
 
 class Named(NamedTuple):
@@ -392,7 +408,8 @@ class SurfaceType:
                     owner.setdefault(place.path[-1], []).append(number)
                 else:
                     owner[place.path[-1]] = int(number) if parameter.is_integer else number
-        pose = pose_of(values["before"])
+        tilts_first = bool(values["before"].pop("tilts_first", 0))
+        pose = pose_of(values["before"], tilts_first=tilts_first)
         fields = {"is_break": True, "before": pose} if self.is_break else {}
         if pose is not None and not self.is_break:
             fields |= {"before": pose, "after": undone(pose)}
@@ -477,9 +494,19 @@ class SurfaceType:
         return tuple(Named(names[place], factor) for place, factor in factors.items() if place in names), like
 
 
+def _parameters(first: int, *rows: tuple) -> dict[int, Parameter]:
+    """PARM from `first` on, a row each: its place, then as the fields of `Parameter`, followers by their places."""
+    parameters = {}
+    for j, (path, *more) in enumerate(rows, first):
+        power, followers = more[0] if more else 0, more[1] if len(more) > 1 else {}
+        places = {_place(follower): factor for follower, factor in followers.items()}
+        parameters[j] = Parameter(_place(path), power if power != "switch" else 0, power == "switch", places)
+    return parameters
+
+
 def _coefficients(first: int, powers: Sequence[int | None]) -> dict[int, Parameter]:
     """PARM that are coefficients, from `first` on, by the power of length of each."""
-    return {j: _parameter(f"coefficients.{k}", power) for k, (j, power) in enumerate(enumerate(powers, first))}
+    return _parameters(first, *((f"coefficients.{k}", power) for k, power in enumerate(powers)))
 
 
 _ROUND = ("curvature", "conic", "coefficients")
@@ -489,10 +516,6 @@ _POLARISATION = dict.fromkeys(range(1, 9), "polarisation; its plane refracts as 
 
 def _unknown_mode(number: float) -> str:
     return "" if number in (0, 1, 2, 3) else f"an OPD mode of {number:g}, expected 0, 1, 2 or 3"
-
-
-def _unknown_order(numbers: Numbers) -> str:
-    return "" if numbers.at(6) in (0, 1) else f"of order {numbers.at(6):g} (PARM 6; 0 and 1 are known)"
 
 
 def _unsized(numbers: Numbers) -> str:
@@ -530,7 +553,7 @@ def _round(name: str) -> SurfaceType:
 
 def _diffractive(name: str, phase: type, most: int) -> SurfaceType:
     """A phase of coefficients, radius and order (PARM 0), with even terms."""
-    parameters = {0: _parameter("phase.order"), **_EVEN}
+    parameters = _parameters(0, ("phase.order",)) | _EVEN
     return SurfaceType(name, (*_ROUND, "phase"), parameters, part=phase, terms=0, most=most, objection=_no_order)
 
 
@@ -541,7 +564,7 @@ _TYPES = {
     "TILTSURF": SurfaceType(
         "tilted",
         ("sag_terms",),
-        {1: _parameter("sag_terms.tan_x"), 2: _parameter("sag_terms.tan_y")},
+        _parameters(1, ("sag_terms.tan_x",), ("sag_terms.tan_y",)),
         part=TiltSag,
         amplitudes=(1, 2),
     ),
@@ -562,7 +585,7 @@ _TYPES = {
     "FZERNSAG": SurfaceType(
         "Zernike fringe sag",
         (*_ROUND, "sag_terms"),
-        {**_EVEN, 9: _parameter("sag_terms.centre_x", 1), 10: _parameter("sag_terms.centre_y", 1)},
+        _EVEN | _parameters(9, ("sag_terms.centre_x", 1), ("sag_terms.centre_y", 1)),
         unused={0: "whether the sag ends with its terms' disc; it continues"},
         part=FringeSag,
         terms=1,
@@ -571,16 +594,14 @@ _TYPES = {
     "IRREGULA": SurfaceType(
         "irregular",
         ("curvature", "conic", "sag_terms"),
-        {
-            1: _parameter("before.x", 1, after__x=-1.0),
-            2: _parameter("before.y", 1, after__y=-1.0),
-            3: _parameter("before.tilt_x", 0, after__tilt_x=-1.0),
-            4: _parameter("before.tilt_y", 0, after__tilt_y=-1.0),
-            5: _parameter("sag_terms.spherical", 1),
-            6: _parameter("sag_terms.astigmatism", 1),
-            7: _parameter("sag_terms.coma", 1),
-            8: _parameter("sag_terms.angle"),
-        },
+        _parameters(
+            1,
+            ("before.x", 1, {"after.x": -1.0}),
+            ("before.y", 1, {"after.y": -1.0}),
+            ("before.tilt_x", 0, {"after.tilt_x": -1.0}),
+            ("before.tilt_y", 0, {"after.tilt_y": -1.0}),
+            *(("sag_terms.spherical", 1), ("sag_terms.astigmatism", 1), ("sag_terms.coma", 1), ("sag_terms.angle",)),
+        ),
         part=IrregularSag,
         amplitudes=(5, 6, 7),
         objection=_unsized,
@@ -588,41 +609,31 @@ _TYPES = {
     "COORDBRK": SurfaceType(
         "coordinate break",
         (),
-        {
-            1: _parameter("before.x", 1),
-            2: _parameter("before.y", 1),
-            3: _parameter("before.tilt_x"),
-            4: _parameter("before.tilt_y"),
-            5: _parameter("before.tilt_z"),
-            6: _parameter("before.tilts_first", is_integer=True),
-        },
-        beyond=_unknown_order,
+        _parameters(
+            1,
+            *(("before.x", 1), ("before.y", 1), ("before.tilt_x",), ("before.tilt_y",), ("before.tilt_z",)),
+            ("before.tilts_first", "switch"),
+        ),
+        beyond=lambda n: "" if n.at(6) in (0, 1) else f"of order {n.at(6):g} (PARM 6; 0 and 1 are known)",
         is_break=True,
     ),
     "DGRATING": SurfaceType(
         "diffraction grating",
         ("curvature", "conic", "phase"),
-        {1: _parameter("phase.frequency"), 2: _parameter("phase.order")},
+        _parameters(1, ("phase.frequency",), ("phase.order",)),
         part=Grating,
     ),
     "PARAXIAL": SurfaceType(
         "paraxial lens",
         ("phase",),
-        {
-            1: _parameter("phase.power_x", INVERSE, phase__power_y=1.0),
-            2: _parameter("phase.opd_mode", is_integer=True),
-        },
+        _parameters(1, ("phase.power_x", INVERSE, {"phase.power_y": 1.0}), ("phase.opd_mode", "switch")),
         part=IdealLens,
         objection=_no_focal_length,
     ),
     "PARAX_XY": SurfaceType(
         "paraxial XY",
         ("phase",),
-        {
-            1: _parameter("phase.power_x", -1),
-            2: _parameter("phase.power_y", -1),
-            3: _parameter("phase.opd_mode", is_integer=True),
-        },
+        _parameters(1, ("phase.power_x", -1), ("phase.power_y", -1), ("phase.opd_mode", "switch")),
         part=IdealLens,
         objection=lambda numbers: _unknown_mode(numbers.at(3)),
     ),
@@ -632,12 +643,11 @@ _TYPES = {
     "HOLOGRM2": SurfaceType(
         "hologram 2",
         ("phase",),
-        {
-            **{1 + k: _parameter(f"phase.first.{k}", 1) for k in range(3)},
-            **{4 + k: _parameter(f"phase.second.{k}", 1) for k in range(3)},
-            7: _parameter("phase.wavelength"),
-            8: _parameter("phase.order"),
-        },
+        _parameters(
+            1,
+            *((f"phase.{beam}.{k}", 1) for beam in ("first", "second") for k in range(3)),
+            *(("phase.wavelength",), ("phase.order",)),
+        ),
         part=Hologram,
         objection=_no_construction,
         flat=True,
@@ -676,29 +686,12 @@ def type_of(surface: Surface) -> str | None:
 # -- poses ------------------------------------------------------------------------------------------------------------
 
 
-def pose_of(numbers: Mapping[str, float]) -> Pose | None:
-    """The pose of decentres x, y in mm and tilts about x, y, z in degrees; numbers that are 0 are not modelled.
-
-    tilts_first: the order.
-    """
-    modelled = {name: double(number) for name, number in numbers.items() if number and name != "tilts_first"}
-    return Pose(**modelled, tilts_first=numbers.get("tilts_first", 0) != 0) if modelled else None
-
-
 def poses_are_parameters(surface: Surface) -> bool:
-    """Whether an irregular surface has a pose that its parameters hold: decentres, then tilts about x and y, undone
-    behind the surface."""
+    """Whether an irregular surface has a pose that its parameters hold, and that is undone behind the surface."""
     before, after = surface.before, surface.after
     if not isinstance(surface.sag_terms, IrregularSag) or before is None or after is None:
         return False
-    if before.tilts_first or before.z is not None or before.tilt_z is not None or not after.tilts_first:
-        return False
-    inverse_pose = undone(before)
-    for name in ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z"):
-        a, b = getattr(inverse_pose, name), getattr(after, name)
-        if (a is None) != (b is None) or (a is not None and not torch.equal(a, b)):
-            return False
-    return True
+    return not before.tilts_first and before.z is None and before.tilt_z is None and same(undone(before), after)
 
 
 def poses(block: Block, millimetres: float) -> dict[str, Pose]:
@@ -710,18 +703,15 @@ def poses(block: Block, millimetres: float) -> dict[str, Pose]:
     fields = {}
     for record in block.all("SCBD"):
         where = record.integer(0, "side of the tilt", 0)
-        numbers = [record.number(k, "tilt or decentre", 0.0) for k in range(3, 8)]
+        numbers = [measured(record, k, "tilt or decentre", millimetres, 0.0) for k in range(3, 8)]
         if where == 3 or not any(numbers):
             continue
         order = record.number(1, "order")
         if where not in (1, 2) or order not in (0, 1):
             message = f"tilt or decentre of the surface (SCBD {where:g} of order {order:g}) is not modelled"
             raise UnsupportedSurface(f"{message}; known are SCBD 1 and 2 of order 0 and 1", record.place)
-        x, y, tilt_x, tilt_y, tilt_z = numbers
-        fields["before" if where == 1 else "after"] = pose_of(
-            {"x": x * millimetres, "y": y * millimetres, "tilt_x": tilt_x, "tilt_y": tilt_y, "tilt_z": tilt_z}
-            | {"tilts_first": order}
-        )
+        named = dict(zip(("x", "y", "tilt_x", "tilt_y", "tilt_z"), numbers, strict=True))
+        fields["before" if where == 1 else "after"] = pose_of(named, tilts_first=order == 1)
     return fields
 
 
@@ -890,12 +880,12 @@ def build(
             raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", thickness.place)
         distance = float("inf")
     else:
-        distance = thickness.number(0, "thickness") * millimetres
+        distance = measured(thickness, 0, "thickness", millimetres)
     kind, fields = type_name(block), {}
     row = types()[kind]
     if "curvature" in row.holds:
         fields["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)
-        fields["conic"] = _nonzero(block, "CONI", "conic constant", 1.0)
+        fields["conic"] = _nonzero(block, "CONI", "conic constant", millimetres)
     if row.is_break:
         for keyword in ("GLAS", *aperture_keywords()):
             record = block.last(keyword)
@@ -922,16 +912,15 @@ def build(
     )
 
 
-def _nonzero(block: Block, keyword: str, quantity: str, divisor: float) -> Tensor | None:
+def _nonzero(block: Block, keyword: str, quantity: str, millimetres: float) -> Tensor | None:
     record = block.last(keyword)
-    number = record.number(0, quantity) / divisor if record else 0.0
-    return double(number) if number else None
+    return nonzero(measured(record, 0, quantity, millimetres)) if record else None
 
 
 def semi_diameter(block: Block, millimetres: float) -> float | None:
     """DIAM, which is a semi-diameter, in mm; None if absent or 0 (left to be computed)."""
     record = block.last("DIAM")
-    size = record.number(0, "semi-diameter") * millimetres if record and record.words else 0.0
+    size = measured(record, 0, "semi-diameter", millimetres) if record and record.words else 0.0
     if size < 0:
         raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
     return size or None
@@ -1011,14 +1000,12 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
             report.warn(message, record.place)
             return ()
     else:
-        sizes = tuple(record.number(k, "size of the aperture") * millimetres for k in range(count))
+        sizes = tuple(measured(record, k, "size of the aperture", millimetres) for k in range(count))
     if record.keyword == "FLAP":
         sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
-    if SHAPES[shape].objection(sizes):
-        raise LensFileError(f"{record.keyword} {SHAPES[shape].objection(sizes)}", record.place)
-    centre = block.last("OBDC")
-    x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
-    return (Aperture(shape, sizes, obscures, (x, y)),)
+    at = block.last("OBDC")
+    centre = tuple(measured(at, axis, "decentre", millimetres) for axis in (0, 1)) if at else (0.0, 0.0)
+    return (clear_aperture(shape, sizes, obscures, centre, record.keyword, record.place),)
 
 
 def _corners(records: Sequence[Record], millimetres: float) -> tuple[float, ...]:
@@ -1029,11 +1016,13 @@ def _corners(records: Sequence[Record], millimetres: float) -> tuple[float, ...]
     corners: list[float] = []
     polygon: list[float] = []
     for record in (*(record for record in records if record.integer(0, "number of the point") > 0), None):
-        x, y, other = (record.number(k, "point of the aperture", 0.0) for k in (1, 2, 3)) if record else (0, 0, 0)
+        x, y, other = (
+            (measured(record, k, "point of the aperture", millimetres, 0.0) for k in (1, 2, 3)) if record else (0, 0, 0)
+        )
         if other:
             return ()
         if (x, y) != (0, 0):
-            polygon += [x * millimetres, y * millimetres]
+            polygon += [x, y]
         elif polygon:
             corners += [*polygon, *polygon[:2]]
             polygon = []

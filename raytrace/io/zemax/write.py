@@ -16,9 +16,9 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.io.assembly import catalogs_needed, is_code, is_left_out, listed_name
-from raytrace.io.report import Draft
 from raytrace.io.source import (
     MILLIMETRES,
+    Draft,
     LensFileError,
     Place,
     Record,
@@ -54,6 +54,7 @@ from raytrace.io.zemax.surfaces import (
     FIELDS_IN_LISTS,
     INVERSE,
     NOTE_PIECE,
+    POWERS,
     SYSTEM_APERTURES,
     Sections,
     SurfaceType,
@@ -304,22 +305,10 @@ def _corners(sizes: Sequence[str], place: Place) -> list[str]:
 
 # -- the unit of length -----------------------------------------------------------------------------------------------
 
-#: Powers of length of the words of a line, from 1, by its keyword; others have none.
-_POWERS = {
-    "ENPD": {1: 1},
-    "SDMA": {3: 1},
-    "CURV": {1: -1},
-    "DISZ": {1: 1},
-    "DIAM": {1: 1},
-    "VDSZ": {1: 1, 2: 1},
-    "PZUP": {3: 1},
-    "OBDC": {1: 1, 2: 1},
-    "UDAD": {2: 1, 3: 1},
-    "SCBD": {4: 1, 5: 1},
-    **{
-        keyword: {k: power for k, power in enumerate(row.powers, 1 + row.from_surface) if power}
-        for keyword, row in THICKNESS_SOLVES.items()
-    },
+#: Powers of length of the numbers of solves, by their keywords.
+_SOLVES = {
+    keyword: {k: power for k, power in enumerate(row.powers, 1 + row.from_surface) if power}
+    for keyword, row in THICKNESS_SOLVES.items()
 }
 
 
@@ -362,13 +351,13 @@ def _powers_of(words: list[str], row: SurfaceType, angles: bool) -> dict[int, in
         return {2: power} if power else {}
     if keyword == "CURV" and len(words) > 3 and int(words[2]) in CURVATURE_SOLVES:
         solved = CURVATURE_SOLVES[int(words[2])].powers
-        return _POWERS["CURV"] | {k: power for k, power in enumerate(solved, 3) if power}
+        return POWERS["CURV"] | {k: power for k, power in enumerate(solved, 3) if power}
     if keyword in (FIELD_LISTS["x"].keywords[0], FIELD_LISTS["y"].keywords[0]):
         return {} if angles else dict.fromkeys(range(1, len(words)), 1)
     if keyword == "FEFD":
         return {} if angles else {1: 1, 2: 1}
     shape, _ = aperture_keywords().get(keyword, ("", False))
-    return dict.fromkeys(range(1, 1 + (SHAPES[shape].sizes or 0)), 1) if shape else _POWERS.get(keyword, {})
+    return dict.fromkeys(range(1, 1 + (SHAPES[shape].sizes or 0)), 1) if shape else (POWERS | _SOLVES).get(keyword, {})
 
 
 def in_file(word: str, power: int | None, millimetres: float) -> str:

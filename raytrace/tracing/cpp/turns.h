@@ -10,7 +10,7 @@ namespace raytrace {
 
 constexpr int kTurn = -1;         // as a kind of surface
 constexpr int kTurnNumbers = 13;  // its terms: R by rows, t, the path
-static_assert(kTurnNumbers <= kTerms, "the numbers of a turn are told as the terms of a surface");
+static_assert(kTurnNumbers <= kTerms, "the numbers of a turn are stored as the terms of a surface");
 
 template <typename T, bool path>
 int turn(const Rays<T>& from, Rays<T>& to, Notes<T>&, int n, const Surface<T>& s) {

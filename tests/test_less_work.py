@@ -1,27 +1,24 @@
-"""Less work: what reuse, planes, symmetry and shared parts save, each beside the same result found without it.
-
-Every case is a pair of calls that return the same numbers. They are timed in turns, by processor time of one thread in
-float64, so that a gain is that of the work that is left out, not of the machine.
-"""
+"""Less work: reuse, planes, symmetry and shared parts give the same numbers as all of the work."""
 
 import dataclasses
 import functools
-import statistics
 from collections.abc import Callable, Sequence
 
+import pytest
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import field_rays, in_turns, nothing, slope, with_leaf, with_sensor_leaf
+from raytrace.bench.measure import field_rays, slope, with_leaf
+from raytrace.bench.speed import with_sensor_leaf
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import sobol
-from raytrace.psf_models import model_of, psf
-from raytrace.shards import torch_threads
+from raytrace.psf_models import MODELS, fourier, model_of, psf
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import prepare, trace_engine
-from raytrace.tracing.scene import Memo, trace_bundle
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.scene import Memo, scene, symmetry, trace_bundle
 from raytrace.tracing.trace import trace_lens
 
 SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it
@@ -29,66 +26,14 @@ FIELD = 10.0  # degrees
 _WAVELENGTHS = 0.48, 0.51, 0.53, 0.58, 0.64  # µm
 _FINITE = 10e3, 50e3  # mm, of object distances
 _ORDERS = {"gaussian": 4, "drt": 4, "wave": 0}
+ROUNDING = 1e-10  # of sums of kernels and gradients; a kernel 1e-12 degrees off the axis moves by 3e-11 of itself
+#: Kernels by two rules of one order: differences of the errors that order leaves.
+RULES = {"drt": 1e-3, "wave": 1e-3}
 
 
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """The same numbers with less work and with all of it. engine: of the trace, "auto" for the program's choice."""
-
-    what: str
-    engine: str
-    less: Callable[[], Tensor]
-    full: Callable[[], Tensor]
-
-
-@dataclasses.dataclass(frozen=True)
-class Gain:
-    """One row. seconds: medians, with less work and with all of it; gain: their ratio.
-
-    error: Σ |less - full| / Σ |full| of the numbers that both return.
-    """
-
-    what: str
-    engine: str
-    seconds: float
-    seconds_without: float
-    gain: float
-    error: float
-
-
-def measure(sizes, *, repeats: int, progress: Callable[[str], object] = nothing) -> list[Gain]:
-    """A row for every case; progress: called with each before it is measured, `len(cases(sizes))` times."""
-    rows = []
-    with torch_threads(1):
-        for case in cases(sizes):
-            progress(case.what)
-            rows.append(_gain(case, repeats))
-    return rows
-
-
-def cases(sizes) -> list[Case]:
-    """All of them (sizes: `speed.Sizes`); nothing is traced before a case is called. Without a compiler those of the
-    compiled trace lack."""
-    engines = ["compiled", "eager"] if prepare() == "compiled" else ["eager"]
-    found = [Case(what, engine, *pair) for engine in engines for what, pair in _traced(sizes.less).items()]
-    others = _kernel_cases(sizes.distances) | _launched(sizes.less)
-    return [*found, *(Case(what, "auto", *pair) for what, pair in sorted(others.items(), key=_kind))]
-
-
-def _kind(case: tuple[str, object]) -> int:
-    return ("symmetry", "wavelengths", "object distances").index(case[0].partition(":")[0])
-
-
-def _gain(case: Case, repeats: int) -> Gain:
-    with trace_engine(case.engine):
-        less, full = case.less(), case.full()
-        taken = in_turns({one: (one, nothing) for one in (case.less, case.full)}, repeats=repeats, threads=1)
-        seconds, without = (statistics.median(one) for one in taken.values())
-    error = float((less - full).abs().sum() / full.abs().sum())
-    return Gain(case.what, case.engine, seconds, without, without / seconds, error)
-
-
-# -- traced: prefix and planes -----------------------------------------------------------------------------------------
+def bound(what):
+    is_rule = what.startswith("symmetry")
+    return next((most for model, most in RULES.items() if is_rule and f"{model} " in what), ROUNDING)
 
 
 def double_gauss() -> Lens:
@@ -208,3 +153,101 @@ def _kernels(
 @functools.cache
 def _focused() -> Lens:
     return with_object_distance(double_gauss(), 25e3)
+
+
+def cases(count: int, distances: int) -> list[tuple[str, str, Callable, Callable]]:
+    """(engine, words, with less work, with all of it)."""
+    engines = ["compiled", "eager"] if prepare() == "compiled" else ["eager"]
+    found = [(engine, what, *pair) for engine in engines for what, pair in _traced(count).items()]
+    return found + [("auto", what, *pair) for what, pair in (_kernel_cases(distances) | _launched(count)).items()]
+
+
+CASES = cases(64, 2)
+
+
+@pytest.mark.parametrize(("engine", "what", "less", "full"), CASES, ids=[f"{case[0]} {case[1]}" for case in CASES])
+def test_less_work_gives_the_same_result(engine, what, less, full):
+    with trace_engine(engine):
+        for _ in range(2):  # a Memo is filled by the first call
+            a, b = less(), full()
+            assert a.shape == b.shape
+            assert float(b.abs().sum()) > 0
+            assert float((a - b).abs().sum() / b.abs().sum()) < bound(what)
+
+
+@pytest.mark.parametrize(("number", "again"), [(None, 1), (11, 2)])
+def test_memo_of_the_cases_traces_only_what_moves(number, again):
+    """Surfaces crossed by a second call: the image alone, or also the last one before it."""
+    lens, _ = with_sensor_leaf(double_gauss()) if number is None else with_leaf(double_gauss(), 11, "curvature")
+    bundle = (
+        lens,
+        torch.zeros(2, 1, dtype=torch.float64),
+        lens.wavelengths[0],
+        torch.rand(2, 8, dtype=torch.float64) - 0.5,
+    )
+    memo = Memo()
+    trace_bundle(bundle, memo)
+    first = memo.crossed
+    trace_bundle(bundle, memo)
+    assert (first, memo.crossed - first) == (12, again)
+
+
+def test_planes_and_symmetry_are_taken_away():
+    """What the fuller side lacks: without planes there is a root for each surface, off the axis no meridian."""
+    assert sum(surface.is_plane for surface in double_gauss().surfaces[1:]) == 4
+    assert not any(surface.is_plane for surface in with_spheres_for_planes(double_gauss()).surfaces[1:])
+    number = torch.tensor([25e3], dtype=torch.float64)
+    kinds = [
+        symmetry(scene(double_gauss(), torch.tensor([[x], [y]], dtype=torch.float64), number, number * 0 + 0.53))
+        for x, y in ((0.0, 0.0), (SKEW, 0.0), (0.0, FIELD), (FIELD, 0.0))
+    ]
+    assert kinds == ["round", "none", "mirror", "none"]
+
+
+def test_wavelengths_share_all_of_a_launch_but_their_paths():
+    """Bit for bit the rays of each wavelength alone, in a medium that disperses."""
+    lens = with_object_distance(double_gauss(), 25e3)
+    lens = lens.replace(0, glass=lens.surfaces[1].glass)
+    field, pupil = torch.tensor([0.0, 10.0], dtype=torch.float64)[:, None, None], sobol(32)[0]
+    colours = torch.tensor([0.48, 0.53, 0.64], dtype=torch.float64)
+    together = rays_of_field(lens, field, pupil, wavelength=colours[:, None])
+    assert together.position.shape == together.direction.shape == (3, 1, 32)
+    assert together.opl.shape == (3, 32)
+    for path, colour in zip(together.opl, colours, strict=True):
+        alone = rays_of_field(lens, field[..., 0], pupil, wavelength=colour)
+        assert torch.equal(together.position[:, 0], alone.position)
+        assert torch.equal(together.direction[:, 0], alone.direction)
+        assert torch.equal(path, alone.opl)
+    assert not torch.equal(together.opl[0], together.opl[2])
+
+
+def test_a_range_of_distances_is_remembered_behind_surfaces_that_do_not_bend():
+    """There the wavelengths still share their rays, but not their paths."""
+    lens = with_object_distance(double_gauss(), torch.tensor([12e3, 40e3], dtype=torch.float64)[:, None, None, None])
+    gap = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    dummy = dataclasses.replace(lens.surfaces[6], thickness=gap)
+    lens = dataclasses.replace(lens, surfaces=(lens.surfaces[0], dummy, *lens.surfaces[1:]), stop=1)
+    colours = torch.tensor([0.48, 0.64], dtype=torch.float64)[:, None]
+    bundle = lens, torch.zeros(2, 1, 1, 1, dtype=torch.float64), colours, sobol(8)[0]
+    memo = Memo(object_distances=(10e3, 50e3))
+    with trace_engine("eager"):
+        kept, traced = trace_bundle(bundle, memo), trace_bundle(bundle)
+    assert [(stored.result.count, stored.result.smooth) for stored in memo._stored] == [(1, True)]
+    assert float((kept.position - traced.position).detach().abs().max()) < 1e-8  # mm
+    assert float((kept.opl - traced.opl).detach().abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize(("varies", "again"), [(False, 0), (True, 1)])
+def test_a_tolerance_computes_an_order_twice_only_for_a_derivative(monkeypatch, varies, again):
+    orders = []
+
+    def counted(batch, pixels, *, order, zernike):
+        orders.append(order)
+        return fourier.kernels(batch, pixels, order=order, zernike=zernike)
+
+    monkeypatch.setitem(MODELS, "fourier", dataclasses.replace(MODELS["fourier"], kernels=counted))
+    lens, leaf = with_sensor_leaf(with_object_distance(double_gauss(), 25e3))
+    leaf.requires_grad_(varies)
+    found = psf(lens, "fourier", fields=torch.zeros(2, 1, dtype=torch.float64), tol=1e-2)
+    assert len(orders) - len(set(orders)) == again
+    assert found.kernel.requires_grad == varies

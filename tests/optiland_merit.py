@@ -1,37 +1,30 @@
-"""Optiland as an optimiser: its sample lenses with one merit function that is told alike in both programs.
+"""A merit function of Optiland's sample lenses, in Optiland and in this package.
 
     M² = Σ w (v - t)² / Σ w
 
 over rows of lens files: TRAC, the distance of a ray on the image from the centroid of its field, at the points of a
-Gaussian quadrature of the pupil and of half of it off the axis, and EFFL. Optiland has no such operand: it is told by
-its own registry of operands, so that all rays of a wavelength are traced in one call of `trace_generic`, and
-posed in two ways whose squares sum up to the same M²:
+Gaussian quadrature of the pupil and of half of it off the axis, and EFFL. In Optiland it is an operand of its registry,
+so that all rays of a wavelength are traced in one call of `trace_generic`, in two forms whose squares sum to M²:
 
-    "rays": a residual for x and y of every ray, what least squares does best with;
-    "spots": the root mean square of every field and wavelength, as Optiland's tutorials pose it.
+    "rays": a residual for x and y of every ray;
+    "spots": the root mean square of every field and wavelength, as in Optiland's tutorials.
 
-Variables, their scales, the focal length, the solvers and their derivatives (differences in least squares, autograd in
-Adam) are Optiland's own. What it ends at is brought back as a lens, whose merit is told by this package's rays as well.
-
-Importing this file imports Optiland: it needs the extra [bench].
+Importing this file imports Optiland.
 """
 
 import dataclasses
 import math
-import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import optiland.backend as be
 import torch
 from optiland.optic import Optic
-from optiland.optimization import LeastSquares, OptimizationProblem, TorchAdamOptimizer
+from optiland.optimization import OptimizationProblem
 from optiland.optimization.operand.operand import operand_registry
 from optiland.samples.objectives import CookeTriplet, DoubleGauss
 from torch import Tensor
 
-from raytrace.bench.report import table
 from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.pupil import gauss_legendre
 from raytrace.system.lens import Fields, Lens, SystemAperture
@@ -43,7 +36,6 @@ from raytrace.tracing.trace import trace_lens
 
 RINGS, ARMS = 3, 6
 AGREE = 1e-9  # of the merits of both programs, relative
-_POSED = ("rays", "spots")
 _APERTURES = {"EPD": "entrance_pupil_diameter", "imageFNO": "image_f_number"}
 
 #: Optiland's sample, its variable radii and thicknesses by surface, and the focal length to be held, mm.
@@ -55,7 +47,7 @@ PROBLEMS: dict[str, tuple[type[Optic], tuple[int, ...], tuple[int, ...], float]]
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What both programs are given.
+    """A problem for both programs.
 
     lens: Optiland's at the start, with variables and rows; moved: by how much, as a part of itself, every
     variable was moved up and down in turn from the sample. merit_in_optiland: M² at the start.
@@ -72,36 +64,6 @@ class Problem:
         """Optiland's lens at the start, in the back end that is set."""
         sample, radii, thicknesses, _ = PROBLEMS[self.name]
         return _moved(sample(), radii, thicknesses, self.moved)
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What an optimiser did.
-
-    history: (processor seconds since the start, M²) of every evaluation, differences included; seconds: processor time,
-    wall: time of day; start, end: M²; lens: where it ended; end_here: M² there by this package's rays.
-    """
-
-    problem: Problem
-    method: str
-    history: tuple[tuple[float, float], ...]
-    seconds: float
-    wall: float
-    start: float
-    end: float
-    lens: Lens
-    end_here: float
-
-    @property
-    def evaluations(self) -> int:
-        return len(self.history)
-
-    def seconds_to(self, merit: float) -> float:
-        """Processor seconds until M² was first at most this; inf if never."""
-        return next((seconds for seconds, found in self.history if found <= merit), math.inf)
-
-
-# -- what is told to both ----------------------------------------------------------------------------------------------
 
 
 def problem(name: str, *, moved: float = 0.0) -> Problem:
@@ -214,7 +176,7 @@ def _real(numbers) -> Tensor:
     return torch.as_tensor(numbers, dtype=torch.float64)
 
 
-# -- what Optiland makes of it -----------------------------------------------------------------------------------------
+# -- Optiland ----------------------------------------------------------------------------------------------------------
 
 
 class _Shared:
@@ -236,7 +198,7 @@ class _Shared:
         spots = [(h, k) for h in np.unique(height) for k in np.unique(colour)]
         share = np.array([weight * (height == h) * (colour == k) for h, k in spots])
         self.mean, self.share = be.array(mean), be.array(share / sum(row.weight for row in rows))
-        self.tell = {"rays": self._rays, "spots": self._spots}[how]
+        self.evaluate = {"rays": self._rays, "spots": self._spots}[how]
         total = sum(row.weight for row in rows)
         self.weights = [1.0] * len(spots) if how == "spots" else np.tile(np.sqrt(weight / total), 2).tolist()
         self.values: object = None
@@ -244,7 +206,7 @@ class _Shared:
     def at(self, place: int):
         """One number of them, traced anew with the first: Optiland evaluates operands in order."""
         if place == 0:
-            self.values = self.tell()
+            self.values = self.evaluate()
         return self.values[place]
 
     def _on_image(self):
@@ -280,91 +242,3 @@ def posed(optic: Optic, rows: Sequence[Row], variables: Sequence[Vary], how: str
         kind = {"curvature": "radius", "thickness": "thickness"}[vary.quantity]
         found.add_variable(optic, kind, surface_number=vary.surface)
     return found
-
-
-class _Followed(LeastSquares):
-    """Optiland's least squares, with what every evaluation found and when."""
-
-    def __init__(self, problem: OptimizationProblem):
-        super().__init__(problem)
-        self.history: list[tuple[float, float]] = []
-        self.began = time.process_time()
-
-    def _compute_residuals_vector(self, x):
-        found = super()._compute_residuals_vector(x)
-        self.history.append((time.process_time() - self.began, float(found @ found)))
-        return found
-
-
-def least_squares(
-    problem: Problem, how: str = "rays", *, tolerance: float = 1e-3, scaled: bool = False, most: int | None = None
-) -> Run:
-    """Optiland's Levenberg-Marquardt (MINPACK's, by differences), numpy back end.
-
-    tolerance: of the sum of squares, 1e-3 by its default; scaled: whether variables are scaled by their columns of the
-    Jacobian; most: steps, as many as it likes by default.
-    """
-    be.set_backend("numpy")
-    optic = problem.optic()
-    asked = posed(optic, problem.rows, problem.variables, how)
-    start = float(asked.sum_squared())  # warms its compiled loops as well
-
-    def solve() -> list[tuple[float, float]]:
-        solver = _Followed(asked)
-        solver.optimize(tol=tolerance, x_scale="jac" if scaled else None, maxiter=most)
-        return solver.history
-
-    name = f"least squares, {how}, tolerance {tolerance:g}{', scaled' * scaled}"
-    return _run(problem, name, optic, start, solve, lambda: float(asked.sum_squared()))
-
-
-def adam(problem: Problem, steps: int, how: str = "spots", *, rate: float = 1e-2, decay: float = 0.99) -> Run:
-    """Optiland's Adam on its torch back end in float64; rate and decay: 1e-2 and 0.99 are its defaults."""
-    be.set_backend("torch")
-    be.set_precision("float64")
-    be.grad_mode.disable()
-    optic = problem.optic()
-    be.grad_mode.enable()
-    try:
-        asked = posed(optic, problem.rows, problem.variables, how)
-        start = float(asked.sum_squared())
-
-        def solve() -> list[tuple[float, float]]:
-            history, began = [], time.process_time()
-            note = lambda _, merit: history.append((time.process_time() - began, merit))  # noqa: E731
-            TorchAdamOptimizer(asked).optimize(n_steps=steps, lr=rate, gamma=decay, disp=False, callback=note)
-            return history
-
-        name = f"Adam, {how}, {steps} steps of {rate:g} · {decay:g}ⁿ"
-        return _run(problem, name, optic, start, solve, lambda: float(asked.sum_squared()))
-    finally:
-        be.grad_mode.disable()
-        be.set_backend("numpy")
-
-
-def _run(problem: Problem, name: str, optic: Optic, start: float, solve: Callable, merit: Callable) -> Run:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        began, processor = time.perf_counter(), time.process_time()
-        history = solve()
-        seconds, wall = time.process_time() - processor, time.perf_counter() - began
-    lens = lens_of(optic)
-    end_here = float(merit_of(lens, problem.rows))
-    return Run(problem, name, tuple(history), seconds, wall, start, merit(), lens, end_here)
-
-
-def report(runs: Sequence[Run]) -> list[str]:
-    """A table of them."""
-    columns = {
-        "lens": lambda run: run.problem.name,
-        "variables": lambda run: str(len(run.problem.variables)),
-        "start": lambda run: f"sample ± {run.problem.moved:.0%}" if run.problem.moved else "sample",
-        "Optiland's": lambda run: run.method,
-        "M² before": lambda run: f"{run.start:.5g}",
-        "M² after": lambda run: f"{run.end:.6g}",
-        "the same here": lambda run: f"{run.end_here:.6g}",
-        "evaluations": lambda run: str(run.evaluations),
-        "processor s": lambda run: f"{run.seconds:.2f}",
-        "wall s": lambda run: f"{run.wall:.2f}",
-    }
-    return table(columns, runs)

@@ -1,0 +1,201 @@
+"""Optimisation of lens files by their own merit functions: how far and how fast, and the cost of derivatives.
+
+    python docs/experiments/bench_optimise.py FILE … --docs docs
+
+Files are optimised from their stored state, and from a start where every variable is moved by up to 5 %. An oracle.json
+in the folder of a file has the results of an independent program: merits as stored, the best, and the moved start.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+import statistics
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import bench_kit as kit
+import numpy as np
+from matplotlib.figure import Figure
+
+from raytrace.bench.report import Measured, Request, digits, in_words, table
+from raytrace.cli.progress import progress
+from raytrace.io import read_lens
+from raytrace.optimization.default_merit import DefaultMerit
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.optimize import optimize
+from raytrace.optimization.problem import Problem
+from raytrace.optimization.variables import freedom, name_of
+from raytrace.plotting import style
+from raytrace.system.lens import Lens
+from raytrace.tracing.compiled import prepare
+
+MOST = 10.0  # s a file
+FRACTION = 0.05  # by which variables are moved
+ROUNDING = 1e-6  # lower merits are drawn as this
+
+
+@dataclasses.dataclass(frozen=True)
+class FileRow:
+    """A file: merit as stored, by this package and by the oracle; ends from there and from the moved start."""
+
+    file: str
+    variables: int
+    rows: int
+    stored: float
+    by_oracle: float
+    best_of_oracle: float
+    settled: bool
+    start_moved: float
+    end_stored: float
+    seconds_stored: float
+    end_moved: float
+    seconds_moved: float
+    evaluations_moved: int
+    stopped: str
+
+
+def bench(request: Request) -> Measured:
+    """The files, and the Jacobian of a default merit function."""
+    prepare()
+    files = request.arguments.lenses
+    with progress(len(files), "file", what="optimising") as bar:
+        rows = [_of_file(name, bar) for name in files]
+    forward, whole, variables, rays = _jacobian(request.open_lens("double_gauss"), request.arguments.repeats)
+    about = request.about()
+    lines = [
+        "# Optimisation", "", "    python docs/experiments/bench_optimise.py FILE … --docs docs", "",
+        "Merits are those of the files' own merit functions, M.", "", in_words(about), "",
+        *(_of_files(rows) if rows else ()),
+        "## Derivatives", "",
+        f"Default merit function of the shipped double Gauss, 3 fields and wavelengths, 6 rings and arms, {rays} rays, "
+        f"with {variables} variables: {1e3 * forward:.2f} ms; with the exact Jacobian of all rows "
+        f"{1e3 * whole:.2f} ms, {whole / forward:.1f} times as much.",
+    ]  # fmt: skip
+    document = {"about": about, "forward_s": forward, "jacobian_s": whole}
+    return Measured(rows, lines, document, optimise_figure, ("optimise.md", "optimise"))
+
+
+def _of_file(name: str, bar) -> FileRow:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lens = read_lens(name)
+    known = _oracle(Path(name))
+    free = freedom(lens)
+    model = Model(free.lens, free.variables, free.solves)
+    moved = model.lens_at(model.start * factors(known, [name_of(variable) for variable in free.variables]))
+    stored, from_moved = (optimize(start, seconds=MOST) for start in (lens, moved))
+    bar.update(1)
+    return FileRow(
+        Path(name).name, len(model.variables), sum(row.weight != 0 for row in stored.merit), stored.merit_before,
+        known.get("mf_stored", math.nan), known.get("mf_best", math.nan), known.get("settled", False),
+        from_moved.merit_before, stored.merit_after, stored.seconds, from_moved.merit_after, from_moved.seconds,
+        from_moved.evaluations, from_moved.stopped,
+    )  # fmt: skip
+
+
+def _oracle(path: Path) -> dict:
+    oracle = path.with_name("oracle.json")
+    files = json.loads(oracle.read_text(encoding="utf-8"))["files"] if oracle.exists() else []
+    return next((known for known in files if known["file"] == path.name), {})
+
+
+def factors(known: Mapping, names: Sequence[str]) -> np.ndarray:
+    """By which variables are moved: those of the oracle, else up to 5 % either way."""
+    if not known:
+        return 1 + FRACTION * np.random.default_rng(0).uniform(-1, 1, len(names))
+    stored, start = np.array(known["x_stored"]), np.array(known["from_perturbed"]["x_start"])
+    ratios = np.divide(start, stored, out=np.ones_like(start), where=stored != 0)
+    by_name = dict(zip(map(_name_here, known["variables"]), ratios, strict=True))
+    return np.array([by_name[name] for name in names])
+
+
+def _name_here(variable: str) -> str:
+    """The oracle's `thickness:3` and, for a parameter of a surface, `p:3/2`."""
+    quantity, _, where = variable.partition(":")
+    surface, _, parameter = where.partition("/")
+    return f"a{2 * int(parameter)}_{surface}" if quantity == "p" else f"{quantity}_{surface}"
+
+
+def _jacobian(lens: Lens, repeats: int) -> tuple[float, float, int, int]:
+    """Median seconds of a default merit function of 6 rings and 6 arms, and of it with its derivatives."""
+    lens = lens.at(wavelengths=[0.5876, 0.4861, 0.6563])
+    free = freedom(lens, "curvature thickness")
+    model = Model(free.lens, free.variables[:20], free.solves)
+    problem = Problem(model, DefaultMerit("spot", rings=6).rows(lens))
+    medians = []
+    for derivatives in (False, True):
+        seconds = []
+        for _ in range(10 * repeats):
+            start = time.perf_counter()
+            problem.state(model.start, derivatives)
+            seconds.append(time.perf_counter() - start)
+        medians.append(statistics.median(seconds))
+    return *medians, len(model.variables), sum(row.weight > 0 for row in problem.rows)
+
+
+def _of_files(files: Sequence[FileRow]) -> list[str]:
+    columns = {
+        "file": lambda row: row.file,
+        "variables": lambda row: str(row.variables),
+        "rows": lambda row: str(row.rows),
+        "M stored": lambda row: f"{row.stored:.8g}",
+        "off the oracle's": lambda row: digits(row.stored / row.by_oracle - 1),
+        "end from there": lambda row: f"{row.end_stored:.8g}",
+        "s": lambda row: f"{row.seconds_stored:.2f}",
+        "M moved": lambda row: f"{row.start_moved:.4g}",
+        "end|moved": lambda row: f"{row.end_moved:.8g}",
+        "s|moved": lambda row: f"{row.seconds_moved:.2f}",
+        "evaluations": lambda row: str(row.evaluations_moved),
+        "the oracle's best": lambda row: digits(row.best_of_oracle, ".8g"),
+        "end / best": lambda row: digits(row.end_moved / row.best_of_oracle, ".5f"),
+        "stopped by": lambda row: row.stopped,
+    }
+    return [
+        "## Files with a merit function", "",
+        f"As stored, and from a start where every variable is moved by up to {FRACTION:.0%}; at most {MOST:g} s each. "
+        "Best: the minimum that an independent least squares found from either start in minutes.", "",
+        *table(columns, files), "",
+    ]  # fmt: skip
+
+
+@style.styled
+def optimise_figure(rows: Sequence[Mapping]) -> Figure:
+    """Merit of every file at its moved start and at its end."""
+    figure = style.new_figure(8.0, 1.2 + 0.28 * max(len(rows), 1))
+    panel = figure.subplots()
+    for place, row in enumerate(rows):
+        ends = [max(row[name], ROUNDING) for name in ("start_moved", "end_moved")]
+        panel.plot(ends, [place, place], color=style.FAINT, linewidth=3, zorder=1)
+        panel.plot(ends[0], place, "o", color=style.GREY, label="moved start" if place == 0 else None)
+        panel.plot(ends[1], place, "o", color=style.FIELD_COLOURS[0], label="end" if place == 0 else None)
+        if row["best_of_oracle"] > ROUNDING:
+            label = "best known" if place == 0 else None
+            panel.plot(row["best_of_oracle"], place, "|", color=style.FIELD_COLOURS[2], markersize=11, label=label)
+        words = f"{row['seconds_moved']:.2g} s"
+        panel.annotate(words, (ends[0], place), (6, 0), textcoords="offset points", va="center", fontsize=7)
+    panel.set_yticks(range(len(rows)), [Path(row["file"]).stem[:44] for row in rows])
+    panel.invert_yaxis()
+    panel.set_xscale("log")
+    panel.set_xlim(0.5 * ROUNDING, 2e3)
+    panel.set_xlabel("merit (10⁻⁶: at most that)")
+    panel.grid(axis="x", alpha=0.25)
+    if rows:
+        figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("lenses", metavar="FILE", nargs="*", help="files with a merit function")
+    kit.shared(parser, "optimise.md, optimise.csv and optimise.png")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    kit.run(bench, options, argv, peers=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
