@@ -5,8 +5,8 @@
     >>> float(rt.first_order(lens).effective_focal_length)
     99.5145515665...
 
-The nouns and verbs stand here, each in the room that PUBLIC names, and are imported when first used: `import raytrace`
-alone loads neither torch nor matplotlib nor pandas. A verb that takes a lens takes the path of its file, too, or the
+Public names are imported from the modules that PUBLIC lists when they are first used: `import raytrace`
+alone loads neither torch nor matplotlib nor pandas. A function of a lens also takes the path of its file, or the
 name of a shipped lens (`raytrace.public`).
 """
 

@@ -14,15 +14,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-_OPEN_FILES = "/proc/self/fd"  # where a file without a name is found again to be named
+_OPEN_FILES = "/proc/self/fd"  # the path by which an unnamed file is given a name
 
 
 class NotWritten(UserWarning):
-    """An output could not be written; the work went on without it."""
+    """An output could not be written; the computation continued without it."""
 
 
 def shipped(folder: str) -> Path:
-    """The folder `glass_catalogs` or `lenses`: inside an installed package, beside it in a checkout."""
+    """The folder `glass_catalogs` or `lenses`: inside an installed package, next to it in a checkout."""
     package = Path(__file__).resolve().parent
     installed = package / folder
     return installed if installed.is_dir() else package.parent / folder
@@ -43,14 +43,14 @@ def read_bytes(path: str | os.PathLike, most: int) -> bytes:
 
 
 def encoding(content: bytes) -> str:
-    """How a text is encoded that does not say so: UTF-16 by its mark or its zeros, UTF-8, else Latin-1."""
+    """The encoding of a text: UTF-16 by its mark or its zeros, UTF-8, else Latin-1."""
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     # Lens and glass files are mostly ASCII: in UTF-16 without its mark every second byte of the beginning is zero.
     head = content[: min(len(content), 512) // 2 * 2]
-    for found, zeros in (("utf-16-le", head[1::2].count(0)), ("utf-16-be", head[0::2].count(0))):
+    for codec, zeros in (("utf-16-le", head[1::2].count(0)), ("utf-16-be", head[0::2].count(0))):
         if head and zeros > 0.4 * len(head):
-            return found
+            return codec
     try:
         content.decode("utf-8")
     except UnicodeDecodeError:
@@ -62,10 +62,9 @@ def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None])
     """Replace a file as a whole or not at all: `write` fills a temporary file, which is then renamed.
 
     The temporary file, in the same folder, has no name until it is complete, where the system allows that: a process
-    killed by then leaves
-    nothing behind. What killed processes left otherwise is removed by the next write of the same file. A link is
-    written through. Raises OSError naming `path` where it cannot be written, or is no regular file; what else `write`
-    raises passes through.
+    killed before leaves no file. Other abandoned temporary files are removed by the next write of the same file. A link
+    is written through. Raises OSError naming `path` where it cannot be written, or is no regular file; other errors of
+    `write` pass through.
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
@@ -122,8 +121,8 @@ def _remove_abandoned(target: Path) -> None:
 def append_text(path: str | os.PathLike, text: str, *, end: int | None = None, sync: bool = True) -> None:
     """Append a text in UTF-8 to a file, as a whole or not at all. Raises OSError naming `path`.
 
-    end: the length in bytes that the file is cut to first, of what a killed process began to append; sync: wait until
-    the disk has it.
+    end: length in bytes to which the file is cut first, without the text that a killed process began to append; sync:
+    wait until the text is on the disk.
     """
     try:
         with open(path, "ab", buffering=0) as file:
@@ -143,10 +142,10 @@ def append_text(path: str | os.PathLike, text: str, *, end: int | None = None, s
 
 
 def check_output(path: str | os.PathLike, suffixes: Sequence[str] = ()) -> None:
-    """Refuse a file that cannot be written before the work whose result it is for.
+    """Refuse an output file that cannot be written, before its content is computed.
 
     suffixes: those that are known, all if none are given. Raises ValueError for another suffix, and OSError for a
-    folder that does not exist or cannot be written in, or for what is no regular file.
+    folder that does not exist or is not writable, and for a file that is not regular.
     """
     target = Path(os.path.realpath(path))
     if suffixes and target.suffix.lower() not in suffixes:
@@ -159,17 +158,17 @@ def check_output(path: str | os.PathLike, suffixes: Sequence[str] = ()) -> None:
 
 
 def check_output_folder(path: str | os.PathLike) -> None:
-    """Refuse a folder that can neither be written in nor made, before the work. Raises OSError."""
+    """Refuse an output folder that is not writable and cannot be made, before the computation. Raises OSError."""
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_dir():
         raise OSError(errno.ENOTDIR, "is a file; give the name of a folder to write in", str(path))
-    _check_folder(next(one for one in (target, *target.parents) if one.exists()), path)
+    _check_folder(next(folder for folder in (target, *target.parents) if folder.exists()), path)
 
 
 def _check_folder(folder: Path, path: str | os.PathLike) -> None:
     if not folder.is_dir():
-        found = "is a file, not a folder" if folder.exists() else "does not exist; make it first"
-        raise OSError(errno.ENOENT, f"cannot be written: the folder {folder} {found}", str(path))
+        state = "is a file, not a folder" if folder.exists() else "does not exist; make it first"
+        raise OSError(errno.ENOENT, f"cannot be written: the folder {folder} {state}", str(path))
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, f"cannot be written: no permission to write in {folder}", str(path))
 

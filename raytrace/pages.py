@@ -1,4 +1,4 @@
-"""Pages of results in Markdown: what is measured is written anew, what stands below the mark is kept."""
+"""Pages of results in Markdown: measurements are rewritten, text below the mark is kept."""
 
 import math
 import os
@@ -11,7 +11,7 @@ import torch
 
 from raytrace import files
 
-#: What stands below this line is written by hand: a page that is made again keeps it.
+#: Text below this line is written by hand and kept when a page is made again.
 KEPT = "<!-- kept when this page is made again -->"
 
 #: Rows of one kind as CSV, a column for each of their fields; empty where a quantity does not exist.
@@ -24,7 +24,7 @@ def markdown(parts: Iterable[str], kept: str = "") -> str:
 
 
 def kept_of(page: str) -> str:
-    """What a page made before keeps."""
+    """The text below the mark of a page."""
     return page.partition(KEPT)[2].strip()
 
 
@@ -50,7 +50,7 @@ def shown(value: float, digits: int) -> str:
 
 
 def measured(what: str, about: Mapping[str, str | int]) -> str:
-    """The median of what it is, in one thread, and the machine."""
+    """A caption: the quantity measured, in one thread, and the machine."""
     return f"Median processor time of {what}, one thread; " + ", ".join(f"{name} {one}" for name, one in about.items())
 
 
@@ -60,7 +60,7 @@ def page(lines: Iterable[str], kept: str) -> str:
 
 
 def machine() -> dict[str, str | int]:
-    """What the figures depend on beside the code."""
+    """The machine and the versions on which the measurements depend."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,

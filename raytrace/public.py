@@ -1,4 +1,4 @@
-"""The verbs as the package exports them: a path serves as a lens, one number as a list of one, `field` as `fields`.
+"""Public functions as the package exports them: paths as lenses, single numbers as lists, `field` as `fields`.
 
 Other values of the wrong kind are refused. Calls inside the package do not pass through here.
 """
@@ -38,7 +38,7 @@ _KINDS = {
 
 @functools.cache
 def public(function: Callable, name: str) -> Callable:
-    """A verb as `raytrace` exports it under a name, with the signature and the text of the function.
+    """A public function as `raytrace` exports it under a name, with the signature and the text of the function.
 
     It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
     and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for

@@ -21,13 +21,13 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.environment import Environment
 from raytrace.maths import pupil, zernike
 from raytrace.psf_models import wave
-from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture
+from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, scene
-from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.trace import steps, trace_lens
 from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of
 
 ORACLE = Path(__file__).parent / "oracles" / "opticstudio.json.gz"

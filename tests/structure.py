@@ -17,7 +17,8 @@ import torch
 from test_layers import FLOORS
 
 import raytrace as rt
-from raytrace.tracing.trace import cross, media
+from raytrace.system.lens import media
+from raytrace.tracing.trace import cross
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Rooms that nothing imports: experiments and measurements, no part of the library.

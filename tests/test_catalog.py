@@ -408,8 +408,8 @@ def test_the_edition_of_a_glass_is_told(tmp_path):
     """By the sources of a shipped glass, by the comment of a user's one; and where a newer edition is in use."""
     assert re.match(r"date not stated; \d+ sources agree: .*SCHOTT", catalogs.edition(find_glass("N-BK7"))[0])
     for (catalog, name), (newer, _) in catalogs.OLDER_EDITIONS.items():
-        told = catalogs.edition(find_glass(name, catalogs=[catalog]))
-        assert newer in told[-1]
+        edition = catalogs.edition(find_glass(name, catalogs=[catalog]))
+        assert newer in edition[-1]
     assert len(catalogs.edition(find_glass("H-K9L"))) == 1
     own = tmp_path / "OWN.AGF"
     own.write_text("NM MINE 1 517642 1.5 60 0 1\nGC melt of March\nCD 2.25 0 0 0 0 0 0 0 0 0\nLD 0.4 0.7\n")

@@ -37,9 +37,9 @@ def test_extrapolation_is_told_once_for_each_glass(run, command):
     verb, *options = command.split()
     found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if verb == "layout" else []))
     assert found.code == 0
-    told = [line for line in found.err.splitlines() if "extrapolated" in line]
-    assert [line.split(": ")[3].split(" is ")[0] for line in told] == ["SK2 (SCHOTT)", "SK16 (SCHOTT)", "F5 (SCHOTT)"]
-    assert told[0].endswith("is extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm")
+    warned = [line for line in found.err.splitlines() if "extrapolated" in line]
+    assert [line.split(": ")[3].split(" is ")[0] for line in warned] == ["SK2 (SCHOTT)", "SK16 (SCHOTT)", "F5 (SCHOTT)"]
+    assert warned[0].endswith("is extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm")
 
 
 def test_extrapolation_is_told_of_a_wavelength_of_codesign(run):

@@ -18,6 +18,7 @@ from raytrace.io import read_lens
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
+from raytrace.system.lens import media
 from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Aperture
@@ -32,7 +33,7 @@ from raytrace.tracing.compiled import (
 )
 from raytrace.tracing.jacobian import hit_jacobian, pushed
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import media, trace_lens, trace_surfaces
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -7,11 +7,11 @@ import torch
 from problems import double_gauss, fields, lens, surface, vector, vignetting_aperture
 
 from raytrace.materials.glass import MIRROR, refractive_index, sellmeier
-from raytrace.system.lens import check
+from raytrace.system.lens import check, media
 from raytrace.system.rays import start
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.trace import steps, trace_lens
 
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 

@@ -27,10 +27,10 @@ from raytrace.io.source import Place, decode
 from raytrace.io.zemax.surfaces import types
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import refractive_index
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.rays import start
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import axial_path, media, steps
+from raytrace.tracing.trace import axial_path, steps
 
 CORPUS = Path(__file__).parents[2] / "shared" / "tier2"
 FILES = json.loads((CORPUS / "oracle_dev.json").read_text())["files"] if (CORPUS / "oracle_dev.json").exists() else {}

@@ -15,10 +15,10 @@ from raytrace.materials.agf import parse_agf
 from raytrace.materials.catalogs import SHIPPED, find_glass, shipped_catalog
 from raytrace.materials.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
 from raytrace.materials.glass import AIR, constant, from_table, model_glass, refractive_index
-from raytrace.system.lens import index_behind
+from raytrace.system.lens import index_behind, media
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import spot_of
-from raytrace.tracing.trace import media, trace_lens
+from raytrace.tracing.trace import trace_lens
 
 float64 = partial(torch.tensor, dtype=torch.float64)
 

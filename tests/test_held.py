@@ -13,8 +13,8 @@ from raytrace.imaging.training import Run
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
 from raytrace.settings import CodesignSettings
+from raytrace.system.lens import media
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
-from raytrace.tracing.trace import media
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"

@@ -9,7 +9,7 @@ from problems import double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.maths import pupil
 from raytrace.maths.value import to
-from raytrace.system.lens import with_object_distance
+from raytrace.system.lens import media, with_object_distance
 from raytrace.tracing.launch import (
     MarginalRayLost,
     launch,
@@ -19,7 +19,7 @@ from raytrace.tracing.launch import (
     stop_radius,
 )
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media, trace_lens, trace_surfaces
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from raytrace.io import read_lens
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.trace import steps, trace_lens
 
 LENSES = Path(__file__).parents[1] / "lenses"
 FILES = sorted(LENSES.glob("*.zmx"))

@@ -23,12 +23,13 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import LOST, Evaluation
 from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
 from raytrace.optimization.ray_bundle import Bundle
+from raytrace.system.lens import media
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

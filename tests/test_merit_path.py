@@ -18,11 +18,12 @@ from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.wavefront import Fit
+from raytrace.system.lens import media
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene
-from raytrace.tracing.trace import lens_steps, media, trace_lens
+from raytrace.tracing.trace import lens_steps, trace_lens
 from raytrace.tracing.wavefront import path_to_reference_sphere, wavefront_of
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"

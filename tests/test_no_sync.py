@@ -12,11 +12,12 @@ from raytrace.materials.glass import MIRROR
 from raytrace.maths import pupil
 from raytrace.maths.value import to
 from raytrace.system import intersection as search
+from raytrace.system.lens import media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 
 #: Operators whose result, or the shape of it, the host has to read from the device.
 READS = {

@@ -207,8 +207,8 @@ def test_third_order_aberrations_are_those_that_oslo_prints(name):
     """EBR, ANG, RD, CC, AD, GLA, RFH, AST and the signs behind a mirror, to the last digit that OSLO prints."""
     surfaces, system, printed = SEIDEL[name]
     found = lens((FAR, *surfaces), system)
-    told = seidel(found, kind="transverse")
-    columns = dict(zip(told.names, told.contributions[:, 0], strict=True))
+    sums = seidel(found, kind="transverse")
+    columns = dict(zip(sums.names, sums.contributions[:, 0], strict=True))
     ours = torch.stack([columns["TSPH"], columns["TSCO"], 0.5 * columns["TAST"], columns["TPFC"], columns["TDIS"]], 1)
     powered = [k for k, surface in enumerate(found.surfaces[1:-1]) if surface.curvature is not None]
     theirs = torch.tensor(printed, dtype=torch.float64)
@@ -238,7 +238,7 @@ def double_gauss(waves: str) -> str:
 
 @pytest.mark.filterwarnings("ignore")
 def test_path_differences_in_waves_are_those_that_oslo_traces():
-    """UNI 1 is a millimetre: paths are told in waves."""
+    """UNI 1 is a millimetre: paths are in waves."""
     found, _ = FORMATS[".len"].read(double_gauss("WV 0.58756; WW 1"), "lens.len")
     theirs = [-0.0166099413374108, -0.0719477735201281, -0.189106686954516]
     assert opd(found, 0.58756, [0.5, 0.75, 1.0]) == pytest.approx(theirs, abs=1e-7)
@@ -499,12 +499,12 @@ def test_glasses_are_looked_up_and_never_replaced():
 def test_commands_that_change_nothing_are_told_with_their_reason():
     surfaces = (FAR, "RD 50; GLA N-BK7; TH 4; TCE 71; DRW ON; LMO ELE; TOX 0", "RD -50; TH 40")
     _, report = read(surfaces, "EBR 5; TELE OFF; FOO 1", tail="CFG NEW\nTH 1 2 8\nEND\n")
-    told = {one.name: (one.status, one.reason) for one in report.keywords}
-    assert {name for name, (status, _) in told.items() if status == "ignored"} >= {
+    statuses = {keyword.name: (keyword.status, keyword.reason) for keyword in report.keywords}
+    assert {name for name, (status, _) in statuses.items() if status == "ignored"} >= {
         *("TCE", "DRW", "LMO", "TOX", "TELE", "CFG")
     }
-    assert all(reason for status, reason in told.values() if status == "ignored")
-    assert told["FOO"] == ("unknown", "")
+    assert all(reason for status, reason in statuses.values() if status == "ignored")
+    assert statuses["FOO"] == ("unknown", "")
     assert any("CFG (further configurations)" in warning for warning in report.warnings)
     assert any("unknown keyword FOO: left out" in warning for warning in report.warnings)
 
@@ -611,8 +611,8 @@ def test_what_cannot_be_read_is_refused_in_a_line(surfaces, system, message):
         ("RD 5\n", "expected LEN NEW"),
         ("LEN OLD\n", "expected LEN NEW"),
         (text(SINGLET, "EBR 5").replace("END 3", ""), "no END after 4 surfaces"),
-        (text(SINGLET, "EBR 5", end=7), "END says that the image is surface 7, but it is 3"),
-        (text(SINGLET, "EBR 5", stated="50 2"), "LEN NEW says that the image is surface 2, but it is 3"),
+        (text(SINGLET, "EBR 5", end=7), "END states that the image is surface 7, but it is 3"),
+        (text(SINGLET, "EBR 5", stated="50 2"), "LEN NEW states that the image is surface 2, but it is 3"),
         (text(SINGLET, "EBR 5", waves="TH 0.1; WV 0.5"), "focus shift"),
         (text(SINGLET, "EBR 5", waves="PY 0; WV 0.5"), "solve"),
         (text(SINGLET, "EBR 5", waves="WV 0.5; WW 1 2"), "WW has 2 values for 1 wavelengths"),
@@ -627,10 +627,10 @@ def test_a_file_that_is_no_lens_or_cut_off_is_refused(content, message):
 
 def test_a_command_that_stands_again_is_warned_of():
     _, report = read((FAR, "RD 50; RD 60; GLA N-BK7; TH 4", "TH 50"), "EBR 5; FNO 4; ANG 1; OBH -1e19")
-    told = "\n".join(report.warnings)
-    assert "RD occurs again (first in line 4); the last is used" in told
-    assert "several system apertures (EBR in line 2 and FNO in line 2); the last is used" in told
-    assert "several fields (ANG in line 2 and OBH in line 2); the last is used" in told
+    text = "\n".join(report.warnings)
+    assert "RD occurs again (first in line 4); the last is used" in text
+    assert "several system apertures (EBR in line 2 and FNO in line 2); the last is used" in text
+    assert "several fields (ANG in line 2 and OBH in line 2); the last is used" in text
 
 
 def test_a_lens_file_of_oslo_is_converted_and_gone_on_with(tmp_path, capsys):

@@ -14,11 +14,11 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.io import read_lens, write_lens
 from raytrace.materials.glass import MIRROR
-from raytrace.system.lens import with_object_distance
+from raytrace.system.lens import media, with_object_distance
 from raytrace.system.rays import start
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance, signed, system_matrix
-from raytrace.tracing.trace import media, trace_lens, trace_surfaces
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 INF = math.inf
 

@@ -15,6 +15,7 @@ from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.psf_models import model_of, psf
 from raytrace.system.intersection import intersect, normal
+from raytrace.system.lens import media
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import Relief, relief
@@ -22,7 +23,7 @@ from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene, symmetry
-from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.trace import steps, trace_lens
 
 RADIUS = vector(4.0)[0]
 

@@ -10,11 +10,17 @@ from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surfa
 from raytrace import seidel
 from raytrace.io import read_lens
 from raytrace.materials.glass import MIRROR, model_glass
-from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.lens import (
+    Lens,
+    SystemAperture,
+    media,
+    with_object_distance,
+    with_sensor_distance,
+    with_wavelengths,
+)
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_matrix
 from raytrace.tracing.spot import image_rays
-from raytrace.tracing.trace import media
 
 INF = math.inf
 FIELD = fields("angle", (8.0,))

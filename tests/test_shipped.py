@@ -38,9 +38,9 @@ def test_a_public_verb_has_type_hints(name):
 def test_every_file_of_oracles_is_described_and_every_described_file_is_there():
     there = {path.name for path in ORACLES.iterdir() if path.is_file()} - {"README.md"}
     assert there == set(DESCRIBED)
-    for name, told in DESCRIBED.items():
-        assert len(told.split()) > 5, name
-        for generator in re.findall(r"`(\w+\.py)`", told):
+    for name, description in DESCRIBED.items():
+        assert len(description.split()) > 5, name
+        for generator in re.findall(r"`(\w+\.py)`", description):
             assert (ORACLES / generator).is_file(), generator
 
 

@@ -25,10 +25,11 @@ from raytrace.maths import pupil
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import to
 from raytrace.system.intersection import normal
+from raytrace.system.lens import media
 from raytrace.system.rays import Rays, start
 from raytrace.tracing.launch import launch, rays_from_infinity, rays_from_point
 from raytrace.tracing.refraction import reflect, refract
-from raytrace.tracing.trace import axial_path, media, steps, trace_lens, trace_surfaces
+from raytrace.tracing.trace import axial_path, steps, trace_lens, trace_surfaces
 
 ROUNDING = 2.0**-53
 

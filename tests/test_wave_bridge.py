@@ -13,11 +13,11 @@ from raytrace.maths.grid import centres, grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import DRT, psf, wave
 from raytrace.system import sag_terms as sag_terms
-from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.lens import Lens, media, with_sensor_distance
 from raytrace.system.surface import sag_at
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import cross_scene, scene
-from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 from raytrace.tracing.wavefront import wavefront_of
 from raytrace.wave_optics import hybrid as bridge
 from raytrace.wave_optics.compute import psf as wave_psf

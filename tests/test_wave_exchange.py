@@ -241,7 +241,7 @@ TEXTS = {
     "an uneven grid": (".csv", "x,y,sag\n-1,0,1\n0.1,0,1\n1,0,2\n", r":3: has x = 0.1 mm; expected 0 "),
     "rows of y": (".csv", "x,y,sag\n-1,-1,1\n-1,1,1\n1,-1,2\n1,1,2\n", r":3: has x = -1 mm"),
     "a missing point": (".csv", "x,y,sag\n-1,-1,1\n1,-1,1\n-1,1,2\n", r"has 3 points, no whole number of rows of 2"),
-    "falling x": (".csv", "x,y,sag\n1,0,1\n-1,0,1\n", r"expected it to rise"),
+    "falling x": (".csv", "x,y,sag\n1,0,1\n-1,0,1\n", r"expected increasing coordinates"),
     "rings off": (".csv", "r,sag\n1,1\n2,1\n", r":3: has r = 2 mm; expected 3"),
     "nan": (".csv", "r,sag\n1,nan\n3,1\n", r"has 1 heights that are not finite"),
     "a short grid": (".dat", "5 5 1 1 0 0 0\n" + "0 0 0 0\n" * 24, r":1: announces 5 × 5 points, but holds 24"),

@@ -97,7 +97,6 @@ def test_the_table_is_repeated_and_counts_its_pictures():
         edof._parts(edof.Table({}), given, WaveCameraConfig(), line, [], {"lens": baseline("singlet", aim())[0]})
     )
     assert (
-        "ElementReport on 1 pictures of leaves, 3 pictures, expected over noise, none drawn; filters are made for 4, 4"
-        in text
+        "Judged on 1 pictures of leaves, 3 pictures, expected over noise, none drawn; filters are made for 4, 4" in text
     )
     assert "Heights, largest less smallest inside the aperture: lens " in text

@@ -8,8 +8,9 @@ from problems import double_gauss, lens, scalar, stigmatic_problems, surface, ve
 from test_trace import rays_of_problem
 
 from raytrace.maths import pupil
+from raytrace.system.lens import media
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import media, trace_lens, trace_surfaces
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 from raytrace.tracing.wavefront import path_to_reference_sphere
 
 WAVE = 0.55e-3  # mm

@@ -19,8 +19,9 @@ from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
 from raytrace.io.source import Place, decode
 from raytrace.io.zemax import write as zemax_write
 from raytrace.io.zemax.surfaces import inverse, spelled_inverse, types
+from raytrace.system.lens import media
 from raytrace.system.rays import start
-from raytrace.tracing.trace import media, steps
+from raytrace.tracing.trace import steps
 
 MILLIMETRES = {"MM": 1.0, "IN": 25.4, "METER": 1000.0}
 
@@ -305,7 +306,7 @@ def test_numbers_out_of_range_are_one_clear_error(second, message):
         ("TYPE EVENASPH\nPARM 9 1", "warnings", r"PARM 9: an EVENASPH has parameters 1 to 8 \(r² to r\^16\)"),
         ("TYPE STANDARD\nPARM 1 1", "notes", "PARM 1 is not used by a STANDARD surface"),
         ("TYPE STANDARD\nXDAT 3 1", "notes", "XDAT 3 is not used by a STANDARD surface"),
-        ("TYPE XASPHERE\nXDAT 1 1\nXDAT 2 9\nXDAT 4 1", "warnings", "XDAT 4: XDAT 1 says 1 terms, to XDAT 3"),
+        ("TYPE XASPHERE\nXDAT 1 1\nXDAT 2 9\nXDAT 4 1", "warnings", "XDAT 4: XDAT 1 states 1 terms, to XDAT 3"),
         ("TYPE COORDBRK\nCURV 0.1", "notes", "CURV is not used by a COORDBRK surface"),
         ("TYPE COORDBRK\nGLAS MIRROR", "warnings", "GLAS on a coordinate break is not used"),
         ("TYPE COORDBRK\nSCBD 3 3 1", "notes", "coordinate return; its solved values"),

@@ -32,12 +32,11 @@ from raytrace.cli.progress import progress
 from raytrace.cli.run import say
 from raytrace.io import read_lens
 from raytrace.maths.value import to
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_even
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.compiler import NoCompiler, compiler, private_folder, run_compiler
-from raytrace.tracing.trace import media
 
 #: Ratio, its words in addition to those of `speed.WORDS`, its bound, and whether that is the largest allowed.
 TARGETS = (

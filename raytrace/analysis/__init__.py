@@ -1,23 +1,23 @@
-"""Analyses of a lens: each a function of the lens that gives a value which tabulates, prints and draws itself.
+"""Analyses of a lens: a file each has the computation, the result with its table, and the figure.
 
-| verb                                        | what it shows                                                  |
+| function                                    | result                                                         |
 |---------------------------------------------|----------------------------------------------------------------|
+| layout, spot, focus                         | cross section, spot diagram, best sensor distance              |
 | ray_fan, opd_fan                            | aberrations along the two sections of the pupil                |
 | wavefront                                   | OPD over the pupil, Zernike coefficients, Strehl ratio         |
 | mtf                                         | modulation, of diffraction or of rays, through focus           |
 | encircled_energy                            | light within a radius, of diffraction or of rays               |
-| distortion, field_curvature, lateral_colour | what chief rays and the close rays about them show             |
+| distortion, field_curvature, lateral_colour | from chief rays and close rays around them                     |
 | relative_illumination                       | light of a field against the axis                              |
 | rms_over_field                              | RMS wavefront or spot, each wavelength and all together        |
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
-| distortion_grid                             | a square grid of object points as the sensor sees it           |
+| distortion_grid                             | image of a square grid of object points            |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
-| compare, abilities                          | PSF models side by side, and what each of them can represent   |
+| compare, abilities                          | PSF models, and the properties that each can represent         |
 
-Each takes fields as y or (x, y), wavelengths in µm, and the options of its command; a file of this folder holds one, or
-a few that are alike.
+Fields are y or (x, y), wavelengths in µm.
 """
 
 from raytrace.analysis.compare import Abilities as Abilities

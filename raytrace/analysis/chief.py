@@ -1,6 +1,7 @@
 """Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -91,7 +92,7 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    UNIT = "mm"
+    UNITS: ClassVar = {"tangential": "mm", "sagittal": "mm"}
 
     def columns(self) -> dict[str, Tensor]:
         tangential, sagittal = masked(self.tangential, self.valid), masked(self.sagittal, self.valid)
@@ -244,7 +245,7 @@ def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
 
 
 def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
-    """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they tell the scale of the image."""
+    """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they give the scale of the image."""
     largest = field_range(lens, 2)[:, 1:]
     if not is_bent(lens):
         return largest * NEAR_AXIS

@@ -1,4 +1,4 @@
-"""PSF models side by side: their kernels over object distance, and in numbers what each of them can represent."""
+"""Comparison of PSF models: kernels over object distance, and the properties that each can represent."""
 
 import dataclasses
 import math
@@ -16,11 +16,10 @@ from raytrace.plotting.style import array, styled
 from raytrace.psf_models.figure import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
-from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
+from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths
 from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.focus import NoImage, focused, real_image_distance
 from raytrace.tracing.paraxial import first_order, largest_field
-from raytrace.tracing.trace import media
 
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
@@ -28,11 +27,11 @@ DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
 _ROWS = sorted(MODELS.values(), key=lambda model: model.row)  # the last one is the reference of the others
 _TOLERANCE = 0.01  # of abilities: the counting noise of a few rays would pass for aberrations and for rings
 _CONIC = 0.2  # by how much the conic of the most curved surface grows
-_SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first dark ring is looked for
+_SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first dark ring is searched
 _AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
 
 
-#: What is asked of each model: attribute, heading of its column; and what of it is a whole number.
+#: Properties of each model: attribute, heading of its column; and the whole numbers among them.
 _SHOWN = {
     "conic": "Δ conic",
     "anisotropy": "σ long/short",
@@ -142,11 +141,11 @@ class Comparison(Result):
 
     @property
     def sensor(self) -> str:
-        """Where the one sensor stands, and for what light, in words."""
+        """The sensor distance and the wavelength, in words."""
         return f"one sensor at {float(self.sensor_distance):.7f} mm, {float(self.wavelength):g} µm"
 
     def document(self) -> dict:
-        """Every model by its name: what it can represent, its differences and its kernels."""
+        """Every model by its name: its properties, differences and kernels."""
         models = {
             name: {
                 **({} if self.abilities is None else self.abilities.of(m)),
@@ -213,7 +212,7 @@ def compare(
     pixel: float = PIXEL,
     size: int = SIZE,
 ) -> Comparison:
-    """The PSF models side by side on the axis over object distances (D,) mm, and what each of them can represent.
+    """The PSF models on the axis over object distances (D,) mm, and the properties that each can represent.
 
     focus_distance, start: of the one sensor, see `common_focus`; wavelengths: µm, of which the first is taken; pixel:
     mm, size: of the window. Raises NoImage for a distance of which the lens forms no real image.
@@ -261,7 +260,7 @@ def side_by_side(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = 
 
 
 def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
-    """What each model can represent, measured on a lens of one wavelength at its own object and sensor distance.
+    """The properties that each model can represent, of a lens at one wavelength, its object and sensor distance.
 
     pixels: about the axis, by default 21 × 21 of 5 µm.
     """

@@ -16,6 +16,7 @@ from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 #: Whose sphere an OPD is measured on.
 REFERENCES = ("primary", "own")
+_UNIT = {"ray": "mm", "opd": "waves"}
 
 
 @value
@@ -39,7 +40,9 @@ class Fan(Analysis):
 
     EVERY = 5
     COMMAND = property(lambda self: f"{self.quantity}-fan")
-    UNIT = property(lambda self: {"ray": "mm", "opd": "waves"}[self.quantity])
+    UNITS = property(
+        lambda self: dict.fromkeys(("tangential", "sagittal"), "mm" if self.quantity == "ray" else "waves")
+    )
 
     def columns(self) -> dict[str, Tensor]:
         tangential = masked(self.tangential, self.tangential_valid)

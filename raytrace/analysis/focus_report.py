@@ -27,7 +27,6 @@ from raytrace.maths.result import Result, number, numbers, object_text
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
@@ -125,9 +124,6 @@ class Focus(Result):
     def words(self) -> dict:
         return {"place": [words for words, _ in self._sensors()]}
 
-    def units(self) -> dict[str, str]:
-        return {"sensor_distance": "mm", "rms_radius": "mm"}
-
     def document(self) -> dict:
         alone = len(self.object_distances) == 1
         before = self.before.surfaces[-2].thickness
@@ -143,7 +139,7 @@ class Focus(Result):
         }
 
     def __str__(self) -> str:
-        data, kind = first_order(self.before), self.before.fields.kind
+        data = first_order(self.before)
         diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
         focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
         objects = ", ".join(_words(d) for d in self.object_distances.tolist())
@@ -153,7 +149,8 @@ class Focus(Result):
             self.before.name,
             f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
             f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
-            f"  object at {objects}; field {fields} {FIELD_UNITS[kind]}; {colours} µm; criterion {self.criterion}\n",
+            f"  object at {objects}; field {fields} {self.before.fields.unit}; {colours} µm; "
+            f"criterion {self.criterion}\n",
             f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
         ]
         for words, sensor in self._sensors():
@@ -311,7 +308,7 @@ def _words(distance: float) -> str:
 
 
 def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
-    """What tells the curves apart, object distance outermost."""
+    """Labels of the curves, object distance outermost."""
     points = [field_label(lens, point) for point in style.array(fields).T]
     if len(distances) == 1:
         return points
@@ -464,7 +461,7 @@ def focus_rays(
 
 
 def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[float, float]:
-    """First and last sensor distance in mm: all minima and marks, and room for the curves to rise beside them.
+    """First and last sensor distance in mm: all minima and marks, and room for the curves to rise around them.
 
     A perfect cone moved by s has the RMS radius s/(√8 N); the room makes that twice the least RMS radius, or five
     times the classical depth of focus 2 λ N² where the spot is smaller than the Airy disc.

@@ -43,6 +43,12 @@ class GridDistortion(Analysis):
     valid: Tensor
 
     COMMAND = "distortion-grid"
+    UNITS = property(
+        lambda self: (
+            dict.fromkeys(("ideal_x", "ideal_y", "actual_x", "actual_y"), "mm")
+            | dict.fromkeys(("field_x", "field_y"), "" if is_at_infinity(self.lens) else "mm")
+        )
+    )
 
     def columns(self) -> dict[str, Tensor]:
         (x, y), (ideal_x, ideal_y) = (masked(point, self.valid) for point in (self.actual, self.ideal))
@@ -56,13 +62,6 @@ class GridDistortion(Analysis):
             "actual_y": y,
             "distortion_percent": masked(100 * self.distortion, self.valid),
         }
-
-    def units(self) -> dict[str, str]:
-        """The field is tan θ or mm of the object, whatever the kind of field of the lens."""
-        points = ("ideal_x", "ideal_y", "actual_x", "actual_y")
-        field = {} if is_at_infinity(self.lens) else {"field_x": "mm", "field_y": "mm"}
-        wavelength, percent = {"wavelength": "µm"}, {"distortion_percent": "%", "largest_percent": "%"}
-        return {**wavelength, **field, **dict.fromkeys(points, "mm"), **percent}
 
     def summary(self) -> dict[str, Tensor]:
         return {"wavelength": self.wavelengths, "largest_percent": 100 * self.largest()}

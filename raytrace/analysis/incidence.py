@@ -96,7 +96,7 @@ def incidence(
 
 
 def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Incidence:
-    along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), beside (F, W, P)
+    along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), against (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     along = torch.cat([along, torch.zeros_like(along[:1])])
     angles, valid, reached = [], [], rays.valid
@@ -104,7 +104,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     gap = None
     for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
-        direction, along = (_told_at(surface, gap, vector) for vector in (rays.direction, along))
+        direction, along = (_in_axes_of(surface, gap, vector) for vector in (rays.direction, along))
         angles.append(_angle(surface, direction, crossing.rays.position, along))
         rays, gap = crossing.rays, gap_behind(surface)
         if surface.is_break:
@@ -132,7 +132,7 @@ def _directions(lens: Lens, fields: Tensor) -> Tensor:
     return torch.stack([x / length, torch.where(on_axis, 1.0, y / length)])
 
 
-def _told_at(surface: Surface, gap: Tensor | Gap | None, vector: Tensor) -> Tensor:
+def _in_axes_of(surface: Surface, gap: Tensor | Gap | None, vector: Tensor) -> Tensor:
     """A direction (3, ...) behind the surface before, in the axes of this one."""
     for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
         if pose is not None:

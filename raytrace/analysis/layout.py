@@ -3,7 +3,7 @@
 import html
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +18,11 @@ from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
     field_title,
+    media,
     name_of_field,
     wavelengths_of,
 )
@@ -31,7 +31,7 @@ from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import edge_radius, warn_of_defects
 from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
 from raytrace.tracing.lens_report import Info, text
-from raytrace.tracing.trace import media, trace_lens
+from raytrace.tracing.trace import trace_lens
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
@@ -66,7 +66,7 @@ class Layout(Result):
 
     def __str__(self) -> str:
         points = ", ".join(map(name_of_field, self.fields.unbind(1)))
-        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
+        return f"{self.lens.name or 'Lens'}: field {points} {self.lens.fields.unit}"
 
     @style.styled
     def draw(self):
@@ -89,10 +89,7 @@ class Layout(Result):
             figure.delaxes(axes)
             axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
         draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=self.rays, view=self.view)
-        (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-        shape = (y1 - y0) / (z1 - z0)
-        width = min(max(6.0 / shape, 5.5), 8.0)
-        height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
+        width, height = _page_size(axes)
         if spectrum is not None:
             width, height = 1.2 * width, max(height, 3.6)
             _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
@@ -142,14 +139,28 @@ def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelen
         how = {"fields": fields if found.has_fields else field_points(None, like=lens), "rays": found.rays}
         drawn.append(_drawn(axes, lens, wavelengths=wavelengths, view=found.view, colour=colour, **how))
     _framed(axes, drawn)
-    shape = axes.get_ylim()[1] - axes.get_ylim()[0], axes.get_xlim()[1] - axes.get_xlim()[0]
-    width = min(max(6.0 * shape[1] / shape[0], 5.5), 8.0)
-    figure.set_size_inches(width, min(max(0.98 * width * shape[0] / shape[1], 1.2), 6.0) + 1.1)
-    figure.suptitle(style.fill(lenses[0].name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
-    handles = [style.legend_entry(color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
+    width, height = _page_size(axes)
+    figure.set_size_inches(width, height)
+    return _titled(figure, lenses[0], width, "Configuration", map(str, range(1, len(colours) + 1)), colours)
+
+
+def _page_size(axes) -> tuple[float, float]:
+    """Width and height in inches of a page for the cross section in axes."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    shape = (high - low) / (right - left)
+    width = min(max(6.0 / shape, 5.5), 8.0)
+    return width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
+
+
+def _titled(figure, lens: Lens, width: float, title: str, labels: Iterable[str], colours: Sequence):
+    """The figure with the name of the lens and a legend of colours."""
+    figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
+    entries = zip(colours, labels, strict=True)
+    handles = [style.legend_entry(linestyle="", label=title)]
+    handles += [style.legend_entry(color=colour, label=label) for colour, label in entries]
     figure.legend(
-        handles=[style.legend_entry(linestyle="", label="Configuration"), *handles],
-        loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
+        handles=handles, loc="outside lower center", ncols=min(len(handles), int(1.5 * width)), handlelength=1.4,
+        columnspacing=1.6,
     )  # fmt: skip
     return figure
 
@@ -173,19 +184,13 @@ def _draw_spectrum(axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> Non
 
 def _finished(figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float):
     """The figure with its title and its legend: fields, or wavelengths where there are several."""
-    figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     if len(wavelengths) > 1:
         title, labels = "Wavelength", [f"{float(wavelength):g} µm" for wavelength in wavelengths]
     else:
         title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T]
     colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
     colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
-    handles = [style.legend_entry(color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
-    figure.legend(
-        handles=[style.legend_entry(linestyle="", label=title), *handles],
-        loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
-    )  # fmt: skip
-    return figure
+    return _titled(figure, lens, width, title, labels, colours)
 
 
 def draw_layout(
@@ -275,7 +280,7 @@ def _extent(lens: Lens, places: list[outline.Section], radii: list[float]) -> tu
 
 
 def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> float:
-    """Where the first surface begins, mm, or what stands before it if nothing is folded."""
+    """The leftmost point of the first surface, mm; of all surfaces if the axis is straight."""
     if not outline.is_bent(lens):
         return _extent(lens, places, radii)[0][0]
     height = np.array([-radii[1], radii[1]])

@@ -15,7 +15,7 @@ from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.spot import image_rays
 
-_NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-8 of the spherical aberration
+_NEAR_AXIS = 1e-4  # of the pupil: the ray that replaces the central one leaves 1e-8 of the spherical aberration
 
 
 @value

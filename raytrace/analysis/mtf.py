@@ -36,7 +36,7 @@ from raytrace.tracing.spot import image_rays, spot_of
 
 _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
-_FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for
+_FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
 _NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
 _FINE_GRID = 512  # points across the pupil, from where a quadrature of the sheared pupil is tried

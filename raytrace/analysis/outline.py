@@ -15,11 +15,11 @@ from raytrace.maths.pupil import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
-from raytrace.tracing.trace import lens_steps, media
+from raytrace.tracing.trace import lens_steps
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
 
@@ -45,7 +45,7 @@ class RayPath(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A surface in a view: how its own z and heights across it lie in the picture.
+    """A surface in a view: how its z and heights across it lie in the picture.
 
     origin: (2,) mm of its vertex, to the right and upward; along, across: (2,) what one of z and one of height move;
     direction: cosines (2,) along x and y of the surface in which heights are taken.
@@ -116,7 +116,7 @@ def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
 
 
 def is_bent(lens: Lens) -> bool:
-    """Whether surfaces stand elsewhere than upright on the z axis."""
+    """Whether a surface is tilted or off the z axis."""
     for frame in frames(lens):
         axes, origin = array(frame.axes), array(frame.origin)
         if not np.allclose(axes, np.eye(3), atol=1e-12) or np.abs(origin[:2]).max() > 1e-12:

@@ -21,7 +21,7 @@ from raytrace.plotting.style import (
 from raytrace.system.lens import Lens, field_label, field_title
 from raytrace.tracing.paraxial import first_order
 
-#: Dashes of wavelengths, in order, for readers who do not tell their colours apart; and of sagittal curves.
+#: Dashes of wavelengths, in order, for colour-blind readers; and of sagittal curves.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 SAGITTAL = (0, (4, 2))
 

@@ -389,8 +389,8 @@ class Fit:
 
     def by_rays(self, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By waves (Q, B, R) and directions (2, Q, B, R), from derivatives (3, Q, B, N, N) by the polynomials."""
-        told = [part.back(slope) for part, slope in zip(self.parts, slopes, strict=True)]
-        return told[2][0], sum(at for _, at in told) / self.scale[:, None, :, None]
+        backs = [part.back(slope) for part, slope in zip(self.parts, slopes, strict=True)]
+        return backs[2][0], sum(at for _, at in backs) / self.scale[:, None, :, None]
 
 
 class _Part:
@@ -416,9 +416,9 @@ class _Part:
 
         dc = V⁺ (dd - dV c) + (VᵀV)⁻¹ dVᵀ r, r = d - V c what is left
         """
-        told = slope[..., self.powers[:, 0], self.powers[:, 1]][..., None, :]  # (Q, B, 1, K)
-        by_data = (told @ self.inverse)[..., 0, :]
-        inner = (told @ self.turn @ self.turn.swapaxes(-1, -2))[..., 0, :]
+        slopes_at = slope[..., self.powers[:, 0], self.powers[:, 1]][..., None, :]  # (Q, B, 1, K)
+        by_data = (slopes_at @ self.inverse)[..., 0, :]
+        inner = (slopes_at @ self.turn @ self.turn.swapaxes(-1, -2))[..., 0, :]
         left = self.root**2 * self.left
         by_places = []
         for by in (self.by_u, self.by_v):
@@ -465,8 +465,8 @@ def otf(polynomials: Tensor, shear: Tensor, points: int) -> Tensor:
     (W1, J1), (W2, J2) = (_wave(line, along + side * shear[..., None, None]) for side in (0.5, -0.5))
     light = area * safe_sqrt(J1 * J2) / math.pi
     phase = 2 * math.pi * (W1 - W2)
-    told = torch.complex((light * torch.cos(phase)).sum((-1, -2)), (light * torch.sin(phase)).sum((-1, -2)))
-    return torch.where(dead, 0.0, told)
+    total = torch.complex((light * torch.cos(phase)).sum((-1, -2)), (light * torch.sin(phase)).sum((-1, -2)))
+    return torch.where(dead, 0.0, total)
 
 
 def _wave(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
@@ -539,8 +539,8 @@ def _corners(pupil: Tensor, shear: Tensor) -> tuple[Tensor, tuple, Tensor]:
     across = safe_sqrt(1 - far * far)
     at = torch.stack([torch.stack([-across, across]), torch.zeros(2, *shear.shape, dtype=shear.dtype)])
     for _ in range(_NEWTON):
-        told = [_slopes(pupil, at[0], at[1] + side * shear) for side in (0.5, -0.5)]
-        (F, a, b), (G, c, d) = told
+        sides = [_slopes(pupil, at[0], at[1] + side * shear) for side in (0.5, -0.5)]
+        (F, a, b), (G, c, d) = sides
         det = a * d - b * c
         det = torch.where(det == 0, 1.0, det)
         step = torch.stack([d * (F - 1) - b * (G - 1), a * (G - 1) - c * (F - 1)]) / det

@@ -1,4 +1,4 @@
-"""What every analysis gives: a result that holds its lens, names its columns, and tells and draws itself."""
+"""Results of analyses: a lens, columns, text and figure."""
 
 import abc
 from typing import ClassVar
@@ -9,16 +9,8 @@ from torch import Tensor
 from raytrace.analysis.setting import field_line, refuse_axis
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.maths.result import Result, axis, cell, flat, rows
-from raytrace.system.lens import FIELD_UNITS
 
-#: Units of columns by their names; the name of a column in per cent ends in _percent.
-_UNITS = {
-    "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
-    "projected_solid_angle": "sr", "crossing": "mm", "lower": "°", "chief": "°",
-    "upper": "°",
-}  # fmt: skip
 _FINE = 321  # points of a curve over frequency or radius, when it is drawn
-_OWN_UNIT = ("tangential", "sagittal", "rms", "peak_to_valley")
 
 
 class Analysis(Result):
@@ -26,9 +18,8 @@ class Analysis(Result):
 
     __slots__ = ()
 
-    #: The command, unit of the columns in _OWN_UNIT, and every how many-th point of a curve the text lists.
+    #: The command, and the step of the points of a curve that the text lists.
     COMMAND: ClassVar[str] = ""
-    UNIT: ClassVar[str] = ""
     EVERY: ClassVar[int] = 1
 
     @property
@@ -44,15 +35,15 @@ class Analysis(Result):
         return table | {name: axis(values, k, axes) for k, (name, values) in enumerate(others.items(), 1)}
 
     def about(self) -> dict[str, str]:
-        """What a document says of the result as a whole."""
+        """Entries of a document for the result as a whole."""
         return {}
 
     def summary(self) -> dict[str, Tensor]:
-        """The columns of a shorter table, if there is one: it is the text, and stands beside the results in JSON."""
+        """The columns of a shorter table, if there is one: the text, and the entry `summary` of JSON."""
         return {}
 
     def units(self) -> dict[str, str]:
-        return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self._unit(name))}
+        return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self.unit_of(name))}
 
     def document(self) -> dict:
         found = {"analysis": self.COMMAND, **self.about(), "units": self.units(), "results": rows(self.columns())}
@@ -60,7 +51,7 @@ class Analysis(Result):
         return {**found, "summary": rows(summary)} if summary else found
 
     def drawn(self) -> "Analysis":
-        """The same curves with points as close as a line needs that is drawn through them."""
+        """The same curves with points as close as a drawn line needs."""
         return self
 
     def __str__(self) -> str:
@@ -68,26 +59,20 @@ class Analysis(Result):
         return self.table(summary) if summary else self.table(self.columns(), self.EVERY)
 
     def table(self, columns: dict[str, Tensor], every: int = 1) -> str:
-        """Columns as text under their names and units, every so many-th point of curves that are longer than twice."""
+        """Columns as text under their names and units, every `every`-th point of longer curves."""
         length = broadcast_shape(*(c.shape for c in columns.values()))[-1]
         thin = every if length > 2 * every else 1
         listed = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
         if "field_x" in listed and not listed["field_x"].any():
             del listed["field_x"]
-        units = {name: self._unit(name) for name in listed}
-        texts = ([name, units[name], *(cell(value, ".6g") for value in column)] for name, column in listed.items())
+        texts = (
+            [name, self.unit_of(name), *(cell(value, ".6g") for value in column)] for name, column in listed.items()
+        )
         padded = [[f"{text:>{max(len(column[0]), 9)}}" for text in column] for column in texts]
         lines = ["  ".join(row) for row in zip(*padded, strict=True)]
         if thin > 1:
             lines.append(f"{len(range(0, length, thin))} of {length} points of each curve; --json lists all")
         return "\n".join(lines)
-
-    def _unit(self, name: str) -> str:
-        if name.startswith("field"):
-            return FIELD_UNITS[self.lens.fields.kind]
-        if name.endswith("_percent"):
-            return "%"
-        return self.UNIT if name in _OWN_UNIT else _UNITS.get(name, "")
 
 
 def fine(places: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, INK, array, styled
-from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.system.lens import Lens, name_of_field
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of
 
@@ -42,6 +42,7 @@ class RmsOverField(OverField):
     reference: str
 
     COMMAND = "rms-over-field"
+    UNITS = property(lambda self: dict.fromkeys(("rms", "polychromatic"), "mm" if self.strehl is None else "waves"))
 
     @property
     def quantity(self) -> str:
@@ -59,17 +60,17 @@ class RmsOverField(OverField):
         return table if self.strehl is None else {**table, "strehl": self.strehl}
 
     def __str__(self) -> str:
-        """A row for each field, the wavelengths beside one another."""
+        """A row for each field, a column for each wavelength."""
         unit, factor = ("waves", 1.0) if self.strehl is not None else ("µm", 1e3)
         heads = ["all, weighted", *(f"{wavelength:g} µm" for wavelength in self.wavelengths.tolist())]
         table = factor * torch.cat([self.polychromatic[:, None], self.rms], 1)
         names = ["field", *map(name_of_field, self.fields.T)]
-        texts = [[f"{head:>13}" for head in heads], *([cell(x, ">13.6g") for x in row] for row in table.tolist())]
+        texts = [[f"{head:>14}" for head in heads], *([cell(x, ">14.6g") for x in row] for row in table.tolist())]
         if self.strehl is not None:
             ratios = ["Strehl".rjust(13), *(cell(ratio, ">13.4f") for ratio in self.strehl.tolist())]
             texts = [[*row, ratio] for row, ratio in zip(texts, ratios, strict=True)]
         lines = [f"{name:>10}" + "".join(row) for name, row in zip(names, texts, strict=True)]
-        lines.insert(1, f"{FIELD_UNITS[self.lens.fields.kind]:>10}" + f"{unit:>13}" * len(heads))
+        lines.insert(1, f"{self.lens.fields.unit:>10}" + f"{unit:>14}" * len(heads))
         return "\n".join(lines)
 
     def at(self, fields: Tensor) -> "RmsOverField":
@@ -80,8 +81,8 @@ class RmsOverField(OverField):
         """RMS over the field: all wavelengths together in black, each in its colour; Maréchal's limit dotted."""
         curves = self.drawn()
         waves = curves.quantity == "wavefront"
-        what = "RMS wavefront error" if waves else "RMS spot radius"
-        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{what} ({'waves' if waves else 'µm'})")
+        quantity = "RMS wavefront error" if waves else "RMS spot radius"
+        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{quantity} ({'waves' if waves else 'µm'})")
         order = np.argsort(field_axis(curves))
         field, scale = field_axis(curves)[order], 1.0 if waves else 1e3
         by_wavelength(panel, curves, field, scale * array(curves.rms)[order], linewidth=1.2)
@@ -93,7 +94,7 @@ class RmsOverField(OverField):
         panel.set_ylim(bottom=0)
         if field.max() > field.min():
             panel.set_xlim(field.min(), field.max())
-        return finished(panel, curves, what, 5)
+        return finished(panel, curves, quantity, 5)
 
 
 def rms_over_field(

@@ -22,12 +22,11 @@ from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
-from raytrace.system.lens import Lens, field_label, field_points
+from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import is_at_infinity, paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
-from raytrace.tracing.trace import media
 from raytrace.words import named, with_article
 
 _SEIDEL = {
@@ -42,7 +41,7 @@ _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
 class Seidel(Analysis):
     """Contributions (J, F, K) of surfaces 1 … K to J aberrations of F fields; their sums over K are the lens's.
 
-    names: of the aberrations; kind: a key of KINDS, which says what they are; unit: "mm" or "waves".
+    names: of the aberrations; kind: a key of KINDS; unit: "mm" or "waves".
     marginal_yni, chief_yni: (F, K) mm, y n i and ȳ n ī at every surface.
     marginal_height, chief_height: (F, K) mm, y and ȳ there.
     invariant: (F,) mm, H; fields: (2, F); wavelength: () µm, of the rays.
@@ -62,6 +61,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
+    UNITS = property(lambda self: dict.fromkeys(self.names, self.unit))
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
@@ -286,7 +286,7 @@ def _longitudinal(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Te
     return -_transverse(S, omega, n, wavelength)[[0, 3, 4, 5, 6, 8]] * n / torch.where(omega == 0, torch.nan, omega)
 
 
-#: What the contributions may be told as: names, conversion of S1 … C2 by n′u′, n′ and the wavelength in mm, and unit.
+#: Kinds of contributions: names, conversion of S1 … C2 by n′u′, n′ and the wavelength in mm, and unit.
 KINDS: dict[str, tuple[tuple[str, ...], Callable, str]] = {
     "coefficients": (("S1", "S2", "S3", "S4", "S5", "C1", "C2"), lambda S, *_: S, "mm"),
     "waves": (("W040", "W131", "W222", "W220P", "W311", "W020", "W111"), _waves, "waves"),

@@ -1,4 +1,4 @@
-"""What an analysis looks at: fields, wavelengths and their weights, as a scene of one object distance."""
+"""The scene of an analysis: fields, wavelengths and their weights, as a scene of one object distance."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_field_kind, with_wavelengths
+from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.ray_failures import check_reach, ray_failures
@@ -19,7 +19,7 @@ from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
 
-#: What verbs take for fields, y or pairs (x, y), and for other numbers; None stands for the lens's own.
+#: Fields, y or pairs (x, y), and other numbers as analyses take them; None: those of the lens.
 Points = Tensor | Sequence | float | None
 Numbers = Tensor | Sequence[float] | float | None
 
@@ -32,7 +32,7 @@ class NothingToShow(ValueError):
 
 
 class Incomplete(UserWarning):
-    """A field lacks something of what an analysis tells."""
+    """A field lacks a part of the results of an analysis."""
 
 
 def setting(
@@ -41,7 +41,7 @@ def setting(
     """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
-    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func that cannot be told.
+    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func this is not checked.
     Warns UnfilledStop.
     """
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
@@ -93,7 +93,7 @@ def field_line(fields: Tensor) -> Tensor:
 
 def field_words(lens: Lens, field: Tensor) -> str:
     """A field (2,) with its unit."""
-    return f"{name_of_field(field)} {FIELD_UNITS[lens.fields.kind]}"
+    return f"{name_of_field(field)} {lens.fields.unit}"
 
 
 def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, what: str) -> None:
@@ -117,7 +117,7 @@ def shown(found):
     if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
         raise NothingToShow(
             f"nothing to show: no number of {found.COMMAND.replace('-', ' ')} exists for this lens; `raytrace info` "
-            "tells whether it has a focal length and an image"
+            "shows whether it has a focal length and an image"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Space: a lens in three dimensions, surfaces as they stand, with the rays of its fields."""
+"""A lens in three dimensions, with the rays of its fields."""
 
 import math
 
@@ -10,10 +10,9 @@ from raytrace.analysis import outline
 from raytrace.maths.pupil import fan
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, frames
-from raytrace.tracing.trace import media
 
 _RINGS, _ARMS = 6, 48  # of the mesh of a surface
 _LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start
@@ -44,7 +43,7 @@ def _seen(points: np.ndarray) -> np.ndarray:
 
 
 def _mesh(surface: Surface, frame: Frame, radius: float) -> np.ndarray:
-    """Points (3, rings, arms) mm of what is drawn of a surface."""
+    """Points (3, rings, arms) mm of the drawn part of a surface."""
     centre_x, centre_y, radius = outline.clear_part(surface, radius)
     holes = [reach(aperture)[0] for aperture in surface.apertures if not aperture.obscures and surface.is_mirror]
     hole = min(max(holes or [0.0]), 0.95 * radius)
@@ -165,7 +164,7 @@ def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
     from mpl_toolkits.mplot3d import proj3d
 
     x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
-    (left, low), (right, high) = axes.viewLim.get_points()  # the middle of the box stands at (0, 0)
+    (left, low), (right, high) = axes.viewLim.get_points()  # the middle of the box is at (0, 0)
     dots = axes.bbox.width / (right - left), axes.bbox.height / (high - low)
     return 2 * np.abs(x).max() * dots[0], 2 * np.abs(y).max() * dots[1]
 

@@ -17,7 +17,6 @@ from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
-    FIELD_UNITS,
     Lens,
     field_label,
     field_points,
@@ -32,7 +31,7 @@ from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, ima
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
-_TRIED = 4096  # rays that tell where all are lost
+_TRIED = 4096  # rays from which the cause is found where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
 _INSET = 0.395  # of a panel's width
@@ -46,11 +45,11 @@ def _of_each(name: str) -> property:
 
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, mm: what Spot says of them, this says, too.
+    """Spots (F, W) of every field and wavelength on the sensor, mm, with the properties of `Spot`.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
-    lens, fields: (2, F), what was looked at. The table has a row a spot; `save` writes the rays.
+    lens, fields: (2, F). The table has a row a spot; `save` writes the rays.
     """
 
     lens: Lens
@@ -81,14 +80,9 @@ class Spots(Result):
             **{name: getattr(self.each, name) for name in names},
         }  # fmt: skip
 
-    def units(self) -> dict[str, str]:
-        field = FIELD_UNITS[self.lens.fields.kind]
-        lengths = ("centroid_x", "centroid_y", "rms_radius", "geometric_radius")
-        return {"field_x": field, "field_y": field, "wavelength": "µm", **dict.fromkeys(lengths, "mm")}
-
     def document(self) -> dict:
         places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
-        unit = {"field_type": self.lens.fields.kind, "field_unit": FIELD_UNITS[self.lens.fields.kind]}
+        unit = {"field_type": self.lens.fields.kind, "field_unit": self.lens.fields.unit}
         about = {} if self.arrivals is None else {"reference": self.reference, "weights": self.weights}
         return {**unit, "results": [self._entry(*place) for place in places], **about}
 
@@ -109,7 +103,7 @@ class Spots(Result):
         return {**found, "launched": self.launched}
 
     def __str__(self) -> str:
-        unit, width = FIELD_UNITS[self.lens.fields.kind], 7 if self.arrivals is not None else 11
+        unit, width = self.lens.fields.unit, 7 if self.arrivals is not None else 11
         heads = ("centroid x", "centroid y", "RMS", "GEO"), ("mm", "mm", "µm", "µm")
         lines = [f"{'field':>10} {'wavelength':>11} {_row(heads[0])} {'rays':>{width}}"]
         lines += [f"{unit:>10} {'µm':>11} {_row(heads[1])} {'lost':>{width}}"]
@@ -217,8 +211,8 @@ def spot(
     each = iter if progress is None else lambda work: progress(work, "field")
     found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
-        told = f"{unaimed} of {found.status.numel()} rays found no way to their point of the stop"
-        warnings.warn(told, LostRays, stacklevel=calling_level())
+        message = f"{unaimed} of {found.status.numel()} rays could not be aimed at their point of the stop"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
     warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)

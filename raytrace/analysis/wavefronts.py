@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -56,7 +57,7 @@ class WavefrontMap(Analysis):
     listed: bool = False
 
     COMMAND = "wavefront"
-    UNIT = "waves"
+    UNITS: ClassVar = {"rms": "waves", "peak_to_valley": "waves", "coefficient": "waves"}
 
     def columns(self) -> dict[str, Tensor]:
         term = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)

@@ -1,1 +1,1 @@
-"""Benchmarks: speed beside error, against an independent reference of high precision and against a peer."""
+"""Benchmarks: speed against error, by independent references of high precision, and compared with other packages."""

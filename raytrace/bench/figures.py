@@ -72,10 +72,10 @@ def _speeds(
     figure = style.new_figure(width * len(titles), width)
     panels = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
     for panel, (value, title) in zip(panels, titles.items(), strict=True):
-        own = [row for row in rows if row[panel_by] == value]
-        for entrant in dict.fromkeys(map(name, own)):
-            points = sorted((row["rays"], row["speed"]) for row in own if name(row) == entrant)
-            panel.plot(*zip(*points, strict=True), label=", ".join(entrant), **look(*entrant))
+        chosen = [row for row in rows if row[panel_by] == value]
+        for labels in dict.fromkeys(map(name, chosen)):
+            points = sorted((row["rays"], row["speed"]) for row in chosen if name(row) == labels)
+            panel.plot(*zip(*points, strict=True), label=", ".join(labels), **look(*labels))
         framed(panel, title, "rays")
     _ticks(panels[0], [row["speed"] for row in rows])
     panels[0].set_ylabel("rays × surfaces per second, millions")
@@ -97,8 +97,8 @@ def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str])
     panels = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
     for panel, (case, title) in zip(panels, titles.items(), strict=False):
         for model, (colour, marker) in _MODELS.items():
-            own = [row for row in rows if (row["lens"], row["field"], row["model"]) == (*case, model)]
-            _samplings(panel, own, look(colour, "-", marker, hollow=False))
+            chosen = [row for row in rows if (row["lens"], row["field"], row["model"]) == (*case, model)]
+            _samplings(panel, chosen, look(colour, "-", marker, hollow=False))
         framed(panel, title, "")
         for axis in (panel.xaxis, panel.yaxis):
             axis.set_major_locator(LogLocator(numticks=12))
@@ -117,11 +117,11 @@ def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str])
 
 
 def _samplings(panel: Axes, rows: Sequence[Mapping], look: dict) -> None:
-    """The samplings of one model: float64 joined in the order of their rays, what was extrapolated by dots."""
+    """The samplings of one model: float64 joined in the order of their rays, extrapolated ones dotted."""
     for dtype in ("float64", "float32"):
-        own = sorted((row for row in rows if row["dtype"] == dtype), key=lambda row: row["rays"])
-        run = [(row["l1_error"], row["forward_s"]) for row in own if not row["extrapolated"]]
-        far = [(row["l1_error"], row["forward_s"]) for row in own if row["extrapolated"]]
+        chosen = sorted((row for row in rows if row["dtype"] == dtype), key=lambda row: row["rays"])
+        run = [(row["l1_error"], row["forward_s"]) for row in chosen if not row["extrapolated"]]
+        far = [(row["l1_error"], row["forward_s"]) for row in chosen if row["extrapolated"]]
         if run:
             single = {"linestyle": "none", "markerfacecolor": "white", "alpha": 0.8} if dtype == "float32" else {}
             panel.plot(*zip(*run, strict=True), **look | single)
@@ -142,7 +142,7 @@ def look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
 
 
 def dtype_keys() -> list[Line2D]:
-    """What stands for a dtype."""
+    """Legend of the marks by dtype."""
     look = {"marker": "o", "color": style.INK, "linestyle": "none"}
     return [_key("float64", **look), _key("float32", markerfacecolor="white", **look)]
 

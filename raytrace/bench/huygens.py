@@ -94,7 +94,7 @@ def clear_rings(scene: Scene, rings: int, arms: int) -> tuple[Tensor, Tensor]:
 
 
 def _bisect(passes, clear: Tensor, dark: Tensor) -> Tensor:
-    """The edge between a radius (arms) that passes and one that does not (the same one if there is no edge)."""
+    """The radius (arms) of the edge between clear and dark; both are the same if there is none."""
     for _ in range(_BISECTIONS):
         middle = 0.5 * (clear + dark)
         through = passes(middle[None])[0]

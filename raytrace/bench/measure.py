@@ -16,13 +16,13 @@ from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_refe
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
 from raytrace.shards import torch_threads
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
 from raytrace.tracing.compiled import engine as engine_asked_for
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.trace import media, trace_lens, trace_surfaces
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference

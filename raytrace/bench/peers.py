@@ -39,11 +39,10 @@ from raytrace.bench.psf_cases import Case, Method
 from raytrace.maths.grid import Grid
 from raytrace.maths.value import to
 from raytrace.psf_models.result import Kernels
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
-from raytrace.tracing.trace import media
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 _RANDOM = (10_000, 100_000, 1_000_000)
@@ -283,8 +282,10 @@ def _histogram(optic: Optic, field, wavelength: float, grid: Grid, count: int) -
     image = optic.surfaces[-1]
     image.aperture = RectangularAperture(x0 - half, x0 + half, y0 - half, y0 + half)
     try:
-        found = IncoherentIrradiance(optic, count, (grid.columns, grid.rows), fields=[field], wavelengths=[wavelength])
-        irradiance = found.data[0][0]
+        analysis = IncoherentIrradiance(
+            optic, count, (grid.columns, grid.rows), fields=[field], wavelengths=[wavelength]
+        )
+        irradiance = analysis.data[0][0]
         irradiance = irradiance[0] if isinstance(irradiance, (tuple, list)) else irradiance
     finally:
         image.aperture = None
@@ -307,20 +308,20 @@ class _AtPoints(ScalarHuygensPSF):
 def _huygens(optic: Optic, field, wavelength: float, grid: Grid, across: int, parts: int) -> tuple[np.ndarray, int]:
     corner = tuple(c - 0.5 * grid.columns * float(grid.pitch) for c in grid.centre.tolist())
     pitch = float(grid.pitch) / parts
-    found = _AtPoints(optic, field, wavelength, across, grid.columns * parts, pixel_pitch=pitch, corner=corner)
-    return _pixels(np.asarray(found.psf), parts), len(found.get_data(field, wavelength).opd)
+    psf = _AtPoints(optic, field, wavelength, across, grid.columns * parts, pixel_pitch=pitch, corner=corner)
+    return _pixels(np.asarray(psf.psf), parts), len(psf.get_data(field, wavelength).opd)
 
 
 def _fft(optic: Optic, field, wavelength: float, grid: Grid, across: int, points: int) -> tuple[np.ndarray, int]:
-    found = FFTPSF(optic, field, wavelength, across, points)
-    step = 1e-3 * wavelength * found._get_working_FNO() * (across - 1) / points
+    psf = FFTPSF(optic, field, wavelength, across, points)
+    step = 1e-3 * wavelength * psf._get_working_FNO() * (across - 1) / points
     chief = optic.trace_generic(*field, 0.0, 0.0, wavelength)
     line = (np.arange(grid.columns * _PARTS) + 0.5) / _PARTS - 0.5 * grid.columns
     places = []
     for centre, start in zip(grid.centre.tolist(), (chief.x, chief.y), strict=True):
         offset = centre - float(np.asarray(start).item()) + line * float(grid.pitch)
         places.append(offset / step + points // 2)
-    return _pixels(_bilinear(np.asarray(found.psf), *places), _PARTS), len(found.get_data(field, wavelength).opd)
+    return _pixels(_bilinear(np.asarray(psf.psf), *places), _PARTS), len(psf.get_data(field, wavelength).opd)
 
 
 def _bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

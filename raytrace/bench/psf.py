@@ -92,16 +92,17 @@ def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
     centroid, variance, energy = moments(scene)
     window = case.window(centroid)
     shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (centroid, variance)))
-    own = case.window(paraxial.chief_ray_height(scene).flatten())
+    about_chief = case.window(paraxial.chief_ray_height(scene).flatten())
     kernels = {
         "rays": drt.reference(scene, window)[0, 0, 0],
         "gaussian": energy * shape[0, 0, 0],
-        "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
+        "paraxial": paraxial.kernels(scene, about_chief).kernel[0, 0, 0],
     }
-    windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), own)
+    windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), about_chief)
     sampling = 0, 0, 0
     try:
-        kernels["fourier"] = MODELS["fourier"].kernels(scene, own, order=MODELS["fourier"].orders[-1]).kernel[0, 0, 0]
+        fourier = MODELS["fourier"]
+        kernels["fourier"] = fourier.kernels(scene, about_chief, order=fourier.orders[-1]).kernel[0, 0, 0]
     except ValueError as refusal:
         say(f"{case.title}: {refusal}")
     try:

@@ -61,24 +61,18 @@ def trace_reference(
         return ReferenceRay(tuple(p), tuple(d), path)
 
 
-def mean_squared_radius(rays: Sequence[ReferenceRay]) -> mpf:
-    """Mean squared distance from the centroid, mm²."""
-    with mp.workdps(_DIGITS):
-        count = len(rays)
-        x, y = (sum(ray.position[axis] for ray in rays) / count for axis in (0, 1))
-        return sum((ray.position[0] - x) ** 2 + (ray.position[1] - y) ** 2 for ray in rays) / count
-
-
 def spot_gradient(
     surfaces: Sequence[ReferenceSurface], index: float, rays: Sequence[tuple], variables: Sequence[tuple[int, str]]
 ) -> list[mpf]:
-    """Derivatives of `mean_squared_radius` by variables (surface, "curvature" or "thickness").
+    """Derivatives of the mean squared distance from the centroid, mm², by (surface, "curvature" or "thickness").
 
     rays: pairs of position and direction, as for `trace_reference`.
     """
 
     def merit(surfaces: Sequence[ReferenceSurface]) -> mpf:
-        return mean_squared_radius([trace_reference(surfaces, index, *ray) for ray in rays])
+        x, y, _ = zip(*(trace_reference(surfaces, index, *ray).position for ray in rays), strict=True)
+        means = ((values, sum(values) / len(rays)) for values in (x, y))
+        return sum((value - mean) ** 2 for values, mean in means for value in values) / len(rays)
 
     with mp.workdps(_DIGITS):
         step, gradient = mpf(_STEP), []

@@ -33,7 +33,7 @@ traces by torch alone, =compiled always by C++, and RAYTRACE_CACHE is the folder
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse, with its usage errors in one line like every other error, that knows what may have been meant."""
+    """argparse, with its usage errors in one line like every other error, that suggests the nearest option."""
 
     def __init__(self, *arguments, **settings):
         super().__init__(*arguments, **settings)
@@ -85,8 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command line; returns 0, or what went wrong: 1 bad input, or a result that falls short of what was asked
-    for, 2 bad usage, 130 interrupted.
+    """Run one command line; returns 0; 1 for bad input or a missed goal, 2 for bad usage, 130 if interrupted.
 
     Results go to stdout; progress, warnings and errors to stderr, one line each.
     """

@@ -312,8 +312,8 @@ def max_bytes(parser: argparse.ArgumentParser) -> None:
             "--max-bytes",
             metavar="BYTES",
             type=memory,
-            help="memory that may be taken, as 4GB: what is predicted to need more is refused before it begins "
-            "(default half of what is free)",
+            help="memory limit, as 4GB: a computation that would need more is refused before it starts "
+            "(default half of the free memory)",
         )
 
 
@@ -468,7 +468,7 @@ def window(group, *, normalise: str) -> None:
     group.add_argument(
         "--normalise",
         choices=("energy", "window"),
-        help="what is 1: all light through the entrance pupil (energy), or the light in each window (window); "
+        help="unit of kernels: all light through the entrance pupil (energy), or that in each window (window); "
         f"default {normalise}",
     )
     group.add_argument(
@@ -483,7 +483,7 @@ def window(group, *, normalise: str) -> None:
 
 
 def merit(parser: argparse.ArgumentParser) -> None:
-    """--merit and what goes with it: `optimization.merit.merit_of_options`."""
+    """--merit and its options: `optimization.merit.merit_of_options`."""
     parser.add_argument(
         "--merit",
         metavar="KIND",
@@ -506,14 +506,14 @@ def merit(parser: argparse.ArgumentParser) -> None:
     own = parser.add_argument_group("of a default merit function")
     own.add_argument("--rings", metavar="N", type=count, help="rings of rays in the pupil (default 3)")
     own.add_argument("--arms", metavar="N", type=count, help="arms of rays in the pupil, even (default 6)")
-    own.add_argument("--reference", choices=("centroid", "chief"), help="what rays are told from (default centroid)")
+    own.add_argument("--reference", choices=("centroid", "chief"), help="centre of the spot (default centroid)")
     own.add_argument(
         "--frequency", dest="frequencies", metavar="F", type=positive_finite, nargs="+", help="of mtf, cycles/mm"
     )
     for name in ("field", "wavelength"):
         option = f"--{name}-weights"
         own.add_argument(option, metavar="W", type=positive_finite, nargs="+", help=f"one a {name}, not the lens's own")
-    bounds = parser.add_argument_group("boundaries, beside any merit function")
+    bounds = parser.add_argument_group("boundaries, of any merit function")
     for name in ("glass", "air"):
         option = f"--{name}-thickness"
         bounds.add_argument(option, metavar="MIN[:MAX]", help=f"of {name} on the axis, mm, as 2:15, or 2")
@@ -524,13 +524,13 @@ def freedom(parser: argparse.ArgumentParser) -> None:
     """--vary, --bounds and --hold: `optimization.variables.freedom`, `optimization.variables.bounds_of`,
     `optimization.problem.conditions_of`."""
     group = parser.add_argument_group(
-        "what varies, where it is not the file's, and what holds",
-        "Words in quotes: 'curvature thickness' (all surfaces that bend light, all gaps), curvature:1-4,7 conic:3 a4:3 "
-        "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); what follows: "
+        "variables and constraints, instead of the file's",
+        "Variables, in quotes: 'curvature thickness' (all powered surfaces, all gaps), curvature:1-4,7 conic:3 a4:3 "
+        "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); pickups and solves: "
         "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "
         "'thickness:8=marginal_height(0)' 'curvature:7=marginal_angle(-0.1)'.",
     )
-    group.add_argument("--vary", metavar="WHAT", nargs="+", help="what varies, and what follows")
+    group.add_argument("--vary", metavar="WHAT", nargs="+", help="variables, pickups and solves")
     group.add_argument(
         "--bounds",
         metavar="NAME:LOW,HIGH",
@@ -541,6 +541,6 @@ def freedom(parser: argparse.ArgumentParser) -> None:
         "--hold",
         metavar="NAME=VALUE",
         nargs="+",
-        help="what is kept to exactly: efl=50 f_number=4 'total_track<=80' 'distortion<=2%%' 'bfd>=30' "
+        help="constraints: efl=50 f_number=4 'total_track<=80' 'distortion<=2%%' 'bfd>=30' "
         "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' efl@2=100, or an operand as REAY(8,0,0,1,0,0)=2",
     )

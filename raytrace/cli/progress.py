@@ -1,12 +1,12 @@
-"""How far a long command has come, on standard error: a bar on a terminal, else one line every ten seconds.
+"""Progress of long commands, on standard error: a bar on a terminal, else one line every ten seconds.
 
     with progress(total, "ray", what="tracing") as bar:
         bar.update(many)
     for plane in progress(planes, "plane"):
         ...
 
-Around every command stands `heartbeat`: it writes the lines, from a thread of its own, so that they come also while a
-single step takes minutes, and in a command that counts nothing.
+`heartbeat` encloses every command: its thread writes the lines, so that they appear while a single step takes minutes
+and in commands that count nothing.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from tqdm import tqdm
 EVERY = 10.0  # s between two lines
 _THOUSANDS = ("ray",)  # units that are counted by the million
 
-_open: list["Bar | Lines"] = []  # what is under way, the innermost last
+_open: list["Bar | Lines"] = []  # running computations, the innermost last
 
 
 def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0) -> "Bar | Lines":
@@ -39,7 +39,7 @@ def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "",
 
 @contextlib.contextmanager
 def heartbeat(what: str) -> Iterator[None]:
-    """Within the block, a line every ten seconds about what is under way; none while a bar stands on a terminal."""
+    """Within the block, a line every ten seconds about the running computation; none while a terminal shows a bar."""
     done, before = threading.Event(), [*_open]
 
     def beat() -> None:
@@ -54,7 +54,7 @@ def heartbeat(what: str) -> Iterator[None]:
         yield
     finally:
         done.set()
-        _open[:] = before  # what a failure left open, too
+        _open[:] = before  # also those that a failure left open
 
 
 class Bar(tqdm):

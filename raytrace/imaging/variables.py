@@ -41,12 +41,11 @@ from raytrace.optimization.variables import (
     with_numbers_of,
 )
 from raytrace.system.identity import digest, identity, other_lens
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
 from raytrace.system.surface import Surface, medium_surfaces, sag, sag_at
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media
 from raytrace.wave_optics.element import Element
 
 # -- thickness limits --------------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ _LONGEST = 80
 _PER_ABBE = 0.01
 
 #: Catalogs that come with a lens, by name in capitals: a description of their source, and a function that reads them.
-AtHand = Mapping[str, tuple[str, Callable[[], Catalog]]]
+CatalogSources = Mapping[str, tuple[str, Callable[[], Catalog]]]
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def _catalog_glass(
     return glass
 
 
-def catalogs_in_folder(file: str) -> AtHand:
+def catalogs_in_folder(file: str) -> CatalogSources:
     """The glass catalogs (.agf) in the folder of a lens file."""
     try:
         paths = sorted(path for path in Path(file).parent.iterdir() if path.suffix.lower() == ".agf" and path.is_file())
@@ -151,7 +151,7 @@ def catalogs_in_folder(file: str) -> AtHand:
 
 
 def catalogs_of_lens(
-    names: Sequence[str], user: Sequence[Path], report: Draft, packed: AtHand | None = None
+    names: Sequence[str], user: Sequence[Path], report: Draft, packed: CatalogSources | None = None
 ) -> tuple[str | Catalog, ...]:
     """The catalogs that a lens file names, in its order: a `Catalog` that came with the lens, others by name.
 
@@ -239,8 +239,13 @@ def _finds(glass: Glass, names: tuple[str, ...], user: Sequence[Path], place: Pl
             listed = find_glass(glass.name, catalogs=catalogs, user=tuple(user), where=str(place))
     except UnknownGlass:
         return bool(glass.catalog)
-    same = listed.formula == glass.formula and listed.coefficients.shape == glass.coefficients.shape
-    return same and torch.equal(listed.coefficients.double(), glass.coefficients.detach().double().cpu())
+    return same_figures(listed, glass)
+
+
+def same_figures(a: Glass, b: Glass) -> bool:
+    """Whether two glasses have the same formula and coefficients."""
+    first, second = (glass.coefficients.detach().double().cpu() for glass in (a, b))
+    return a.formula == b.formula and torch.equal(first, second)
 
 
 def listed_name(glass: Glass, place: Place) -> str:

@@ -326,7 +326,7 @@ def _refuse_incomplete(parts: _Sections) -> None:
     for keyword, count in counts:
         if count != last and not (keyword == "LEN NEW" and count > last):  # space for more surfaces
             place = end.place if keyword == "END" else parts.head.place
-            raise LensFileError(f"{keyword} says that the image is surface {count:g}, but it is {last}", place)
+            raise LensFileError(f"{keyword} states that the image is surface {count:g}, but it is {last}", place)
     if surfaces[-1].number("TH", "focus shift"):
         shift = surfaces[-1].last("TH")
         message = f"TH {shift.words[0]} of the image (a focus shift) is not modelled; add it to the thickness before"

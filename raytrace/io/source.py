@@ -190,11 +190,12 @@ def nonzero(number: float | None) -> Tensor | None:
     return double(number) if number else None
 
 
-def exact(number: Tensor | float, quantity: str, place: Place) -> str:
-    """The shortest decimal (at most 17 digits) that reads back as the same 64-bit number.
+def exact(number: Tensor | float | None, quantity: str, place: Place) -> str:
+    """The shortest decimal (at most 17 digits) that reads back as the same 64-bit number; 0.0 for None.
 
     Raises LensFileError for a batch of numbers, nan and infinity.
     """
+    number = 0.0 if number is None else number
     return exact_list(torch.as_tensor(number, dtype=torch.float64), quantity, place, axes=0)[0]
 
 

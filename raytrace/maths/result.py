@@ -1,8 +1,9 @@
-"""Results: what a verb gives, as numbers, as a table, as text, as a document for JSON and as a figure."""
+"""Results of public functions: numbers, a table, a text, a document for JSON and a figure."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,6 +12,19 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.plotting import style
+
+#: Units of columns by name; those of fields are the lens's, the name of a column in per cent ends in _percent.
+UNITS = {
+    "wavelength": "µm", "frequency": "1/mm", "projected_solid_angle": "sr", "lower": "°", "chief": "°", "upper": "°",
+    **dict.fromkeys(
+        (
+            "radius", "thickness", "semi_diameter", "height", "shift", "crossing", "x", "y", "z", "opl",
+            "object_distance", "sensor_distance", "rms_radius", "geometric_radius", "optical_invariant", "sigma",
+            "marginal_yni", "chief_yni", "centroid_x", "centroid_y", "sigma_x", "sigma_y", "efl",
+        ),
+        "mm",
+    ),
+}  # fmt: skip
 
 
 class Result:
@@ -21,6 +35,9 @@ class Result:
     """
 
     __slots__ = ()
+
+    #: Units of columns that differ from the table UNITS, by name.
+    UNITS: ClassVar[Mapping[str, str]] = {}
 
     @property
     def falls_short(self) -> bool:
@@ -35,16 +52,25 @@ class Result:
         """Texts of a column whose numbers, 0 and up, count them, by the name of the column."""
         return {}
 
+    def unit_of(self, column: str) -> str:
+        """The unit of a column, in text, JSON and frames; "" of a plain number."""
+        if column in self.UNITS:
+            return self.UNITS[column]
+        if column in ("field_x", "field_y"):
+            return self.lens.fields.unit
+        return "%" if column.endswith("_percent") else UNITS.get(column, "")
+
     def units(self) -> dict[str, str]:
         """Units of columns by their names, of those that have one; `to_frame` has them in `attrs`."""
-        return {}
+        return {name: unit for name in self.columns() if (unit := self.unit_of(name))}
 
     def to_frame(self):
         """The table for pandas, a row for every point of every curve; units are in `frame.attrs["units"]`."""
         import pandas
 
-        frame = pandas.DataFrame(flat(self.columns()))
-        frame.attrs["units"] = self.units()
+        columns = self.columns()
+        frame = pandas.DataFrame(flat(columns))
+        frame.attrs["units"] = {name: unit for name in columns if (unit := self.unit_of(name))}
         return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in self.words().items()})
 
     def save(self, path: str | PathLike) -> None:
@@ -52,7 +78,7 @@ class Result:
         write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
 
     def document(self) -> dict:
-        """The result for JSON: plain numbers, null for what is undefined."""
+        """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}
 
     def draw(self, **options):
@@ -93,7 +119,7 @@ def rows(columns: dict[str, Tensor]) -> list[dict]:
 
 
 def number(value) -> float | None:
-    """A number for JSON; null for what is undefined, infinite or not there."""
+    """A number for JSON; null for undefined, infinite and missing ones."""
     if value is None:
         return None
     value = float(value)
@@ -106,7 +132,7 @@ def numbers(values: Tensor) -> list:
 
 
 def plain(document):
-    """A document for JSON: null for what is no finite number."""
+    """A document for JSON: null for numbers that are not finite."""
     if isinstance(document, dict):
         return {name: plain(entry) for name, entry in document.items()}
     if isinstance(document, list | tuple):

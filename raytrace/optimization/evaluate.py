@@ -49,6 +49,8 @@ class MeritResult(Result):
     skipped: tuple[int, ...]
     each: bool = False
 
+    UNITS = property(lambda self: dict.fromkeys(("target", "value"), f"of the operand, lengths in {self.unit:g} mm"))
+
     def columns(self) -> dict[str, Tensor]:
         words, valued = self.words(), self.valued()
         operands = [words["operand"].index(row.name) for row in valued]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.variables import GLASS, Address, UnknownNumber, names_at, path_of, with_numbers_of
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths
 from raytrace.system.phases import power_of
@@ -22,7 +22,7 @@ from raytrace.system.surface import gap_behind, medium_surfaces, vertex_curvatur
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
-from raytrace.tracing.trace import media, sequence_of
+from raytrace.tracing.trace import sequence_of
 
 #: Numbers that a surface keeps at 0 as None.
 _AT_ZERO = ("curvature", "conic")

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.system.lens import Lens, index_behind
+from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import sag_at, signed, vertex_curvature
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
-from raytrace.tracing.trace import media, sequence_of, trace_surfaces
+from raytrace.tracing.trace import sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))

@@ -16,7 +16,7 @@ INK = "#262626"
 GREY = "#7a7a7a"
 FAINT = "#d0d0d0"
 
-#: Colours of the fields: Okabe and Ito's set, told apart by colour-blind readers; the first three differ most.
+#: Colours of the fields: Okabe and Ito's set, distinct for colour-blind readers; the first three differ most.
 FIELD_COLOURS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#6A51A3", "#525252")
 
 #: Colours of wavelengths the eye does not see, and markers of all wavelengths, in order.
@@ -153,7 +153,7 @@ def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
 
 
 def length_text(length: float, digits: int = 4) -> str:
-    """A length in mm as a reader would say it: µm below 0.1 mm, m from 10 m, km from 10 km."""
+    """A length in mm with a suitable unit: µm below 0.1 mm, m from 10 m, km from 10 km."""
     if math.isinf(length):
         return "∞"
     scales = ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km"))

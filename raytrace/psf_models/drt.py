@@ -457,17 +457,15 @@ def stream_kernels(
     grid: Grid,
     rays: int,
     *,
-    sampling: str = "sobol",
-    seed: int = 0,
     width: float = 0.25,
     max_bytes: float = streaming.MAX_BYTES,
     progress: streaming.Progress | None = None,
 ) -> tuple[Kernels, Kernels]:
-    """Kernels of `rays` independent rays for each distance, field and wavelength, as `kernels_of_rays`, and of the
-    first half of them; without derivatives.
+    """Kernels of `rays` Sobol rays for each distance, field and wavelength, as `kernels_of_rays`, and of the first half
+    of them; without derivatives.
 
-    sampling, seed: as for `stream_spots`; width: half width in pixels of the blur of each ray, 0 for none; max_bytes:
-    additional memory; progress: called with the number of rays traced since the last call. Sums are float64.
+    width: half width in pixels of the blur of each ray, 0 for none; max_bytes: additional memory; progress: called with
+    the number of rays traced since the last call. Sums are float64.
     """
     shape, lens = scene.shape, scene.lens
     like = lens.surfaces[-2].thickness
@@ -479,7 +477,7 @@ def stream_kernels(
     references: list[Tensor] = []
     sums, images = [streaming.nothing(like)] * len(shots), like.new_zeros(len(shots), *grid.shape, dtype=torch.float64)
     done, half = 0, max(1, rays // 2)
-    for points in streaming.pupil_chunks(rays, size, sampling=sampling, seed=seed, like=like, cut=half):
+    for points in streaming.pupil_chunks(rays, size, sampling="sobol", seed=0, like=like, cut=half):
         for k, s in enumerate(shots):
             landing, valid = streaming.hits(s, points)
             if not done:

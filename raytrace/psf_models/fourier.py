@@ -39,9 +39,9 @@ from raytrace.psf_models.dft import (
 from raytrace.psf_models.paraxial import chief_ray_height, need_one_focus
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves, reach
 from raytrace.psf_models.result import Kernels, centroid_and_covariance
+from raytrace.system.lens import media
 from raytrace.tracing.paraxial import first_order, signed
 from raytrace.tracing.scene import Scene, symmetry
-from raytrace.tracing.trace import media
 
 _MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refused
 

@@ -158,7 +158,10 @@ class Psf(Result):
             "field": numbers(self.fields[:, place[1]]),
             **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
             **{key: numbers(getattr(self, key)[at]) for key in ("centroid", "ray_centroid")},
-            **{key: _square(getattr(self, key)[at]) for key in ("covariance", "ray_covariance")},
+            **{  # [[xx, xy], [xy, yy]]
+                key: [numbers(getattr(self, key)[at][:2]), numbers(getattr(self, key)[at][1:])]
+                for key in ("covariance", "ray_covariance")
+            },
             "energy": number(self.energy[place]),
             "error": number(self.error[place]),
             "residual": None if self.residual is None else number(self.residual[place]),
@@ -182,25 +185,20 @@ class Psf(Result):
         if self.waves:
             lines.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
         sigmas, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
-        table = {
-            ("object", "mm", 12): lambda at: f"{float(self.object_distances[at[0]]):g}",
-            ("field", FIELD_UNITS[self.lens.fields.kind], 9): lambda at: name_of_field(self.fields[:, at[1]]),
-            ("λ", "µm", 9): lambda at: f"{float(self.wavelengths[at[2]]):g}",
-            ("centroid x", "mm", 12): lambda at: cell(float(self.centroid[0][at]), ".6f"),
-            ("centroid y", "mm", 12): lambda at: cell(float(self.centroid[1][at]), ".6f"),
-            ("σ x", "µm", 9): lambda at: cell(float(sigmas[0][at]), ".4f"),
-            ("σ y", "µm", 9): lambda at: cell(float(sigmas[1][at]), ".4f"),
-            ("rays' σ x", "µm", 9): lambda at: cell(float(rays[0][at]), ".4f"),
-            ("rays' σ y", "µm", 9): lambda at: cell(float(rays[1][at]), ".4f"),
-            ("energy", "window", 8): lambda at: f"{float(self.energy[at]):.4f}",
-            ("error", "est.", 9): lambda at: cell(float(self.error[at]), ".1e"),
-            ("rays", "", 7): lambda at: f"{self.rays}",
-        }
-        left_out = ("λ",) * self.wavelengths_summed + ("rays' σ x", "rays' σ y") * (not self.waves)
-        shown = {column: text for column, text in table.items() if column[0] not in left_out}
-        lines += [" ".join(f"{column[k]:>{column[2]}}" for column in shown) for k in (0, 1)]
+        columns = [("centroid x", "mm", 12, self.centroid[0], ".6f"), ("centroid y", "mm", 12, self.centroid[1], ".6f")]
+        columns += [("σ x", "µm", 9, sigmas[0], ".4f"), ("σ y", "µm", 9, sigmas[1], ".4f")]
+        if self.waves:
+            columns += [("rays' σ x", "µm", 9, rays[0], ".4f"), ("rays' σ y", "µm", 9, rays[1], ".4f")]
+        columns += [("energy", "window", 8, self.energy, ".4f"), ("error", "est.", 9, self.error, ".1e")]
+        first = [("object", "mm", 12), ("field", FIELD_UNITS[self.lens.fields.kind], 9), ("λ", "µm", 9)]
+        first = first[: self.energy.dim()]
+        headings = [*first, *(column[:3] for column in columns), ("rays", "", 7)]
+        lines += [" ".join(f"{heading[k]:>{heading[2]}}" for heading in headings) for k in (0, 1)]
         for at in np.ndindex(self.energy.shape):
-            lines.append(" ".join(f"{text(at):>{width}}" for (_, _, width), text in shown.items()))
+            cells = [f"{float(self.object_distances[at[0]]):g}", name_of_field(self.fields[:, at[1]])]
+            cells += [f"{float(self.wavelengths[w]):g}" for w in at[2:]]
+            cells += [cell(float(values[at]), form) for *_, values, form in columns] + [f"{self.rays}"]
+            lines.append(" ".join(f"{text:>{heading[2]}}" for text, heading in zip(cells, headings, strict=True)))
         if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
             lines.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
         return "\n".join(lines)
@@ -213,11 +211,6 @@ class Psf(Result):
         shares = (self.wavelength_weights / self.wavelength_weights.max()).tolist()
         shares = ":".join(f"{share:.3g}" for share in shares)
         return f"summed over {named} µm by weights {shares}" if self.wavelengths_summed else f"each of {named} µm"
-
-
-def _square(covariance: Tensor) -> list[list]:
-    """[[xx, xy], [xy, yy]]; nulls where there is no light."""
-    return [numbers(covariance[:2]), numbers(covariance[1:])]
 
 
 def _sigmas(covariance: Tensor) -> Tensor:

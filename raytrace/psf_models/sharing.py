@@ -58,8 +58,15 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
                 part = dataclasses.replace(part, largest=largest)
             light = kernels(part, dataclasses.replace(grid, centre=centre), **options)
             rays = int(largest(torch.tensor(light.rays)))
-        light = _joined(light, scene.shape, block if share.rank < math.prod(cut) else None)
-        return dataclasses.replace(light, grid=grid, rays=rays)
+
+        def whole(parts: list[Tensor], before: int) -> Tensor:
+            (part,) = parts
+            joined = part.new_zeros(*part.shape[:before], *scene.shape, *part.shape[before + 3 :])
+            if share.rank < math.prod(cut):  # the process does not repeat a block
+                joined[(slice(None),) * before + block] = part.detach()
+            return total(joined)
+
+        return dataclasses.replace(combined([light], whole), grid=grid, rays=rays)
 
     return compute
 
@@ -97,16 +104,3 @@ def _block(shape: Sequence[int], cut: Sequence[int], number: int) -> tuple[slice
         number, part = divmod(number, parts)
         slices.append(Share(part, parts).part(count))
     return tuple(reversed(slices))
-
-
-def _joined(light: Kernels, shape: Sequence[int], block: tuple[slice, ...] | None) -> Kernels:
-    """All kernels from the blocks of all processes; block: of this process, None if another process has it too."""
-
-    def whole(parts: list[Tensor], before: int) -> Tensor:
-        (part,) = parts
-        joined = part.new_zeros(*part.shape[:before], *shape, *part.shape[before + 3 :])
-        if block is not None:
-            joined[(slice(None),) * before + block] = part.detach()
-        return total(joined)
-
-    return combined([light], whole)

@@ -15,14 +15,14 @@ from raytrace.materials.environment import (
     objection,
     unknown_change,
 )
-from raytrace.materials.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
 from raytrace.maths.value import check_precision, value
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean
 
 #: Units of a field point by the kind of field.
@@ -75,6 +75,11 @@ class Fields:
     weight: Tensor
     vignetting: Tensor | None = None
     telecentric: bool = False
+
+    @property
+    def unit(self) -> str:
+        """The unit of field points."""
+        return FIELD_UNITS[self.kind]
 
 
 @value
@@ -344,6 +349,48 @@ def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
     if air is None and surface.environment is None:
         return refractive_index(surface.glass, wavelength)
     return index_in(surface.glass, wavelength, air or _reference(wavelength), surface.environment)
+
+
+def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
+    """Refractive index behind every surface, object first; positive also behind a mirror.
+
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
+    break keeps the medium. A medium that does not change is the same tensor, so that a trace refracts nothing there.
+    """
+    dtype, numbers = lens.surfaces[-2].thickness.dtype, medium_surfaces(lens.surfaces)
+    in_air = lens.environment is None and all(surface.environment is None for surface in lens.surfaces)
+    # Air lies between all elements: each medium is evaluated once.
+    distinct: dict[tuple, int] = {}
+    keys = []
+    for number in numbers:
+        surface = lens.surfaces[number]
+        glass, air = surface.glass, () if in_air else (surface.glass.records, id(surface.environment))
+        keys.append((glass.formula, id(glass.coefficients), *air))
+        distinct.setdefault(keys[-1], number)
+    if in_air:
+        indices = _refractive_indices([lens.surfaces[number].glass for number in distinct.values()], wavelength)
+    else:
+        indices = [index_behind(lens, number, wavelength) for number in distinct.values()]
+    by_medium = {key: n.to(dtype) for key, n in zip(distinct, indices, strict=True)}
+    return [by_medium[key] for key in keys]
+
+
+def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:
+    """`refractive_index` of each glass; glasses of one formula are evaluated together."""
+    groups: dict[object, list[int]] = {}
+    for number, medium in enumerate(glasses):
+        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
+        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    indices: dict[int, Tensor] = {}
+    for numbers in groups.values():
+        if len(numbers) == 1:
+            indices[numbers[0]] = refractive_index(glasses[numbers[0]], wavelength)
+            continue
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
+        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        group = dataclasses.replace(glasses[numbers[0]], coefficients=stacked)
+        indices |= dict(zip(numbers, refractive_index(group, wavelength[None]).unbind(0), strict=True))
+    return [indices[number] for number in range(len(glasses))]
 
 
 def _reference(like: Tensor) -> Environment:

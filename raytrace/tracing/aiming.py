@@ -16,11 +16,11 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, safe_divide, varies, with_batch_axes
 from raytrace.maths.value import detached
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
-from raytrace.tracing.trace import lens_steps, media, trace_surfaces
+from raytrace.tracing.trace import lens_steps, trace_surfaces
 from raytrace.words import named
 
 _STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
@@ -101,7 +101,9 @@ def aim_at_image(
         rays = through(unknown[:2], pupil)
         (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
         off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
-        return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
+        if radius is not None:  # at the stop, chief rays of all heights may share one point
+            off = torch.broadcast_tensors(*off, *(at / radius for at in stop))
+        return torch.stack(off), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
     given = lens, height, through(start[:2].detach(), torch.zeros_like(start[:2])), radius

@@ -18,13 +18,13 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit
 from raytrace.maths.value import value
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.aiming import aim_at_middle, is_bent
 from raytrace.tracing.paraxial import cone_angle, first_order, object_distance_of
-from raytrace.tracing.trace import media, steps
+from raytrace.tracing.trace import steps
 
 _PARALLEL = 1e-15  # rad per mm, and other quantities that are 0 but for rounding
 

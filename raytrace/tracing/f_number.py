@@ -3,12 +3,11 @@
 import torch
 from torch import Tensor
 
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
-from raytrace.tracing.trace import media
 
 
 def working_f_number(lens: Lens) -> Tensor:

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.value import detached, value
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import lens_steps, media
+from raytrace.tracing.trace import lens_steps
 from raytrace.words import calling_level
 
 #: Points of the pupil whose rays are highest on a surface.

@@ -15,7 +15,7 @@ from raytrace.materials.glass import label
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.system.configurations import count
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, media
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
@@ -26,7 +26,6 @@ from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import media
 
 #: What phases and departures are called, with their own numbers; of others their kind stands alone.
 _WORDS = {

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from raytrace.maths.dual import quotient, select, value_of
 from raytrace.maths.value import value
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu
-from raytrace.tracing.trace import media
 
 
 @value

@@ -18,12 +18,12 @@ from raytrace.files import write_atomically
 from raytrace.io.ray_tables import read_rays
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
+from raytrace.system.lens import Lens, field_points, media, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import STATUS, LostRays
-from raytrace.tracing.trace import axial_path, media, sequence_of, steps, trace_lens
+from raytrace.tracing.trace import axial_path, sequence_of, steps, trace_lens
 from raytrace.words import calling_level
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))

@@ -18,12 +18,12 @@ from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import broadcast_shape, varies
 from raytrace.maths.value import value
 from raytrace.system.apertures import SHAPES
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import Crossing, lens_steps, media, sequence_of, steps, trace_lens, trace_surfaces
+from raytrace.tracing.trace import Crossing, lens_steps, sequence_of, steps, trace_lens, trace_surfaces
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: accepted error of interpolated rays

@@ -19,14 +19,14 @@ from torch.utils import _pytree as pytree
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import to, value
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_searched
 from raytrace.tracing.aiming import aiming_of
 from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 from raytrace.tracing.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.tracing.spot import where_lit
-from raytrace.tracing.trace import media, sequence_of, trace_surfaces
+from raytrace.tracing.trace import sequence_of, trace_surfaces
 
 MAX_BYTES = 256 * 2**20
 _CHUNK = {"cpu": 2**15}  # rays whose temporaries stay in the caches of a core

@@ -2,7 +2,7 @@
 
 The trace is a generator: to record, draw or find where a ray failed, consume `steps`; to resume from stored rays, pass
 them with the remaining surfaces. `trace_surfaces` and `trace_lens` return the last rays only, through the compiled
-engine where that is available and pays. `media` and `sequence_of` give the indices and surfaces a lens is traced as.
+engine where that is available and pays.
 """
 
 import dataclasses
@@ -13,17 +13,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.materials import glass
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import value
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
-from raytrace.system.lens import Lens, index_behind
-from raytrace.system.phases import IdealLens, power_of
+from raytrace.system.lens import Lens, media
+from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
+from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.compiled import is_expressible, trace_compiled, uses_compiled
+from raytrace.tracing.paraxial import power, signed, ynu
 from raytrace.tracing.refraction import deflect
 
 
@@ -184,7 +184,7 @@ def trace_surfaces(
 ) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`.
 
-    The compiled engine traces the runs of surfaces that it supports, where it pays: see `compiled.run`.
+    The compiled engine traces the runs of surfaces that it supports, where it pays: see `tracing.compiled`.
     """
     if torch.compiler.is_compiling():
         return _eager(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap)
@@ -238,66 +238,14 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
     surfaces = lens.surfaces[1:]
     if not any(isinstance(surface.phase, IdealLens) for surface in surfaces):
         return surfaces
-    wavelength, side, sequence = lens.primary, 1, []
-    indices = media(lens, wavelength)
-    y, omega = torch.ones_like(indices[0]), indices[0] / lens.surfaces[0].thickness
-    for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
-        behind = -side if surface.is_mirror else side
-        power = vertex_curvature(surface) * (behind * n2 - side * n1)
-        power = power if surface.phase is None else power + power_of(surface.phase, wavelength)[1]
+    indices, sequence = media(lens, lens.primary), []
+    n = signed(surfaces, indices)
+    powers = [power(*each, lens.primary) for each in zip(surfaces, n[:-1], n[1:], strict=True)]
+    gaps = [surface.thickness / behind for surface, behind in zip(surfaces, n[1:], strict=True)]
+    rays = ynu(torch.ones_like(n[0]), n[0] / lens.surfaces[0].thickness, powers, gaps)
+    for surface, before, (y, omega) in zip(surfaces, indices, rays, strict=False):
         if isinstance(surface.phase, IdealLens):
-            vergence = omega / (n1 * torch.where(y == 0, torch.finfo(y.dtype).tiny ** 0.5, y))
-            phase = dataclasses.replace(surface.phase, vergence=vergence)
-            surface = dataclasses.replace(surface, phase=phase)
+            vergence = omega / (before * torch.where(y == 0, torch.finfo(y.dtype).tiny ** 0.5, y))
+            surface = dataclasses.replace(surface, phase=dataclasses.replace(surface.phase, vergence=vergence))
         sequence.append(surface)
-        omega = omega - power * y
-        y, side = y + surface.thickness * omega / (behind * n2), behind
     return tuple(sequence)
-
-
-def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
-    """Refractive index behind every surface, object first; positive also behind a mirror.
-
-    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
-    break keeps the medium. A medium that does not change is the same tensor, so that `cross` refracts nothing there.
-    """
-    dtype = lens.surfaces[-2].thickness.dtype
-    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
-        return _media_in_environment(lens, wavelength, dtype)
-    glasses = [lens.surfaces[k].glass for k in medium_surfaces(lens.surfaces)]
-    # Air lies between all elements: each medium is evaluated once.
-    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in glasses}
-    indices = _refractive_indices(list(distinct.values()), wavelength)
-    by_medium = dict(zip(distinct, (n.to(dtype) for n in indices), strict=True))
-    return [by_medium[medium.formula, id(medium.coefficients)] for medium in glasses]
-
-
-def _media_in_environment(lens: Lens, wavelength: Tensor, dtype: torch.dtype) -> list[Tensor]:
-    """`media` of a lens at a temperature and a pressure."""
-    indices: list[Tensor] = []
-    by_medium: dict[tuple, Tensor] = {}
-    for number in medium_surfaces(lens.surfaces):
-        surface = lens.surfaces[number]
-        key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
-        if key not in by_medium:
-            by_medium[key] = index_behind(lens, number, wavelength).to(dtype)
-        indices.append(by_medium[key])
-    return indices
-
-
-def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
-    """`refractive_index` of each glass; glasses of one formula are evaluated together."""
-    groups: dict[object, list[int]] = {}
-    for number, medium in enumerate(glasses):
-        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
-        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
-    indices: dict[int, Tensor] = {}
-    for numbers in groups.values():
-        if len(numbers) == 1:
-            indices[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
-            continue
-        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
-        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
-        group = dataclasses.replace(glasses[numbers[0]], coefficients=stacked)
-        indices |= dict(zip(numbers, glass.refractive_index(group, wavelength[None]).unbind(0), strict=True))
-    return [indices[number] for number in range(len(glasses))]

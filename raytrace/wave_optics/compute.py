@@ -150,7 +150,7 @@ class ElementPsf(Result):
         if what == "heights":
             return figures.height_figure(self.scene.elements, title=self.title)
         if what == "caustic":
-            return figures.caustic_figure(self, *caustic(self.scene, **({"progress": progress} if progress else {})))
+            return figures.caustic_figure(self, *caustic(self.scene, progress=progress or _silent))
         if what not in ("kernels", "encircled"):
             raise ValueError(f"no figure {what!r}; expected one of kernels, heights, caustic, encircled")
         return figures.psf_figure(self) if what == "kernels" else figures.encircled_figure(self)
@@ -211,6 +211,7 @@ _DESIGN = 0.55  # µm
 _CHUNK = 1e9  # bytes: beyond, kernels are computed one by one
 _RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
 _PLANES, _RANGE, _ACROSS = 121, (0.8, 1.2), 0.05  # of a caustic: over the sensor distance, and of the aperture
+_COLUMNS = 201
 
 #: Shows the progress of a loop: (its items, their unit) -> the items.
 Progress = Callable[[Sequence, str], Iterable]
@@ -374,27 +375,17 @@ def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
 
 
 @torch.no_grad()
-def caustic(
-    scene: WaveScene,
-    distances: Tensor | None = None,
-    *,
-    half: float | None = None,
-    columns: int = 201,
-    tol: float = 1e-2,
-    progress: Progress = _silent,
-) -> tuple[Tensor, Tensor, float]:
-    """The caustic of a scene: light per mm² (D, W, Z, columns), 1 = all through the aperture, on y = 0 from -half to
-    half mm; its distances (Z,) mm; and half.
+def caustic(scene: WaveScene, *, progress: Progress = _silent) -> tuple[Tensor, Tensor, float]:
+    """The caustic of a scene: light per mm² (D, W, Z, 201), 1 = all through the aperture, on y = 0 from -half to half
+    mm; its distances (Z,) mm from the element, 0.8 to 1.2 of the sensor distance; and half, a tenth of the radius.
 
-    distances: from element to plane, by default from four fifths to six fifths of the sensor distance; half: by default
-    a tenth of the radius. Pixels and sensor do not count. Light is the mean over squares 2·half/columns wide.
+    Light is the mean over squares 2·half/201 wide.
     """
-    z = scene.sensor_distance
-    distances = z * torch.linspace(*_RANGE, _PLANES, dtype=z.dtype) if distances is None else distances.to(z)
-    half = 2 * _ACROSS * float(aperture(scene)) if half is None else half
-    line = grid(torch.as_tensor(2 * half / columns).to(z), (1, columns))
+    distances = scene.sensor_distance * torch.linspace(*_RANGE, _PLANES).to(scene.sensor_distance)
+    half = 2 * _ACROSS * float(aperture(scene))
+    line = grid(torch.as_tensor(2 * half / _COLUMNS).to(distances), (1, _COLUMNS))
     planes = [
-        psf(dataclasses.replace(scene, sensor_distance=distance, grid=line), tol=tol).kernel[..., 0, :] / line.pitch**2
+        psf(dataclasses.replace(scene, sensor_distance=distance, grid=line), tol=1e-2).kernel[..., 0, :] / line.pitch**2
         for distance in progress(distances, "plane")
     ]
     return torch.stack(planes, -2), distances, half

@@ -156,7 +156,9 @@ def matched(element: Element, process: Process, wavelengths: Tensor) -> tuple[El
         pistons = 2 * math.pi * torch.rand(len(rate), generator=random, dtype=torch.float64).to(wanted)
         pistons = pistons if trial else torch.zeros_like(pistons)
         for _ in range(_ROUNDS):
-            agreement = _agreement(rate, depths, wanted, pistons)
+            agreement = torch.zeros(len(depths), len(wanted)).to(wanted)  # Σ_λ cos of the differences in phase
+            for slope, piston in zip(rate, pistons, strict=True):
+                agreement += torch.cos(slope * (depths[:, None] - wanted) - piston)
             nearest = depths[agreement.argmax(0)]
             pistons = torch.angle(
                 (area * torch.polar(torch.ones_like(rate)[:, None], rate[:, None] * (nearest - wanted))).sum(1)
@@ -166,11 +168,3 @@ def matched(element: Element, process: Process, wavelengths: Tensor) -> tuple[El
             best, most = nearest, near
     etched = element.with_numbers(best.reshape(element.numbers.shape))
     return dataclasses.replace(etched, period=process.period(element), levels=process.levels), most
-
-
-def _agreement(rate: Tensor, depths: Tensor, wanted: Tensor, pistons: Tensor) -> Tensor:
-    """Σ_λ cos (C, R) of phases of depths (C,) with those wanted (R,)."""
-    total = torch.zeros(len(depths), len(wanted)).to(wanted)
-    for slope, piston in zip(rate, pistons, strict=True):
-        total += torch.cos(slope * (depths[:, None] - wanted) - piston)
-    return total

@@ -229,7 +229,13 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
     rows, rest = divmod(len(table), columns)
     if rest:
         raise HeightMapError(f"has {len(table)} points, no whole number of rows of {columns}", file, len(table) + 1)
-    pitch = _pitch_between(table, rows, columns, known, file)
+    pitch = known.pitch  # a single pixel has none
+    if len(table) > 1:
+        axis, count = (0, columns) if columns > 1 else (1, rows)
+        pitch = float(f"{(table[-1, axis] - table[0, axis]) / (count - 1):.15g}")
+        if pitch <= 0:
+            ends = f"{table[0, axis]:g} to {table[-1, axis]:g} mm"
+            raise HeightMapError(f"has {'xy'[axis]} from {ends}; expected increasing coordinates", file)
     if pitch is None:
         raise HeightMapError(_NO_PITCH, file)
     line = np.arange(len(table)) + 2
@@ -237,18 +243,6 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
     _expect(table[:, 0], (x - 0.5 * (columns - 1)) * pitch, pitch, "x", file, line)
     _expect(table[:, 1], (y - 0.5 * (rows - 1)) * pitch, pitch, "y", file, line)
     return _profile(table[:, 2].reshape(rows, columns), pitch, file)
-
-
-def _pitch_between(table: np.ndarray, rows: int, columns: int, known: Known, file: str) -> float | None:
-    """The pitch of a table of pixels, to 15 digits; a single pixel has none."""
-    if rows == columns == 1:
-        return known.pitch
-    axis, count = (0, columns) if columns > 1 else (1, rows)
-    pitch = float(f"{(table[-1, axis] - table[0, axis]) / (count - 1):.15g}")
-    if pitch <= 0:
-        message = f"has {'xy'[axis]} from {table[0, axis]:g} to {table[-1, axis]:g} mm; expected it to rise"
-        raise HeightMapError(message, file)
-    return pitch
 
 
 def _expect(values: np.ndarray, wanted: np.ndarray, pitch: float, name: str, file: str, lines: np.ndarray) -> None:

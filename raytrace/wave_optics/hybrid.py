@@ -28,13 +28,13 @@ from raytrace.maths.zernike import noll
 from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels
 from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
-from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, with_object_distance
+from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, media, with_object_distance
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
-from raytrace.tracing.trace import media, sequence_of, trace_surfaces
+from raytrace.tracing.trace import sequence_of, trace_surfaces
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 

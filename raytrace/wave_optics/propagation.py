@@ -58,7 +58,7 @@ def transfer_function_intensity(
 def padded(samples: int, pad: float) -> int:
     """Samples of the padded transform: pad·samples or the next number of small factors, as odd or even as `samples`."""
     size = math.ceil(pad * samples - 1e-9)
-    while (size - samples) % 2 or not _smooth(size):
+    while (size - samples) % 2 or not _has_small_factors(size):
         size += 1
     return size
 
@@ -139,7 +139,7 @@ def _interpolation(s: Tensor, pitch: Tensor, size: int) -> tuple[Tensor, int, in
     return torch.sinc(apart) * window, first, last
 
 
-def _smooth(number: int) -> bool:
+def _has_small_factors(number: int) -> bool:
     for factor in (2, 3, 5, 7):
         while number % factor == 0:
             number //= factor

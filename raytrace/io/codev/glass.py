@@ -15,7 +15,15 @@ from typing import NamedTuple
 
 import torch
 
-from raytrace.io.assembly import by_figures, catalogs_in_folder, catalogs_of_lens, is_code, is_left_out, listed_glass
+from raytrace.io.assembly import (
+    by_figures,
+    catalogs_in_folder,
+    catalogs_of_lens,
+    is_code,
+    is_left_out,
+    listed_glass,
+    same_figures,
+)
 from raytrace.io.codev.keywords import unquoted
 from raytrace.io.source import (
     FORMULA,
@@ -307,21 +315,17 @@ def _by_digits(glass: Glass, place: Place) -> str:
 def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
     """The name of a private glass; one without a name gets one that is free."""
     if not glass.name:
-        same = (key for key, other in private.items() if not other.name and _same(other, glass))
+        same = (key for key, other in private.items() if not other.name and same_figures(other, glass))
         name = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)
         private[name] = glass
         return name
     if not re.fullmatch(r"[^\s'\"!;&^]+", glass.name) or glass.name.upper() in ("AIR", "REFL"):
         raise LensFileError(f"the name of the glass is {glass.name!r}, expected one word", place)
     key = glass.name.upper()
-    if key in private and not (_same(private[key], glass) and private[key].name == glass.name):
+    if key in private and not (same_figures(private[key], glass) and private[key].name == glass.name):
         raise LensFileError(f"two glasses are named {glass.name!r}; give one of them another name", place)
     private[key] = glass
     return glass.name
-
-
-def _same(a: Glass, b: Glass) -> bool:
-    return a.formula == b.formula and torch.equal(a.coefficients, b.coefficients)
 
 
 def _catalog_name(glass: Glass, user: Sequence[Path], place: Place) -> str:
@@ -337,7 +341,7 @@ def _catalog_name(glass: Glass, user: Sequence[Path], place: Place) -> str:
         if glass.catalog:
             return written
         listed = AIR
-    if listed.formula != glass.formula or not torch.equal(listed.coefficients, glass.coefficients.detach().cpu()):
+    if not same_figures(listed, glass):
         message = f"the figures of {glass.name!r} are not those of its catalog; a file holds its name only"
         raise LensFileError(f"{message}: use the listed glass or a model glass", place)
     return written

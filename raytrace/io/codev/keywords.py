@@ -55,8 +55,8 @@ APERTURE_WORDS = (*(word for words in APERTURES.values() for word in words), "AD
 RING = "RING"
 
 #: Data that CODE V has no command for are in comments, `!raytrace catalogs SCHOTT OHARA`.
-OWN = "!RAYTRACE"
-_OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
+COMMENT = "!RAYTRACE"
+_COMMENT_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 
 #: Decentres and tilts by the numbers of a pose; those about x and y are left-handed, their sign turns.
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
@@ -142,9 +142,9 @@ def commands(text: str, file: str) -> Iterator[Record]:
     waiting, start = "", 0
     for line_number, line in enumerate(text.split("\n"), 1):
         place = Place(file, line_number)
-        if line.lstrip().upper().startswith(OWN) and not waiting:
+        if line.lstrip().upper().startswith(COMMENT) and not waiting:
             _, *words = line.split(None, 2)
-            yield Record(OWN, tuple(words), words[-1] if len(words) > 1 else "", place, False)
+            yield Record(COMMENT, tuple(words), words[-1] if len(words) > 1 else "", place, False)
             continue
         held, start = _uncommented(line, place), start if waiting else line_number
         if held.rstrip().endswith("&"):
@@ -202,7 +202,7 @@ class Sections(NamedTuple):
     system: Block
     surfaces: list[Block]
     private: dict[str, Record]
-    own: list[Record]
+    comments: list[Record]
 
 
 class Stream:
@@ -212,18 +212,18 @@ class Stream:
         self.file, self.report = file, report
         self.system, self.surfaces = Block(Place(file)), []
         self.private: dict[str, Record] = {}
-        self.own: list[Record] = []
+        self.comments: list[Record] = []
         self.pointer: Block | None = None
         self.slope: str | None = None  # whether S gives radii (RDY) or curvatures (CUY)
         self.in_catalog = self.has_image = False
 
     def take(self, record: Record) -> None:
         """Sort one command in."""
-        if record.keyword == OWN:
+        if record.keyword == COMMENT:
             word = record.words[0].upper() if record.words else ""
-            status = READ if word in _OWN_WORDS else UNKNOWN
-            self.report.met(f"{OWN.lower()} {word.lower()[:40]}", status, record.place)
-            self.own.append(record._replace(keyword=word, place=self._place(record)))
+            status = READ if word in _COMMENT_WORDS else UNKNOWN
+            self.report.met(f"{COMMENT.lower()} {word.lower()[:40]}", status, record.place)
+            self.comments.append(record._replace(keyword=word, place=self._place(record)))
         elif self.in_catalog and record.keyword not in ("PWL", "END"):
             name, waves = unquoted(_WORD.match(record.text.strip())[0]), self.system.last("PWL")
             self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves.words if waves else ()))
@@ -383,4 +383,4 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         raise LensFileError("no surface (SO, S, SI); is it a sequence of CODE V (.seq)?", Place(file))
     if not stream.has_image:
         raise LensFileError(f"{len(stream.surfaces)} surfaces and no SI, the image: file cut off?", Place(file))
-    return Sections(stream.system, stream.surfaces, stream.private, stream.own)
+    return Sections(stream.system, stream.surfaces, stream.private, stream.comments)

@@ -31,13 +31,13 @@ from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_apertur
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
+    COMMENT,
     FIELD_KINDS,
     INFINITY,
     LEFT_HANDED,
     LETTERS,
     MOST_TERMS,
     NANOMETRE,
-    OWN,
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
@@ -93,14 +93,14 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     if reference is None and len(waves) > 1:
         message = f"no REF: the reference of the {len(waves)} wavelengths is not specified; add REF 1 to {len(waves)}"
         raise LensFileError(message, source.place)
-    private = codev_glass.private_glasses(parts.private, waves, _own_words(parts, "UNNAMED"), report)
+    private = codev_glass.private_glasses(parts.private, waves, _comment_words(parts, "UNNAMED"), report)
     glasses = [record.words[0] for block in parts.surfaces for record in block.all("GLA") if record.words]
     came = codev_glass.came_with(file, glasses, catalogs, report)
     library = codev_glass.GlassLibrary(private, came, catalogs, waves)
     surfaces, before = [], AIR
     for k, block in enumerate(parts.surfaces):
-        own = {record.keyword: record for record in parts.own if record.place.surface == k}
-        surface = _surface(block, unit, before, own, library, report)
+        comments = {record.keyword: record for record in parts.comments if record.place.surface == k}
+        surface = _surface(block, unit, before, comments, library, report)
         before = before if surface.is_mirror or surface.is_break else surface.glass
         surfaces.append(surface)
     solve, primary = system.last("PIM"), reference.integer(0, "number of the reference wavelength") if reference else 1
@@ -111,8 +111,8 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     focused = [*front, last, dataclasses.replace(image, thickness=torch.zeros_like(image.thickness))]
     weights, title = _numbers(system, "WTW", "weight"), system.last("TIT")
     stop, aperture = _stop(parts.surfaces, report), _system_aperture(system, surfaces[0], unit)
-    catalog_names = _own_words(parts, "CATALOGS")
-    if not any(record.keyword == "CATALOGS" for record in parts.own):
+    catalog_names = _comment_words(parts, "CATALOGS")
+    if not any(record.keyword == "CATALOGS" for record in parts.comments):
         catalog_names = dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog)
     title_words = title.words if title else ()
     draft = LensDraft(
@@ -125,7 +125,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
         wavelength_weights=weights and weights[0],
         primary_wavelength=primary,
         name=(unquoted(title_words[0]) if len(title_words) == 1 else " ".join(title_words)).strip(),
-        notes=tuple(plain_text(record.text) for record in parts.own if record.keyword == "NOTE"),
+        notes=tuple(plain_text(record.text) for record in parts.comments if record.keyword == "NOTE"),
         catalogs=tuple(catalog_names),
         ray_aiming=_aiming(parts, report),
         sources={"stop": ("STO", stop), "aperture": aperture[2], "wavelengths": ("WL", source.place)},
@@ -278,13 +278,14 @@ def _vignetting(system: Block, count: int, report: Draft) -> list[list[float]]:
 # -- comments of this package, and commands that are left out ---------------------------------------------------------
 
 
-def _own_words(parts: Sections, keyword: str) -> list[str]:
-    return [word for record in parts.own if record.keyword == keyword for word in words(" ".join(record.words[1:]))]
+def _comment_words(parts: Sections, keyword: str) -> list[str]:
+    texts = (" ".join(record.words[1:]) for record in parts.comments if record.keyword == keyword)
+    return [word for text in texts for word in words(text)]
 
 
 def _aiming(parts: Sections, report: Draft) -> str:
     """CODE V aims reference rays at the stop; EPD is the diameter of the real beam on the axis."""
-    comments = [record for record in parts.own if record.keyword == "AIMING"]
+    comments = [record for record in parts.comments if record.keyword == "AIMING"]
     if not comments:
         report.note(
             "ray aiming is not specified: real, as CODE V aims at the stop, which is as wide as the real marginal ray "
@@ -293,7 +294,7 @@ def _aiming(parts: Sections, report: Draft) -> str:
         return "real"
     word = comments[-1].text.strip().lower()
     if word not in RAY_AIMING:
-        message = f"{OWN.lower()} aiming is {shown(word)}, expected one of {', '.join(RAY_AIMING)}"
+        message = f"{COMMENT.lower()} aiming is {shown(word)}, expected one of {', '.join(RAY_AIMING)}"
         raise LensFileError(message, comments[-1].place)
     return word
 
@@ -321,18 +322,19 @@ def _surface(
     block: Block,
     unit: float,
     before: Glass,
-    own: dict[str, Record],
+    comments: dict[str, Record],
     library: codev_glass.GlassLibrary,
     report: Draft,
 ) -> Surface:
     """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
 
-    own: comments of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase.
+    comments: of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase.
     """
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
-    glass, is_break = _medium(block, before, library, report), "BREAK" in own
-    radius = number((own["RADIUS"].text or "?").strip(), "radius", own["RADIUS"].place) if "RADIUS" in own else 1.0
+    glass, is_break = _medium(block, before, library, report), "BREAK" in comments
+    stated = comments.get("RADIUS")
+    radius = number((stated.text or "?").strip(), "radius", stated.place) if stated else 1.0
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
     slope = block.last("CUY")  # or RDY, a radius; 0 is a plane in both

@@ -13,13 +13,13 @@ from torch import Tensor
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
+    COMMENT,
     FIELD_KINDS,
     INFINITY,
     LEFT_HANDED,
     LETTERS,
     MOST_TERMS,
     NANOMETRE,
-    OWN,
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
@@ -78,7 +78,7 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     x, y = FIELD_KINDS[fields.kind]
     return [
         "RDM N;LEN",
-        *_own(lens, private, place),
+        *_comments(lens, private, place),
         f"TITLE {_quoted(lens.name, 'the title', place)}" if lens.name else "",
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
@@ -98,15 +98,15 @@ def _weights(numbers: Tensor, quantity: str, place: Place) -> list[str]:
     return [weight.removesuffix(".0") for weight in exact_list(numbers, quantity, place)]
 
 
-def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
+def _comments(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     """Data that CODE V has no command for, in comments."""
-    own = OWN.lower()
+    start = COMMENT.lower()
     unnamed = [key for key, glass in private.items() if not glass.name]
     return [
-        *(f"{own} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
-        f"{own} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{own} catalogs",
-        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
-        f"{own} unnamed {' '.join(unnamed)}" if unnamed else "",
+        *(f"{start} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
+        f"{start} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{start} catalogs",
+        f"{start} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
+        f"{start} unnamed {' '.join(unnamed)}" if unnamed else "",
     ]
 
 
@@ -185,14 +185,14 @@ def _surface(
     refuse_sag_terms(dataclasses.replace(rest, phase=None) if is_round else rest, place)
     last = len(lens.surfaces) - 1
     name = {0: "SO", last: "SI"}.get(number, "S")
-    curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
+    curvature = exact(surface.curvature, "curvature", place)
     glass = codev_glass.word(_medium(lens, number), private, user, place)
     label = _quoted(surface.comment, "the comment", place) if surface.comment.strip() else ""
     return [
         f"{name} {curvature} {_thickness(surface, number == last, place)} {glass}".rstrip(),
         "  STO" if number == lens.stop else "",
         f"  SLB {label}" if label else "",
-        f"  {OWN.lower()} break" if surface.is_break else "",
+        f"  {COMMENT.lower()} break" if surface.is_break else "",
         *_poses(surface, place),
         *_shape(surface, place),
         *(_phase(surface.phase, float(lens.primary), place) if is_round else []),
@@ -278,7 +278,7 @@ def _phase(phase: RadialPhase, wavelength: float, place: Place) -> list[str]:
         fraction = Fraction(float(term)) * length / (turn * Fraction(float(radius)) ** (2 * j))
         with localcontext(prec=_DIGITS):
             lines.append(f"  HCO C{j} {Decimal(fraction.numerator) / Decimal(fraction.denominator)}")
-    return lines if float(radius) == 1 else [*lines, f"  {OWN.lower()} radius {radius}"]
+    return lines if float(radius) == 1 else [*lines, f"  {COMMENT.lower()} radius {radius}"]
 
 
 def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:

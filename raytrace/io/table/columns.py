@@ -201,7 +201,7 @@ def columns(cells: Sequence[str], units: str, ignored: Sequence[str], place: Pla
     cells, headings = _without_counters(cells)
     for k, cell in enumerate(cells):
         if squeezed(cell).casefold() in ignored and cell.strip():
-            headings[k] = Heading("ignored as the header says")
+            headings[k] = Heading("ignored by the header")
     _check_units(cells, headings, units, place)
     names = [column.name if column else None for column in headings]
     if names and not cells[0].strip():

@@ -5,7 +5,7 @@ glass, and if wanted nd and Vd, conic, semi-diameter or diameter, aspheric terms
 apertures, type, comment. Header lines '# key: value' hold the system (`table.system`). Without them the lens is read
 with assumptions that are stated in warnings: on axis, the d line, F/10 unless the stop row has a semi-diameter.
 
-- An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' says otherwise.
+- An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' states another unit.
 - A column of numbers whose heading is not known, or may mean two things, is an error; '# ignore: NAME' leaves it out.
 - Glass: empty or `air`; a catalog name; `MIRROR`; a number, the constant index; `1.5168/64.17` (nd/Vd) or
   `1.5168/64.17/0.0008` (nd/Vd/ΔPgF), a model glass; six digits, a MIL code; `NAME=1.33` or `NAME=1.5168/64.17`, the
@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from raytrace.io.assembly import (
-    AtHand,
+    CatalogSources,
     LensDraft,
     assemble,
     by_figures,
@@ -97,35 +97,35 @@ def _medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.glass`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
-    given = {name: number(cell, name.replace("_", " "), place) for name, cell in _figures(cells).items()}
-    indices = {name.split()[1]: value for name, value in given.items() if name.startswith("index")}
+    figures = {name: number(cell, name.replace("_", " "), place) for name, cell in _figures(cells).items()}
+    indices = {name.split()[1]: value for name, value in figures.items() if name.startswith("index")}
     if not indices:
-        if given:
-            name = next(iter(given))
-            raise LensFileError(f"{name} is {given[name]:g}, but no index is given; fill in nd", place)
+        if figures:
+            name = next(iter(figures))
+            raise LensFileError(f"{name} is {figures[name]:g}, but no index is given; fill in nd", place)
         return AIR
     for line, value in indices.items():
         if not 0 < value < 100:
             raise LensFileError(f"index {line} is {value:g}, expected a positive number, as 1.5168", place)
-    if any(value <= 0 for name, value in given.items() if name.startswith("abbe")):
-        raise LensFileError(f"an Abbe number of {min(given.values()):g}, expected a positive one", place)
+    if any(value <= 0 for name, value in figures.items() if name.startswith("abbe")):
+        raise LensFileError(f"an Abbe number of {min(figures.values()):g}, expected a positive one", place)
     if all(value == 1 for value in indices.values()):
         return AIR
-    if len(given) == 1:
+    if len(figures) == 1:
         line, value = indices.popitem()
         at = "" if line == "d" else f" (given at {line})"
         report.glass(place.surface, "", f"constant index {value!r}{at}")
         return constant(value)
-    if given.keys() <= {"index d", "abbe d", "dpgf"} and "abbe d" in given:
-        numbers = tuple(given.get(name, 0.0) for name in ("index d", "abbe d", "dpgf"))
+    if figures.keys() <= {"index d", "abbe d", "dpgf"} and "abbe d" in figures:
+        numbers = tuple(figures.get(name, 0.0) for name in ("index d", "abbe d", "dpgf"))
     else:
-        numbers = _fitted(indices, given, place)
+        numbers = _fitted(indices, figures, place)
     written = "/".join(f"{value:.7g}" for value in numbers if value)
-    report.glass(place.surface, "", f"model glass {written} by {', '.join(given)}")
+    report.glass(place.surface, "", f"model glass {written} by {', '.join(figures)}")
     return model_glass(*numbers)
 
 
-def _fitted(indices: dict[str, float], given: dict[str, float], place: Place) -> tuple[float, float, float]:
+def _fitted(indices: dict[str, float], figures: dict[str, float], place: Place) -> tuple[float, float, float]:
     """n_d, V_d, ΔP_gF of the model glass through figures that are linear in its A, B, C."""
 
     def at_lines(lines: Mapping[str, float]) -> dict[str, np.ndarray]:
@@ -136,7 +136,7 @@ def _fitted(indices: dict[str, float], given: dict[str, float], place: Place) ->
     dispersion, violet = model["F"] - model["C"], model["g"] - model["F"]
     normal = violet - 0.6438 * dispersion + 0.001682 * model["d"]
     rows = [(at[line], value) for line, value in indices.items()]
-    for name, value in given.items():
+    for name, value in figures.items():
         kind, _, line = name.partition(" ")
         if kind == "abbe":
             span = at["F'"] - at["C'"] if line == "e" else blue_red
@@ -153,10 +153,10 @@ def _fitted(indices: dict[str, float], given: dict[str, float], place: Place) ->
     nd, spread = float(model["d"] @ solution), float(dispersion @ solution)
     for line, value in indices.items():
         if abs(float(at[line] @ solution) - value) > 1e-4:
-            listed = ", ".join(f"{name} {value:g}" for name, value in given.items())
+            listed = ", ".join(f"{name} {value:g}" for name, value in figures.items())
             raise LensFileError(f"no glass has {shown(listed)}; is a column named wrongly?", place)
     if not (spread > 0 and nd > 1):
-        raise LensFileError(f"an index that rises with the wavelength ({', '.join(given)}); columns mixed up?", place)
+        raise LensFileError(f"an index that rises with the wavelength ({', '.join(figures)}); columns mixed up?", place)
     abbe = (nd - 1) / spread
     return nd, abbe, float(violet @ solution) / spread - 0.6438 + 0.001682 * abbe
 
@@ -252,10 +252,11 @@ def _curvature(row: Row, unit: float) -> Tensor | None:
 def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
     """The kind that the type names, or the first that fits; and its a_j up to the last cell that is filled."""
     powers = {n: column for column in row.cells if (n := order(column)) is not None}
-    terms = {n: found for n, column in powers.items() if (found := _cell(row, column)) is not None}
+    cells = {n: _cell(row, column) for n, column in powers.items()}
+    terms = {n: term for n, term in cells.items() if term is not None}
     words = set(_words(row.cells.get("type", "")))
     named_first = sorted(KINDS.values(), key=lambda kind: not words & set(kind.words))
-    kind = next(kind for kind in named_first if not any(found and n % kind.step for n, found in terms.items()))
+    kind = next(kind for kind in named_first if not any(term and n % kind.step for n, term in terms.items()))
     last = max((n for n in terms if n % kind.step == 0), default=0)
     numbers = [terms.get(n, 0.0) / unit ** (n - 1) for n in range(kind.step, last + 1, kind.step)]
     return kind.name, double(numbers) if numbers else None
@@ -345,7 +346,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     return build(parse(text, file, report), catalogs=catalogs)
 
 
-def build(table: Table, *, catalogs: Sequence[Path] = (), packed: AtHand | None = None) -> Lens:
+def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources | None = None) -> Lens:
     """The lens of a parsed table. packed: its glass catalogs, instead of those in the folder of its file."""
     value, place = table.metadata.get("units", ("mm", table.place))
     if value.upper() not in MILLIMETRES:
@@ -422,8 +423,8 @@ def _with_object(surfaces: list[Surface], rows: list[Row], table: Table, unit: f
         raise LensFileError(f"object distance {value}, but the row of the object has another", place)
     if is_given:
         return surfaces
-    own, others = (surfaces[0], surfaces[1:]) if has_row else (Surface(thickness=double(distance)), surfaces)
-    return [dataclasses.replace(own, thickness=double(distance)), *others]
+    first, others = (surfaces[0], surfaces[1:]) if has_row else (Surface(thickness=double(distance)), surfaces)
+    return [dataclasses.replace(first, thickness=double(distance)), *others]
 
 
 def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> list[Surface]:

@@ -213,17 +213,13 @@ def _wavelengths(value: str, place: Place) -> list[float]:
     powers = {"": 0, "µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
     if unit not in powers or not words or len(words) > 1000:
         raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
-    waves = [_decimal(word, powers[unit], place) for word in words]
+    # rounded once: 486.1 nm is 0.4861 µm
+    waves = [float(Decimal(repr(number(word, "wavelength", place))).scaleb(powers[unit])) for word in words]
     for wavelength in waves:
         if not 0 < wavelength < (math.inf if unit else _LONGEST):
             expected = f"expected 0 to {_LONGEST:g} µm; in nm write '587.6 nm', and '3000 µm' where that is meant"
             raise LensFileError(f"a wavelength of {wavelength:g} µm, {expected}", place)
     return waves
-
-
-def _decimal(word: str, power: int, place: Place) -> float:
-    """A number times a power of ten, rounded once: 486.1 nm is 0.4861 µm."""
-    return float(Decimal(repr(number(word, "wavelength", place))).scaleb(power))
 
 
 def written_environment(air: Environment | None, place: Place) -> dict[str, str]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from raytrace.io.source import (
-    MAX_SURFACES,
     READ,
     Draft,
     LensFileError,
@@ -17,6 +16,7 @@ from raytrace.io.source import (
     is_infinite,
     is_number,
     plain_text,
+    refuse_surplus,
     shown,
 )
 from raytrace.io.table.columns import UNREAD, columns, is_header, order, squeezed
@@ -71,14 +71,17 @@ def parse(text: str, file: str, report: Draft) -> Table:
             skipped = 0
             continue
         following = lines[line_number : line_number + 1]
-        if split is None and not _is_metadata(line) and (found := _headings(line, following, place)):
-            split, headings, skipped = found
+        if split is None and not _is_metadata(line) and (layout := _headings(line, following, place)):
+            split, headings, skipped = layout
             header(table, headings, place)
         elif not _metadata_line(table, line, place):
-            if split is None:
-                _preamble(table, line, place)
-            else:
+            if split is not None:
                 add_row(table, split(line, place), place)
+                continue
+            if line_number > _PREAMBLE:
+                raise LensFileError(f"no line of headings in {_PREAMBLE} lines; {_WANTED}", place)
+            table.notes.append(line.strip())
+            report.met("text before the table", READ, place)
     if split is None:
         hint = "; in Shift-JIS or GBK? Save it as UTF-8" if re.search("[\x80-\x9f]", text) else ""
         raise LensFileError(f"no line of headings; {_WANTED}{hint}", table.place)
@@ -94,8 +97,7 @@ def header(table: Table, cells: Sequence[str], place: Place) -> None:
 
 def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
     """Add the surface of a line; its number is its place among the rows, from 1 unless it is the object."""
-    if len(table.rows) >= MAX_SURFACES:
-        raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", place)
+    refuse_surplus(table.rows, place)
     count = len(table.columns)
     extra = [cell.strip() for cell in cells[count:] if cell.strip()]
     if extra:
@@ -153,13 +155,6 @@ def add_metadata(table: Table, name: str, value: str, place: Place) -> None:
             table.report.warn(f"'{key}' occurs again; the last is used", place)
         table.metadata[key] = (value, place)
     table.report.met(key, READ, place)
-
-
-def _preamble(table: Table, line: str, place: Place) -> None:
-    if place.line > _PREAMBLE:
-        raise LensFileError(f"no line of headings in {_PREAMBLE} lines; {_WANTED}", place)
-    table.notes.append(line.strip())
-    table.report.met("text before the table", READ, place)
 
 
 def _headings(line: str, following: list[str], place: Place) -> tuple[Callable, list[str], int] | None:

@@ -51,7 +51,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
     row = {
         "surface": str(number),
         "type": ", ".join([*roles, *([kind.name] if kind else [])]) or "standard",
-        "curvature": "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place),
+        "curvature": exact(surface.curvature, "curvature", place),
         "thickness": thickness(surface.thickness, "inf", place),
         "glass": _glass(surface.glass, place),
     }

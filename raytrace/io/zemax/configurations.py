@@ -659,7 +659,7 @@ def _report_solved(sections: Sections, operands: Sequence[PlacedOperand], active
     ]
     varying = (p.operand.values() for p in operands if refracts(p.operand))
     if left and any(value != values[0] for values in varying for value in values):
-        message = f"solved for configuration {active}, and kept in the others as it is there: {', '.join(left)}"
+        message = f"solved for configuration {active}, and unchanged in the others: {', '.join(left)}"
         report.warn(message, sections.system.last("MNUM").place)
 
 

@@ -147,6 +147,11 @@ class TypedSurface(NamedTuple):
     def solve(self, quantity: str, kind: str, numbers: Iterable[float] = (), source: int = 0) -> Solve:
         return Solve(self.number, quantity, kind, tuple(numbers), source=source)
 
+    def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
+        """scale times a quantity of a surface, the same one unless another is named, plus an offset."""
+        pickup = {"source": source, "scale": scale, "offset": offset, "quantity_of_source": other}
+        return Solve(self.number, quantity, "pickup", **pickup)
+
     def has(self, quantity: str, record: Record, report: Draft) -> bool:
         if quantity not in self.row.holds:
             message = f"a surface that is {self.row.name} has no {quantity}; left out"
@@ -220,8 +225,7 @@ def _curvature_rules(typed: TypedSurface, report: Draft) -> Iterator[Vary | Solv
     numbers = _solve_numbers(record, 2)
     source = _source(numbers, typed.number)
     if code == _CURVATURE_PICKUP and source is not None and not any(numbers[2:]):
-        scale = numbers[1] if len(numbers) > 1 else 1.0
-        yield Solve(typed.number, "curvature", "pickup", source=source, scale=scale)
+        yield typed.pickup("curvature", source, numbers[1] if len(numbers) > 1 else 1.0)
         return
     row = CURVATURE_SOLVES.get(code, SolveRow(f"code {code}"))
     yield typed.solve("curvature", row.kind, _scaled(numbers, row, typed.millimetres))
@@ -240,8 +244,7 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
         if source is None or record.number(3, "column", 0.0):
             yield typed.solve("thickness", "PZUP", _with_offset(_solve_numbers(record, 0), 1, millimetres))
         else:
-            pickup = {"source": source, "scale": scale, "offset": offset}
-            yield Solve(typed.number, "thickness", "pickup", **pickup)
+            yield typed.pickup("thickness", source, scale, offset)
     if record := typed.block.last("VDSZ"):
         if math.isinf(float(typed.surface.thickness)):
             yield typed.solve("thickness", "variable")
@@ -255,26 +258,24 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
 def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
     numbers = _solve_numbers(record, 1)
     source = _source(numbers, typed.number)
-    own, _ = typed.names("PARM", j)
+    named, _ = typed.names("PARM", j)
     there, _ = surfaces[source].names("PARM", j) if source is not None else ((), None)
     power = typed.row.parameters[j].power if j in typed.row.parameters else 0
-    is_linear = own and there and power is not INVERSE and own[0].factor == there[0].factor == 1
+    is_linear = named and there and power is not INVERSE and named[0].factor == there[0].factor == 1
     if not is_linear or any(numbers[3:]) or len(numbers) < 2:
         yield typed.solve(f"PARM {j}", "PPAR", _with_offset(numbers, power or 0, typed.millimetres))
         return
     offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power, typed.millimetres)
-    other = there[0].name if there[0].name != own[0].name else ""
-    pickup = {"source": source, "scale": numbers[1], "offset": offset, "quantity_of_source": other}
-    yield Solve(typed.number, own[0].name, "pickup", **pickup)
-    yield from _followers(typed, own)
+    other = there[0].name if there[0].name != named[0].name else ""
+    yield typed.pickup(named[0].name, source, numbers[1], offset, other)
+    yield from _followers(typed, named)
 
 
 def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> Iterator[Solve]:
     """The further numbers of the lens that a number of the file gives, as pickups of the first."""
     first = named[0]
     for other in named[1:]:
-        pickup = {"source": typed.number, "scale": other.factor / first.factor, "quantity_of_source": first.name}
-        yield Solve(typed.number, other.name, "pickup", **pickup)
+        yield typed.pickup(other.name, typed.number, other.factor / first.factor, other=first.name)
 
 
 def _glass_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
@@ -486,13 +487,13 @@ def _is_row(record: Record) -> bool:
 
 
 def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
-    """The lines of tolerances unchanged; none where the file only says that there are none."""
-    own = [record for record in lines if record.keyword in _TOLERANCES]
-    for record in own:
+    """The lines of tolerances unchanged; none where the file states that there are none."""
+    tolerances = [record for record in lines if record.keyword in _TOLERANCES]
+    for record in tolerances:
         report.met(record.keyword, READ, record.place)
-    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in own):
+    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in tolerances):
         return ()
-    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in own)
+    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in tolerances)
 
 
 def read_merit(path: str | PathLike) -> tuple[Row, ...]:
@@ -554,15 +555,15 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     data = lens.optimization_data
     if data is None:
         return lines
-    own = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
-    sizes = [rule for rule in own if rule.quantity == "semi_diameter"]
+    rules = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
+    sizes = [rule for rule in rules if rule.quantity == "semi_diameter"]
     code, source = (_FIXED if number in data.semi_diameters else 0), 0
     if not code and sizes:
         code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
-    lines = _changed(lines, "DIAM", {2: str(code), 3: str(source)})
-    own = [rule for rule in own if rule.operand is None and rule.quantity != "semi_diameter"]
-    parameters = _parameters(lens.surfaces[number]) if own else {}
-    for rule in own:
+    lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
+    rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
+    parameters = _parameters(lens.surfaces[number]) if rules else {}
+    for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
         if rule.quantity == "thickness":
@@ -574,12 +575,12 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
                 raise _unheld(rule, place)
             lines = _behind(lines, "CONI", "VCON")
         elif isinstance(rule, Vary) and rule.quantity in _GLASS_NUMBERS.values():
-            lines = _changed(lines, "GLAS", {1 + k: "1" for k, name in _GLASS_NUMBERS.items() if name == rule.quantity})
+            lines = changed(lines, "GLAS", {1 + k: "1" for k, name in _GLASS_NUMBERS.items() if name == rule.quantity})
         elif rule.quantity == "glass":
             words = {2: str(_code_of(rule.kind, _GLASS_RULES))}
             if rule.kind == "pickup":
                 lines, words[3] = with_glass_line(lines), str(rule.source)
-            lines = _changed(lines, "GLAS", words)
+            lines = changed(lines, "GLAS", words)
         else:
             lines = _with_parameter(lines, rule, parameters, place)
     return lines
@@ -591,7 +592,7 @@ def _code_of(kind: str, codes: dict[int, str]) -> int:
     return int(kind.rpartition(" ")[2]) if code is None else code
 
 
-def _changed(lines: Lines, keyword: str, words: dict[int, str]) -> Lines:
+def changed(lines: Lines, keyword: str, words: dict[int, str]) -> Lines:
     """The lines of a surface with other words, counted from the keyword, in those of a keyword."""
 
     def change(line: str) -> str:
@@ -638,7 +639,7 @@ def _with_curvature(lines: Lines, rule: Vary | Solve, place: Place) -> Lines:
         code = _code_of(rule.kind, {code: row.kind for code, row in CURVATURE_SOLVES.items()})
         words = [str(code), *map(_spelled, rule.numbers)]
     words += ["0"] * (4 - len(words))
-    return _changed(lines, "CURV", dict(enumerate(words, 2)))
+    return changed(lines, "CURV", dict(enumerate(words, 2)))
 
 
 def with_glass_line(lines: Lines) -> Lines:
@@ -658,7 +659,7 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
         further = [] if isinstance(rule, Vary) else [*map(_spelled, rule.numbers)]
         words = {3: str(_VARIABLE if is_variable else _code_of(rule.kind, {}))} | dict(enumerate(further, 4))
         start = f"  XDAT {j} "
-        return [_changed([line], "XDAT", words)[0] if line.startswith(start) else line for line in lines]
+        return [changed([line], "XDAT", words)[0] if line.startswith(start) else line for line in lines]
     if is_variable:
         line = f"VPAR {j}"
     elif rule.kind == "pickup":

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from raytrace.io.assembly import MOST_POINTS, AtHand, LensDraft, assemble, catalogs_of_lens
+from raytrace.io.assembly import MOST_POINTS, CatalogSources, LensDraft, assemble, catalogs_of_lens
 from raytrace.io.source import (
     MILLIMETRES,
     Block,
@@ -54,7 +54,7 @@ def read(
     catalogs: Sequence[Path] = (),
     *,
     configuration: int | None = None,
-    packed: AtHand | None = None,
+    packed: CatalogSources | None = None,
 ) -> Lens:
     """The lens of a .zmx text; report: filled.
 

@@ -727,13 +727,10 @@ def numbers_of(block: Block, row: SurfaceType, millimetres: float) -> Numbers:
             continue
         power = row.parameters[j].power
         try:
-            parameters[j] = (
-                in_millimetres(value, power, millimetres)
-                if power is not INVERSE
-                else inverse(record.words[1], millimetres)
-                if value
-                else 0.0
-            )
+            if power is INVERSE:
+                parameters[j] = inverse(record.words[1], millimetres) if value else 0.0
+            else:
+                parameters[j] = in_millimetres(value, power, millimetres)
         except OverflowError as error:
             message = f"PARM {record.words[0]} is {shown(record.words[1])}, too small a length"
             raise LensFileError(message, record.place) from error
@@ -786,7 +783,7 @@ def _report_unused(block: Block, kind: str, row: SurfaceType, report: Draft) -> 
         if row.terms is None and record.number(1, "value"):
             report.note(f"{record.place}: XDAT {j} is not used by a {kind} surface")
         elif row.terms is not None and j >= end and j > 2 and record.number(1, "value"):
-            report.warn(f"XDAT {j}: XDAT 1 says {end - FIRST_TERM} terms, to XDAT {end - 1}; left out", record.place)
+            report.warn(f"XDAT {j}: XDAT 1 states {end - FIRST_TERM} terms, to XDAT {end - 1}; left out", record.place)
     for keyword, name in (("CURV", "curvature"), ("CONI", "conic")):
         record = block.last(keyword)
         if record and name not in row.holds and record.number(0, name):

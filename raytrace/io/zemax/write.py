@@ -40,6 +40,7 @@ from raytrace.io.zemax.configurations import (
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
+    changed,
     margin_line,
     statuses,
     tail_lines,
@@ -96,8 +97,8 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        own = with_rules(_surface(lens, number, surface, place), lens, number, place)
-        lines += _with_pickups(own, lens, number, place)
+        ruled = with_rules(_surface(lens, number, surface, place), lens, number, place)
+        lines += _with_pickups(ruled, lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -167,7 +168,7 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
     kind = _type(surface, place)
-    curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
+    curvature = exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":
         semi_diameter = float(lens.aperture.value)
@@ -250,8 +251,8 @@ def _pose(pose: Pose, place: Place) -> str:
     if pose.z is not None:
         message = "a decentre along z; add it to the thickness before; a .zmx file cannot hold it"
         raise LensFileError(message, place)
-    values = (getattr(pose, name) for name in ("x", "y", "tilt_x", "tilt_y", "tilt_z"))
-    numbers = (exact(0.0 if value is None else value, "tilt or decentre", place) for value in values)
+    values = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
+    numbers = (exact(value, "tilt or decentre", place) for value in values)
     return " ".join([str(int(pose.tilts_first)), "0", *numbers])
 
 
@@ -437,23 +438,17 @@ def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> li
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
             if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
                 raise LensFileError(f"follows {operand} by a rule that is not written", place)
+            start = {"PRAM": f"PPAR {operand.parameter}", "THIC": "PZUP", "CRVT": "CURV", "GLSS": "GLAS"}[name]
+            line = next((line.split() for line in lines if f"{line} ".startswith(f"  {start} ")), [])
             if name in ("PRAM", "THIC"):
-                start = f"  PPAR {operand.parameter} " if name == "PRAM" else "  PZUP "
-                if not any(
-                    line.startswith(start) for line in lines
-                ):  # a solve of the surface itself is written already
-                    lines = [*lines, f"{start}{operand.number} {factor!r} {offset!r} 0"]
+                if not line:  # else a solve of the surface itself is written already
+                    lines = [*lines, f"  {start} {operand.number} {factor!r} {offset!r} 0"]
+            elif line[2:3] not in (["0"], ["1"], []):
                 continue
-            keyword = {"CRVT": "CURV", "GLSS": "GLAS"}[name]
-            if any(line.split()[0] == keyword and line.split()[2] not in ("0", "1") for line in lines):
-                continue
-            if name == "CRVT" and offset:
+            elif name == "GLSS":
+                lines = changed(with_glass_line(lines), "GLAS", {2: "2", 3: str(operand.number)})
+            elif offset:
                 raise LensFileError(f"follows {operand} with an offset, which is not written", place)
-            lines = with_glass_line(lines) if name == "GLSS" else lines
-            at = next(k for k, line in enumerate(lines) if line.split()[0] == keyword)
-            words = lines[at].split()
-            if name == "CRVT":
-                lines[at] = f'  CURV {words[1]} 4 {operand.number} {factor!r} 0 ""'
             else:
-                lines[at] = "  " + " ".join([*words[:2], "2", str(operand.number), *words[4:]])
+                lines = changed(lines, "CURV", {2: "4", 3: str(operand.number), 4: repr(factor), 5: "0"})
     return lines
