@@ -1,8 +1,16 @@
-"""Derivatives by finite differences, of merit functions."""
+"""Derivatives by finite differences, of merit functions and of torch functions."""
+
+from functools import partial
 
 import numpy as np
+import torch
 
 from raytrace.optimization.merit_rows import Evaluation
+
+#: Without undefined gradients, half of the time: only a custom autograd function can fail there, and its tests call
+#: `torch.autograd.gradcheck`.
+gradcheck = partial(torch.autograd.gradcheck, check_undefined_grad=False)
+gradgradcheck = partial(torch.autograd.gradgradcheck, check_undefined_grad=False)
 
 
 def slopes_by_differences(evaluation: Evaluation, start: np.ndarray, relative: float = 1e-4) -> np.ndarray:

@@ -8,6 +8,7 @@ import copy
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import turned
 from torch.testing import assert_close
@@ -263,8 +264,8 @@ def derivatives_equal_differences(case):
         return torch.cat([last.position, last.direction, last.opl[None]])
 
     # Centred differences of 1e-6 of numbers of order 1: 1e-9 relative and 1e-10 absolute rounding, per unit of output.
-    assert torch.autograd.gradcheck(outputs, values, eps=1e-6, atol=1e-6, rtol=1e-4)
-    assert torch.autograd.gradgradcheck(outputs, values, eps=1e-6, atol=1e-5, rtol=1e-3)
+    assert gradcheck(outputs, values, eps=1e-6, atol=1e-6, rtol=1e-4)
+    assert gradgradcheck(outputs, values, eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
 LAWS = {

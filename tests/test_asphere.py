@@ -5,8 +5,8 @@ from decimal import Decimal, localcontext
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import surface
-from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.system.intersection import intersect
 from raytrace.system.shapes import EVEN, sag_and_derivatives

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from differences import gradcheck
 
 from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.image import transfer_functions
@@ -79,4 +80,4 @@ def test_derivatives_in_the_kernels():
     def mean_error(kernels):
         return errors(transfer_functions(kernels, 12), S, 0.1).mean()
 
-    assert torch.autograd.gradcheck(mean_error, gaussians(0.8, 1.5)[:, 3:8, 3:8].clone().requires_grad_())
+    assert gradcheck(mean_error, gaussians(0.8, 1.5)[:, 3:8, 3:8].clone().requires_grad_())

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import covariance, draws
 
 from raytrace.imaging.image import blur, transfer_functions
@@ -127,7 +128,7 @@ def test_gamma_and_kernel_have_derivatives():
         pictures = restore(image, wiener(H, gamma**2)), restore(image, towards_measurement(H, gamma**2))
         return *pictures, towards_estimate(image, H, gamma**2, estimate=other)
 
-    assert torch.autograd.gradcheck(restored, [x.requires_grad_() for x in (image, kernel, gamma, other)])
+    assert gradcheck(restored, [x.requires_grad_() for x in (image, kernel, gamma, other)])
 
 
 def test_gamma_may_depend_on_frequency_or_colour():
@@ -232,7 +233,7 @@ def test_derivatives_of_the_closed_form():
         )
 
     inputs = gaussians(0.8, 1.5, size=3), torch.tensor(0.1, dtype=torch.float64)
-    assert torch.autograd.gradcheck(closed_form, [x.requires_grad_() for x in inputs])
+    assert gradcheck(closed_form, [x.requires_grad_() for x in inputs])
 
 
 # --- pictures with borders

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from torch.autograd import gradcheck, gradgradcheck
+from differences import gradcheck, gradgradcheck
 
 import raytrace as rt
 from raytrace.io import read_lens_with_report

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import both_engines, points, scalar, vector
-from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 from raytrace.maths import zernike

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.materials.glass import (
     AIR,

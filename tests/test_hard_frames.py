@@ -8,8 +8,8 @@ import math
 import pytest
 import torch
 from bends import pose, real
+from differences import gradcheck, gradgradcheck
 from problems import both_engines, surface, vector
-from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt

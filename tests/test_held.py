@@ -4,16 +4,18 @@ import dataclasses
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import focal_length
 
 from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, patch_spectrum
 from raytrace.imaging.codesign import camera, closed_form, optimise
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
-from raytrace.imaging.variables import BadVariables, Variables, parse_bounds
+from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import media
+from raytrace.system.parameter_paths import BadVariables, parse_bounds
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"
@@ -62,7 +64,7 @@ def test_derivatives_through_what_is_solved_for(lens):
         return surfaces[6].thickness + surfaces[1].curvature
 
     given = [torch.full_like(one, 0.05).requires_grad_() for one in free.values()]
-    assert torch.autograd.gradcheck(numbers, given, eps=1e-5, rtol=1e-6)
+    assert gradcheck(numbers, given, eps=1e-5, rtol=1e-6)
     own = camera(lens, dataclasses.replace(SMALL, model="gaussian"))
     spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
     own.plan()

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import draws, gaussian, generator
 
 from raytrace.imaging.image import (
@@ -123,7 +124,7 @@ def test_adjoint(boundary, size, origin):
 @pytest.mark.parametrize("boundary", ["valid", "reflect"])
 def test_derivatives(boundary):
     inputs = [draws(2, n, n, seed=n).requires_grad_() for n in (7, 4)]
-    assert torch.autograd.gradcheck(lambda x, h: blur(x, h, boundary=boundary), inputs)
+    assert gradcheck(lambda x, h: blur(x, h, boundary=boundary), inputs)
 
 
 def test_an_extension_mirrors_at_both_borders_and_tapers_without_a_jump():
@@ -254,7 +255,7 @@ def test_derivatives_of_layers(composition):
     def image(picture, depth, kernels):
         return blur_layers(picture, depth_masks(depth, PLANES[:3], softness=0.3), kernels, composition=composition)
 
-    assert torch.autograd.gradcheck(image, [x.requires_grad_() for x in (picture, depth, kernels)])
+    assert gradcheck(image, [x.requires_grad_() for x in (picture, depth, kernels)])
 
 
 # --- the sensor
@@ -294,7 +295,7 @@ def test_counts_are_whole_and_skewed_as_poisson():
 
 def test_gradients_of_noise():
     picture = draws(3, 3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: add_shot_noise(x, 100.0, generator=generator()), picture)
+    assert gradcheck(lambda x: add_shot_noise(x, 100.0, generator=generator()), picture)
     dark = torch.tensor([0.0, -0.1, 0.2], dtype=torch.float64, requires_grad=True)
     for noisy in (add_shot_noise, count_electrons):
         (slope,) = torch.autograd.grad(noisy(dark, 100.0, generator=generator()).sum(), dark)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from torch.autograd import gradcheck, gradgradcheck
+from differences import gradcheck, gradgradcheck
 
 from raytrace.maths.numerics import dot, polynomial, safe_divide, safe_sqrt, unit
 

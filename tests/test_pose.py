@@ -3,6 +3,7 @@
 import pytest
 import torch
 from bends import pose, real
+from differences import gradcheck, gradgradcheck
 from problems import rotation
 
 import raytrace as rt
@@ -148,5 +149,5 @@ def test_derivatives_by_every_number_of_a_pose_and_a_grating():
 
     start_at = [real(0.02), *(real(0.05 * number).requires_grad_() for number in SOME.values())]
     start_at[0].requires_grad_()
-    assert torch.autograd.gradcheck(trace, start_at)
-    assert torch.autograd.gradgradcheck(lambda *n: trace(*n)[0][:, :3], start_at)
+    assert gradcheck(trace, start_at)
+    assert gradgradcheck(lambda *n: trace(*n)[0][:, :3], start_at)

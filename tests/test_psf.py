@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import field, number, sharp_double_gauss
 
 import raytrace as rt
@@ -412,7 +413,7 @@ def test_derivatives_in_the_lens_the_sensor_and_the_grid_with_rays_vignetted(mod
     for t, gradient in zip(inputs, torch.autograd.grad(traced[0, 0, 1].square().sum(), inputs), strict=True):
         assert float(gradient.abs()) > 0, t
     # A kernel of `drt` is smooth in pieces: a curvature may change by less than the way to the next, 1e-8/mm.
-    assert torch.autograd.gradcheck(kernel, inputs, eps=1e-9, atol=1e-5, rtol=1e-4, fast_mode=True)
+    assert gradcheck(kernel, inputs, eps=1e-9, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_derivatives_in_the_object_distance_and_the_field():
@@ -423,7 +424,7 @@ def test_derivatives_in_the_object_distance_and_the_field():
         return found.centroid, found.covariance
 
     inputs = number(1e4).requires_grad_(), number(3.0).requires_grad_()
-    assert torch.autograd.gradcheck(moments, inputs, eps=1e-4, atol=1e-8, rtol=1e-3)
+    assert gradcheck(moments, inputs, eps=1e-4, atol=1e-8, rtol=1e-3)
 
 
 # Physics --------------------------------------------------------------------------------------------------------------

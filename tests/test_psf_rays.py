@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
@@ -50,8 +51,8 @@ def test_smooth_splat_is_the_histogram_far_from_edges_and_twice_differentiable()
     def image(points):
         return splat_smooth(grid(0.005, 5), points, number([1.0, 0.5, 0.7]), width=0.5)
 
-    assert torch.autograd.gradcheck(image, near, eps=1e-9)
-    assert torch.autograd.gradgradcheck(image, near, eps=1e-9, atol=1e-3, rtol=1e-3)
+    assert gradcheck(image, near, eps=1e-9)
+    assert gradgradcheck(image, near, eps=1e-9, atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.parametrize("width", [0.1, 0.25, 0.5])

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import lens, points, surface, vector
-from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.io import write_lens
 from raytrace.io.source import LensFileError

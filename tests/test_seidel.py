@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace import seidel
@@ -147,7 +148,7 @@ def test_a_curvature_carries_its_derivatives():
         return seidel(system, kind="waves").contributions
 
     curvature, conic = (scalar(x).requires_grad_() for x in (0.02, -0.5))
-    assert torch.autograd.gradcheck(sums, (curvature, conic))
+    assert gradcheck(sums, (curvature, conic))
 
 
 def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import both_engines, field, lens, scalar, scene_of, surface, vector
-from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt

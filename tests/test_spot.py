@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import floats, number
 from test_hardcases import of_kind
 
@@ -118,7 +119,7 @@ def test_a_mask_by_rays_makes_a_merit_finite_with_finite_second_derivatives():
         return torch.where(found.rays > 0, found.mean_square_radius, 7.0).sum()
 
     assert merit(points) > 7
-    assert torch.autograd.gradgradcheck(merit, points)
+    assert gradgradcheck(merit, points)
     assert torch.func.hessian(merit)(points.detach()).isfinite().all()
 
 
@@ -160,8 +161,8 @@ def test_derivatives_of_the_mean_square():
         found = spot_of_points(p, valid, weights)
         return found.mean_square_radius, found.rms_radius, found.geometric_radius, found.centroid
 
-    assert torch.autograd.gradcheck(statistics, points)
-    assert torch.autograd.gradgradcheck(lambda p: statistics(p)[:2], points)
+    assert gradcheck(statistics, points)
+    assert gradgradcheck(lambda p: statistics(p)[:2], points)
 
 
 def test_float32_keeps_its_digits():

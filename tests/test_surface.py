@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import FEMTOMETRE, surface, turned, vector
-from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.system.apertures import Aperture, inside
 from raytrace.system.intersection import intersect, normal

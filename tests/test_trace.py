@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import (
     FEMTOMETRE,
     PICOMETRE,
@@ -18,7 +19,6 @@ from problems import (
     vector,
     vignetting_aperture,
 )
-from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.materials.glass import MIRROR, sellmeier
 from raytrace.maths import pupil

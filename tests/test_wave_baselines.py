@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import number
 from scipy.special import j0, j1
-from torch.autograd import gradcheck
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import double_gauss, lens, scalar, surface, vector
-from torch.autograd import gradcheck
 
 from raytrace.materials.glass import constant
 from raytrace.maths.grid import centres, grid

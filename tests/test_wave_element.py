@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck
 from problems import number
-from torch.autograd import gradcheck
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
