@@ -93,7 +93,9 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     if reference is None and len(waves) > 1:
         message = f"no REF: the reference of the {len(waves)} wavelengths is not specified; add REF 1 to {len(waves)}"
         raise LensFileError(message, source.place)
-    private = codev_glass.private_glasses(parts.private, waves, _comment_words(parts, "UNNAMED"), report)
+    private = {name: codev_glass.private_glass(row, waves, report) for name, row in parts.private.items()}
+    for name in {word.upper() for word in _comment_words(parts, "UNNAMED")} & private.keys():
+        private[name] = dataclasses.replace(private[name], name="")
     glasses = [record.words[0] for block in parts.surfaces for record in block.all("GLA") if record.words]
     came = codev_glass.came_with(file, glasses, catalogs, report)
     library = codev_glass.GlassLibrary(private, came, catalogs, waves)
