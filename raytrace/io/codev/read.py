@@ -41,7 +41,7 @@ from raytrace.io.codev.keywords import (
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
-    Sections,
+    Stream,
     sections,
     unquoted,
 )
@@ -280,12 +280,12 @@ def _vignetting(system: Block, count: int, report: Draft) -> list[list[float]]:
 # -- comments of this package, and commands that are left out ---------------------------------------------------------
 
 
-def _comment_words(parts: Sections, keyword: str) -> list[str]:
+def _comment_words(parts: Stream, keyword: str) -> list[str]:
     texts = (" ".join(record.words[1:]) for record in parts.comments if record.keyword == keyword)
     return [word for text in texts for word in words(text)]
 
 
-def _aiming(parts: Sections, report: Draft) -> str:
+def _aiming(parts: Stream, report: Draft) -> str:
     """CODE V aims reference rays at the stop; EPD is the diameter of the real beam on the axis."""
     comments = [record for record in parts.comments if record.keyword == "AIMING"]
     if not comments:
