@@ -138,7 +138,7 @@ def test_conditions_are_those_asked_for_and_the_rest_stays():
         (lambda lens: rt.lens(ROWS, stop=1, f_number=4, field_kind="angles"), "expected one of angle"),
     ],
 )
-def test_what_makes_no_lens_is_told(call, said):
+def test_what_makes_no_lens_is_reported(call, said):
     lens = rt.lens(ROWS, stop=1, f_number=5)
     with pytest.raises(ValueError, match=re.escape(said)):
         call(lens)

@@ -224,7 +224,7 @@ def test_printed_radii_are_those_of_the_spot():
     assert "Field angle 8.4°" in text
 
 
-def test_wavelengths_that_are_given_weigh_the_same_unless_told():
+def test_wavelengths_that_are_given_weigh_the_same_unless_given():
     lens = dataclasses.replace(read_lens("cooke_triplet"), wavelength_weights=number([1.0, 2.0, 1.0]))
     assert shares_of(lens, None, None).tolist() == [1, 2, 1]
     assert shares_of(lens, number([0.5, 0.6]), None).tolist() == [1, 1]

@@ -167,7 +167,7 @@ def test_start_in_the_middle_of_a_lens():
     assert torch.equal(rest.direction, whole.direction)
 
 
-def test_reasons_of_loss_are_told_once_and_add_up():
+def test_reasons_of_loss_are_reported_once_and_add_up():
     system = lens(
         [surface(0.1, 15.0, 1.8, apertures=vignetting_aperture(9.0)), surface(-0.01, 5.0), surface(0.3, 5.0, 1.5)]
     )
