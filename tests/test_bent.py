@@ -202,7 +202,7 @@ def test_a_spectrum_stands_apart_on_the_sensor():
     )
 
 
-def test_lost_rays_behind_turned_axes_are_no_wavefront():
+def test_failed_rays_behind_turned_axes_are_no_wavefront():
     """A ray that missed a surface has numbers of its own behind a fold: they are not taken for a vignetted ray's."""
     lens = rt.lens(
         [{"thickness": 20.0}, {"radius": 12.0, "thickness": 4.0, "glass": 1.5}, {"radius": -12.0, "thickness": 14.0}],

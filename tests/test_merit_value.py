@@ -142,7 +142,7 @@ def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
     assert edged.rows[-1].target == pytest.approx(0.1)
 
 
-def test_lost_rays_are_reported(lens):
+def test_failed_rays_are_reported(lens):
     wide = lens.at(fields=[0, 80])
     found = rt.evaluate(wide, merit="spot")
     assert bool(found.lost.any())

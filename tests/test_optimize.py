@@ -268,7 +268,7 @@ def bent_too_far(lens):
     return lens.replace(4, curvature=torch.tensor(-0.06, dtype=torch.float64))
 
 
-def test_what_a_lost_ray_misses_by_has_the_derivative_of_differences(triplet):
+def test_what_a_failed_ray_misses_by_has_the_derivative_of_differences(triplet):
     problem = problem_of(bent_too_far(triplet), "curvature thickness")
     x = problem.model.start
     found = problem.evaluated(x)

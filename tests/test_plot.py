@@ -151,7 +151,7 @@ def one_surface(curvature: float, index: float, aperture: float, apertures: tupl
         (-1 / 40, 9.0, (Aperture("circular", (0.0, 5.0)),), "vignetted"),
     ],
 )
-def test_a_lost_ray_ends_at_the_surface_that_lost_it(curvature, aperture, apertures, status):
+def test_a_failed_or_vignetted_ray_ends_at_its_surface(curvature, aperture, apertures, status):
     lens = one_surface(curvature, 1.5, aperture, apertures)
     (paths,) = fans(lens, 3)
     assert [path.status for path in paths] == [status, "ok", status]

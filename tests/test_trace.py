@@ -233,7 +233,7 @@ def test_the_lossy_system_loses_rays_in_every_way():
 
 @both_engines
 @pytest.mark.parametrize("number", range(5))
-def test_first_and_second_derivatives_of_every_number_with_lost_rays(number):
+def test_first_and_second_derivatives_of_every_number_with_failed_rays(number):
     """Thickness, curvature, conic, terms and index of each surface, and the rays themselves."""
     flat, structure = torch.utils._pytree.tree_flatten(LOSSY.surfaces[1 + number])
     rays = lossy_rays()

@@ -219,7 +219,7 @@ def quick(tmp_path, monkeypatch):
     return made
 
 
-def test_an_unsafe_folder_is_left_alone_and_told_of(quick, tmp_path, capsys):
+def test_an_unsafe_folder_is_left_alone_and_reported(quick, tmp_path, capsys):
     tmp_path.chmod(0o777)
     loaded = library.library.__wrapped__()
     assert loaded.parent == quick[0]
