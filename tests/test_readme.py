@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from raytrace.bench import trace
 from raytrace.cli import codesign_run, main
 
 ROOT = Path(__file__).parents[1]
@@ -74,6 +75,7 @@ def test_examples_run(line, tmp_path, monkeypatch, capsys):
     (tmp_path / "lenses").symlink_to(ROOT / "lenses")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(codesign_run, "_LEAVES", 16)  # pictures: a hundred take 8 s to draw
+    monkeypatch.setattr(trace, "SAMPLE", 6)
     assert main(shlex.split(line)) == 0, capsys.readouterr().err
     words = shlex.split(line)
     for option in ("-o", "--plot"):
