@@ -1,7 +1,4 @@
-"""Experiments of the documentation: a grid of cases, a keyed store that resumes, and a page with tables and figures.
-
-Scripts in `docs/experiments` use it.
-"""
+"""Kit of the scripts in `docs/experiments`: a grid of cases, a store that resumes, a page with tables and figures."""
 
 import io
 import itertools
@@ -17,8 +14,6 @@ from raytrace.pages import write_page
 from raytrace.plotting.style import save
 from raytrace.stores import number, read_document
 
-_ADVICE = "remove it to compute it again"
-
 
 def cases(**axes: Sequence) -> Iterator[dict]:
     """All combinations of values, by the name of their axis; the last axis changes fastest."""
@@ -26,9 +21,9 @@ def cases(**axes: Sequence) -> Iterator[dict]:
 
 
 class Store:
-    """Results in a folder by key, computed only where they are missing.
+    """Results in a folder by key, computed only if they are missing.
 
-    about: what all of them depend on; the folder refuses another (`OtherSettings`).
+    about: whatever all of them depend on; the folder refuses another (`OtherSettings`).
     """
 
     def __init__(self, folder: Path, about: Mapping):
@@ -39,7 +34,7 @@ class Store:
         file = self.folder / f"{key}.json"
         if not file.exists():
             write_json(file, compute())
-        return read_document(file, number(infinite=True), DamagedRun, _ADVICE)
+        return read_document(file, number(infinite=True), DamagedRun, "remove it to compute it again")
 
     def arrays(self, key: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Arrays by name."""
@@ -53,8 +48,8 @@ class Store:
 
 
 def published(file: str | Path, docs: str | Path) -> str:
-    """A file as the command of a page spells it: relative to docs/ if it is in there, else as given, without the
-    folder if the path is absolute."""
+    """A file as the command of a page spells it: relative to docs/ if it is inside, else without the folder of an
+    absolute path."""
     path, root = Path(file), Path(docs).resolve()
     if path.resolve().is_relative_to(root):
         return (Path("docs") / path.resolve().relative_to(root)).as_posix()
@@ -62,7 +57,7 @@ def published(file: str | Path, docs: str | Path) -> str:
 
 
 def publish(page: Path, folder: str, parts: Iterable[str], *, tables: Mapping[str, str], figures: Mapping) -> None:
-    """Write a page above the part that it keeps, and its tables (CSV) and figures (of matplotlib) by file name.
+    """Write a page above its hand-written part, and its tables (CSV) and figures (matplotlib) by file name.
 
     folder: of tables and figures, next to the page.
     """

@@ -38,12 +38,13 @@ from raytrace.imaging.image import blur
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.training import Run, Share
-from raytrace.imaging.variables import BadVariables, Variables
+from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.psf_models import psf
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
+from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.focus import NoImage, best_focus
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 

@@ -17,10 +17,9 @@ from test_stores import STRANGE, put
 import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
-from raytrace.optimization import bfgs, checkpoint, least_squares
-from raytrace.optimization.bfgs import lowest
-from raytrace.optimization.checkpoint import BadCheckpoint, best_of_paths
-from raytrace.optimization.least_squares import Sides, State
+from raytrace.optimization import checkpoint, solver
+from raytrace.optimization.checkpoint import BadCheckpoint
+from raytrace.optimization.solver import Sides, State, best_of_paths, minimise
 
 TRIPLET = read_lens("cooke_triplet")
 SPOT = {"merit": "spot", "vary": "curvature sensor", "cycles": 8}
@@ -103,7 +102,7 @@ OTHERS = {
     "another lens: .* thickness 12.93 of surface 2, not 13": (TRIPLET.replace(2, thickness=13.0), {}),
     "other conditions": (TRIPLET.at(fields=[0.0, 7.0]), {}),
     "other variables: .*; expected thickness_1 among them": (TRIPLET, {"vary": "curvature:1-4 sensor thickness:1"}),
-    "other merit": (TRIPLET, {"rings": 4}),
+    "other merit": (TRIPLET, {"merit": rt.DefaultMerit("spot", rings=4)}),
     "other hold": (TRIPLET, {"hold": "efl=100"}),
     "other paths": (TRIPLET, {"paths": 2}),
     "other bounds": (TRIPLET, {"bounds": "sensor:70..90"}),
@@ -171,11 +170,11 @@ def mutations(document: dict):
 def test_damaged_checkpoints_are_refused_in_a_line(kept, tmp_path):
     document, path, count = json.loads(kept.read_text()), tmp_path / "damaged.json", 0
     of, names = document["of"], [*document["variables"]]
-    assert checkpoint.resumed(kept, of, names).course is not None
+    assert checkpoint.read_checkpoint(kept, of, names).descent is not None
     for name, content in mutations(document):
         put(path, content)
         with pytest.raises(BadCheckpoint, match=r"damaged.json(, line \d+)?: ") as error:
-            checkpoint.resumed(path, of, names)
+            checkpoint.read_checkpoint(path, of, names)
         assert "\n" not in str(error.value), name
         assert len(str(error.value)) < 600, name
         count += 1
@@ -216,8 +215,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 100.0
-        for module in (least_squares, bfgs):
-            monkeypatch.setattr(module.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(solver.time, "monotonic", lambda: self.now)
 
     def state(self, x, derivatives):
         """A narrow valley (Rosenbrock)."""
@@ -248,7 +246,7 @@ def test_no_step_begins_that_would_not_end_in_time(seconds, monkeypatch):
     assert clock.now - 100.0 >= seconds - 13  # nor does it end long before
     assert found.cycles == len(found.history)
     clock.now = 100.0
-    lowest(clock, np.array([-1.2, 1.0]), typical=np.ones(2), seconds=seconds, **FREE)
+    minimise(clock, np.array([-1.2, 1.0]), typical=np.ones(2), seconds=seconds, **FREE)
     assert clock.now - 100.0 <= max(seconds, 40.0)
 
 

@@ -17,7 +17,7 @@ from raytrace.cli import main
 from raytrace.cli.commands import COMMANDS
 from raytrace.cli.run import RUNNER_OPTIONS
 from raytrace.maths.result import Result
-from raytrace.optimization.merit import merit_of_options
+from raytrace.optimization.merit import DefaultMerit, Merit, merit_of_options
 from raytrace.system.lens import field_points
 from raytrace.tracing.launch import launch
 from raytrace.tracing.spot import spot_of
@@ -296,7 +296,8 @@ def test_a_command_has_the_options_of_its_verb(command):
     if command.verb == "psf":  # in the objects of a model and of the execution
         own -= {"rays", "rho"}
     if "merit" in keywords:
-        own -= {*inspect.signature(merit_of_options).parameters}
+        for definition in (merit_of_options, DefaultMerit, Merit.of):
+            own -= {*inspect.signature(definition).parameters}
     assert own <= {*keywords}
     assert verb.__doc__
 

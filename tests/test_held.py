@@ -11,10 +11,11 @@ from raytrace.imaging.closed_form import camera_error, even_distances, optimise_
 from raytrace.imaging.codesign import camera, closed_form, optimise
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
-from raytrace.imaging.variables import BadVariables, Variables, parse_bounds
+from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import media
+from raytrace.system.parameter_paths import BadVariables, parse_bounds
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"

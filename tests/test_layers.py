@@ -35,8 +35,8 @@ FLOORS = {
     "psf_models": 6,
     "analysis": 7,
     "wave_optics": 7,
-    "imaging": 8,
-    "optimization": 9,
+    "optimization": 8,
+    "imaging": 9,
     # pages of experiments
     "experiments": 11,
     "cli": 12,

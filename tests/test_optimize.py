@@ -12,12 +12,12 @@ from scipy.optimize import minimize
 from scripts import script
 
 import raytrace as rt
-from raytrace.optimization import checkpoint as paths
+from raytrace.optimization import solver as paths
 from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.least_squares import Linear, Manner, NoStep, Sides, State, least_squares
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
 from raytrace.optimization.report import optimize_report
+from raytrace.optimization.solver import Linear, NoStep, Sides, SolverOptions, State, least_squares
 from raytrace.optimization.variables import freedom, name_of
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
@@ -99,7 +99,7 @@ def by_rosenbrock(x):
 def test_a_curved_valley_is_followed_to_its_end(bends):
     end = least_squares(
         squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), lower=np.full(2, -FAR), upper=np.full(2, FAR),
-        manner=Manner(bends=bends),
+        options=SolverOptions(bends=bends),
     )  # fmt: skip
     assert end.state.x == pytest.approx([1, 1], abs=1e-9)
     assert end.evaluations < 100
@@ -331,7 +331,7 @@ def test_log_checkpoint_and_resume(command_line, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--merit", "spot"], "the file tells no variables: --vary names them"),
+        (["--merit", "spot"], "the file has no variables: --vary names them"),
         (["--vary", "curvature"], "no merit function of its own: choose one by --merit spot"),
         (["--merit", "spot", "--vary", "curvature", "--bounds", "curvature:3,2"], "3 is not less than 2"),
         (["--merit", "spot", "--vary", "curvature", "-o", "lens.foo"], "expected a name that ends in .zmx"),
@@ -455,7 +455,7 @@ def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
 
 def test_cycles_are_limited_where_neither_they_nor_the_time_are(monkeypatch):
     """Along a narrow valley a merit may fall for ever; who gives a time has all of it."""
-    monkeypatch.setattr(paths, "LIMIT", 3)
+    monkeypatch.setattr(paths, "_UNLIMITED", 3)
     state, start, ends = squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), np.full(2, FAR)
     found = paths.best_of_paths(state, start, lower=-ends, upper=ends)
     assert (found.cycles, found.stopped) == (3, "cycles")

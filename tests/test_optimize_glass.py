@@ -14,7 +14,6 @@ from raytrace.cli import main
 from raytrace.materials.catalogs import shipped_catalog
 from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.constraints import conditions_of
 from raytrace.optimization.glass_choice import (
     STATUSES,
     Choice,
@@ -24,13 +23,13 @@ from raytrace.optimization.glass_choice import (
     expansion,
     hull,
     pool_of,
-    without_glass,
 )
-from raytrace.optimization.least_squares import Sides, State, least_squares
 from raytrace.optimization.merit import merit_for
-from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.variables import freedom
+from raytrace.optimization.problem import NoProblem, conditions_of
+from raytrace.optimization.solver import Sides, State, least_squares
+from raytrace.optimization.variables import freedom, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
@@ -131,7 +130,7 @@ def test_what_is_predicted_ranks_what_is_reached(triplet):
     own = {k: triplet.surfaces[k].glass for k in choice.surfaces}
     design = Design(start.state.x, own, start.state)
     for surface in choice.surfaces:
-        merits = choice.foretold(design, [surface], ())[surface]
+        merits = choice.predicted(design, [surface], ())[surface]
         some = np.argsort(merits)[:60:5]
         glasses = [choice.candidates[surface][0][i] for i in some]
         reached = [choice.descend(Design(design.x, own | {surface: g}, None), (), 15).merit for g in glasses]
@@ -183,7 +182,7 @@ def test_which_glasses_vary(triplet):
         free, surfaces = without_glass(freedom(lens, "glass"), "glass")
         assert surfaces == expected
         assert free.variables == (Vary(1, "curvature"),)
-    with pytest.raises(NoProblem, match="nothing but glasses"):
+    with pytest.raises(BadVariables, match="nothing but glasses"):
         without_glass(freedom(triplet, "glass"), "glass")
 
 
@@ -219,11 +218,11 @@ def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypa
     whole = rt.optimize(triplet, **how)
     swap = Choice._swap
 
-    def ended(self, surface, foretold):
+    def ended(self, surface, merits):
         if len(done) == 1:
             raise RuntimeError("the machine stops")
         done.append(surface)
-        return swap(self, surface, foretold)
+        return swap(self, surface, merits)
 
     monkeypatch.setattr(Choice, "_swap", ended)
     with pytest.raises(RuntimeError, match="the machine stops"):

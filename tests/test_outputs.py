@@ -94,7 +94,7 @@ def test_what_a_search_cannot_write_is_reported_and_its_minima_are_printed(lens,
     def full(*arguments):
         raise OSError(28, "No space left on device", "minimum_01.zmx")
 
-    monkeypatch.setattr("raytrace.optimization.search_result.write_lens", full)
+    monkeypatch.setattr("raytrace.optimization.search.write_lens", full)
     words = "search lens.zmx --merit spot --vary sensor --starts 1 --rings 2 -o minima --bounds sensor:80..120"
     done = command_line(*words.split())
     assert done.code == 1

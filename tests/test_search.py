@@ -13,18 +13,23 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
-from raytrace.optimization.constraints import conditions_of
 from raytrace.optimization.conventions import conventions_of
 from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
-from raytrace.optimization.least_squares import Manner, least_squares
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.optimize import opened
-from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
-from raytrace.optimization.search_result import Minima
-from raytrace.optimization.search_settings import Asked
-from raytrace.optimization.starts import length_of, space_of
+from raytrace.optimization.search import Minima
+from raytrace.optimization.search_tasks import (
+    BadSearch,
+    Journal,
+    SearchProblem,
+    SearchStopped,
+    TaskResult,
+    length_of,
+    space_of,
+)
+from raytrace.optimization.solver import SolverOptions, least_squares
 from raytrace.optimization.variables import bounds_of, freedom
 
 PLANE = float("inf")
@@ -115,7 +120,7 @@ def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():
 
 
 def ended(x, merit, lost=0):
-    return Ended(float(lost), 0.0, merit, 1.0, np.array(x, dtype=float))
+    return TaskResult(float(lost), 0.0, merit, 1.0, np.array(x, dtype=float))
 
 
 def test_a_minimum_is_kept_once_and_the_best_of_its_finds():
@@ -183,7 +188,9 @@ def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
         rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1),
         rt.Row("MNEG", (1, 6)),
     )
-    asked = Asked(free, rows, conditions_of(lens, "bfd>=40"), bounds_of(free.lens, free.variables), None, None, PLAIN)
+    asked = SearchProblem(
+        free, rows, conditions_of(lens, "bfd>=40"), bounds_of(free.lens, free.variables), None, None, PLAIN
+    )
     before = asked.whole.evaluated(asked.model.start)
     for k in (1, 2, 3, 4, 7):
         one = enlarged(lens, asked, k)
@@ -215,10 +222,10 @@ def best_triplet():
     free = freedom(lens, "curvature thickness")
     rows, held = tuple(DefaultMerit(rings=2).rows(lens)), conditions_of(lens, "efl=100")
     bounds = bounds_of(free.lens, free.variables, "thickness:1..30 sensor:60..120")
-    asked = Asked(free, rows, held, bounds, (2.0, 8.0), (0.5, 30.0), PLAIN)
+    asked = SearchProblem(free, rows, held, bounds, (2.0, 8.0), (0.5, 30.0), PLAIN)
     x, space = asked.model.start, asked.space
-    for manner in (Manner(), Manner(damping=1e-8)):
-        x = least_squares(asked.whole.state, x, lower=space.lower, upper=space.upper, manner=manner).state.x
+    for options in (SolverOptions(), SolverOptions(damping=1e-8)):
+        x = least_squares(asked.whole.state, x, lower=space.lower, upper=space.upper, options=options).state.x
     return asked, asked.model.lens_at(x)
 
 
@@ -227,7 +234,7 @@ def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k
     """The merit has no slope along any step that meets the conditions, and curves down along one alone."""
     asked, lens = best_triplet
     place = Place(k, enlarged(lens, asked, k))
-    stage, x = place.stage(0.0, 1, Manner()), place.asked.model.start
+    stage, x = place.stage(0.0, 1, SolverOptions()), place.task.model.start
     size = np.sqrt(stage.problem.state(x, False).cost)
     found = saddle(stage.problem, x, stage.moves(x))
     assert np.abs(found.slope).max() < 1e-7 * size
@@ -306,7 +313,7 @@ def test_tasks_that_are_known_are_not_done_again_and_a_torn_line_is(tmp_path):
     assert np.array_equal(again[0].x, [1.0 / 3, 2.0])
     with pytest.raises(BadSearch, match="a search of other seed"):
         Journal(tmp_path, {"seed": 2}, np.inf)
-    with pytest.raises(Stopped):
+    with pytest.raises(SearchStopped):
         Journal(tmp_path, about, 0.0).each([task("d")], 2)
 
 

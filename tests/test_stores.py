@@ -14,7 +14,7 @@ from raytrace.files import append_text
 from raytrace.imaging.codesign import Outcome
 from raytrace.imaging.training import DamagedRun, Run
 from raytrace.materials.catalogs import find_glass
-from raytrace.optimization.journal import BadSearch, Ended, Journal
+from raytrace.optimization.search_tasks import BadSearch, Journal, TaskResult
 from raytrace.stores import (
     DamagedLine,
     Lines,
@@ -209,7 +209,7 @@ def test_damaged_lines_of_a_journal_are_reported_and_their_tasks_done_again(tmp_
         path, done = journal(tmp_path, line), []
 
         def task(key, done=done):
-            return key, lambda: done.append(key) or Ended(0.0, 0.0, 0.25, 0.5, np.array([1.0, 2.0]))
+            return key, lambda: done.append(key) or TaskResult(0.0, 0.0, 0.25, 0.5, np.array([1.0, 2.0]))
 
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
@@ -237,7 +237,7 @@ def test_a_journal_is_appended_to_and_never_rewritten(tmp_path):
     path = journal(tmp_path, json.dumps(GOOD))
     before, inode = path.read_bytes(), path.stat().st_ino
     again = Journal(tmp_path, ABOUT, math.inf)
-    again.each([("d", lambda: Ended(0.0, 0.0, 0.25, 0.5, np.array([1.0, 2.0])))], 2)
+    again.each([("d", lambda: TaskResult(0.0, 0.0, 0.25, 0.5, np.array([1.0, 2.0])))], 2)
     assert path.read_bytes().startswith(before)
     assert (len(again.known), path.stat().st_ino) == (4, inode)
 

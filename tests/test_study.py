@@ -110,7 +110,7 @@ def answers(found, times=()):
 TIMES = [StepTime(model, psf, 1.0, 80.0) for model, psf in zip(SIMULATED, (1.0, 2.0, 3.0, 9.0), strict=True)]
 
 
-#: What the paper's Figures 4 and 5 show, as its text says: 0 is the least blur.
+#: The statements of the paper's text on its Figures 4 and 5 as numbers.
 SEEN = Seen(
     distances=(10.0, 25.0, 35.0, 50.0),
     blur={
@@ -200,8 +200,8 @@ def test_gains_at_distances_are_those_over_the_better_of_both():
 
 def test_a_claim_that_is_not_answered_says_why():
     """Not by a run that is missing where all have ended, but more than the sensor varied, or at other distances."""
-    by_text = {one.text: one for one in claims(paper(), TIMES, dataclasses.replace(SEEN, settled={}))}
-    early, near = (by_text[number_of(text)] for text in ("The focus is near", "All lose less at 10 m"))
+    judged = {one.text: one for one in claims(paper(), TIMES, dataclasses.replace(SEEN, settled={}))}
+    early, near = (judged[number_of(text)] for text in ("The focus is near", "All lose less at 10 m"))
     assert (early.holds, early.figures) == (None, "answered only where the sensor alone varies")
     assert (near.holds, near.figures) == (None, "no losses at 10 and 15 m")
     assert early.answer == near.answer == "not applicable"

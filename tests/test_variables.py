@@ -12,23 +12,20 @@ from torch.utils import _pytree as pytree
 
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.variables import (
-    BadLimits,
-    BadVariables,
     Limits,
     OtherLens,
     PhaseVariables,
     Variables,
     edge_thickness,
     limits_of,
-    parse_bounds,
-    parse_range,
     violation,
 )
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
+from raytrace.optimization.variables import freedom, name_of
 from raytrace.system.lens import with_sensor_distance
-from raytrace.system.parameter_paths import parameter_paths
+from raytrace.system.parameter_paths import BadLimits, BadVariables, parameter_paths, parse_bounds, parse_range
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag
 from raytrace.wave_optics.element import Element, Rings
@@ -200,7 +197,7 @@ def test_bounds_hold_after_a_step():
     numbers = variables.numbers()
     assert numbers["sensor"] == pytest.approx(58.0, abs=NANOMETRE)
     assert numbers["curvature_3"] == pytest.approx(0.0, abs=1e-12)
-    with pytest.raises(BadVariables, match="bounds for thickness_2, not among the variables"):
+    with pytest.raises(BadVariables, match="`bounds` for thickness_2, not among the variables"):
         Variables(read_lens("double_gauss"), "sensor", bounds={"thickness_2": (0, 1)})
 
 
@@ -208,9 +205,11 @@ def test_bounds_hold_after_a_step():
     ("vary", "message"),
     [
         ("", "no variables"),
-        ("focus", "'focus': expected sensor, or one of thickness"),
-        ("thickness", "'thickness': expected sensor, or one of"),
-        ("sensor:3", "'sensor:3': expected sensor"),
+        ("focus", "'focus': expected a number of a lens; did you mean sensor"),
+        ("focal", "'focal': no 'focal'; this lens has thickness, sensor"),
+        ("sensor:3", "'sensor:3': expected sensor without surfaces"),
+        ("glass:1", "glass_1 is a variable of optimize alone"),
+        ("curvature:4=-curvature:3", "solves and pickups are for optimize"),
         ("curvature:1,x", "'x' is no surface number"),
         ("thickness:12", "surface 12; this lens has surfaces 1 to 11"),
         ("thickness:0", "surface 0"),
@@ -392,6 +391,24 @@ def test_every_number_of_a_shape_can_be_varied_by_its_name():
     total.backward()
     assert float(variables.a4_3.grad) == variables.variables[0].unit
     assert float(variables.radius_5.grad) == variables.variables[2].unit
-    for wrong in ("a4:4", "a3:3", "focus:3"):
-        with pytest.raises(BadVariables, match=r"surface \d has no \w+; it has thickness, curvature, conic"):
+    for wrong, words in (("coefficients2:3", "surface 3 has no coefficients2; it has"), ("a3:3", "no 'a3'")):
+        with pytest.raises(BadVariables, match=words):
             Variables(lens, wrong)
+
+
+def test_variable_syntax_is_that_of_optimize():
+    """Kinds without surfaces, numbers that are 0 in the lens, and tilts, whose unit is 1 mm at the edge."""
+    lens = read_lens("cooke_triplet")
+    free = freedom(lens, "curvature thickness a4:3 tilt:2 index:1")
+    variables = Variables(lens, "curvature thickness a4:3 tilt:2 index:1")
+    assert set(variables.names) == {name_of(one) for one in free.variables}
+    with torch.no_grad():
+        variables.get_parameter("tilt_x_2").add_(1.0)
+        variables.get_parameter("a4_3").add_(1e-3)
+    changed, edge = variables(), lens.surfaces[2].semi_diameter
+    assert float(changed.surfaces[2].before.tilt_x) == pytest.approx(math.degrees(1 / edge), rel=1e-12)
+    edge = torch.tensor(lens.surfaces[3].semi_diameter ** 2, dtype=torch.float64)
+    assert float(sag(changed.surfaces[3], edge) - sag(lens.surfaces[3], edge)) == pytest.approx(1e-3, rel=1e-9)
+    bounded = Variables(lens, "curvature sensor", bounds="curvature:-0.1..0.1 sensor:70..")
+    assert bounded.bounds["curvature_1"] == (-0.1, 0.1)
+    assert bounded.bounds["sensor"] == (70.0, math.inf)

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
 
-#: How the models are drawn: colour and dashes, to be told apart in print.
+#: How the models are drawn: colour and dashes, distinguishable in print.
 LOOKS = {
     "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
     "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),

@@ -522,7 +522,7 @@ def merit(parser: argparse.ArgumentParser) -> None:
 
 def freedom(parser: argparse.ArgumentParser) -> None:
     """--vary, --bounds and --hold: `optimization.variables.freedom`, `optimization.variables.bounds_of`,
-    `optimization.constraints.conditions_of`."""
+    `optimization.problem.conditions_of`."""
     group = parser.add_argument_group(
         "variables and constraints, instead of the file's",
         "Variables, in quotes: 'curvature thickness' (all powered surfaces, all gaps), curvature:1-4,7 conic:3 a4:3 "

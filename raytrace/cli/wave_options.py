@@ -1,41 +1,28 @@
-"""Arguments that the subcommands of `raytrace wave` share. No torch."""
+"""Options that the subcommands of `raytrace wave` share. No torch."""
 
 import argparse
 
 from raytrace.cli.options import catalog, count, file_name, positive, positive_finite, size
 
-#: The names that `--element` takes beside files: those of wave.designs.
+#: The names of elements that `--element` takes, those of wave_optics.designs.
 ELEMENTS = (
-    "ideal",
-    "singlet",
-    "fresnel",
-    "multifocal",
-    "multifocal-refractive",
-    "cubic",
-    "cubic-refractive",
-    "achromat",
+    *("ideal", "singlet", "fresnel", "multifocal", "multifocal-refractive", "cubic", "cubic-refractive", "achromat"),
     "hybrid",
 )
 ENGINES = ("auto", "pupil", "radial", "fresnel", "angular_spectrum")
 
 
+def _length(group, flag: str, help: str, default: float | None = None, *, metavar: str = "MM", **more) -> None:
+    """An option of a positive, finite number."""
+    text = help if default is None else f"{help} (default {default:g})"
+    group.add_argument(flag, help=text, default=default, **{"metavar": metavar, "type": positive_finite} | more)
+
+
 def camera(parser: argparse.ArgumentParser, *, exact: bool = True, across: float = 5.0, sensor: float = 35.5) -> None:
-    """--aperture, --sensor, --exact: what every wave camera has; across, sensor: mm where they are not given."""
+    """--aperture, --sensor, --exact; across, sensor: defaults, mm."""
     group = parser.add_argument_group("camera")
-    group.add_argument(
-        "--aperture",
-        metavar="MM",
-        type=positive_finite,
-        default=across,
-        help=f"diameter of the aperture (default {across:g})",
-    )
-    group.add_argument(
-        "--sensor",
-        metavar="MM",
-        type=positive_finite,
-        default=sensor,
-        help=f"from element to sensor (default {sensor:g})",
-    )
+    _length(group, "--aperture", "diameter of the aperture", across)
+    _length(group, "--sensor", "from element to sensor", sensor)
     if exact:
         group.add_argument(
             "--exact", action="store_true", help="true spheres instead of Fresnel's paraboloids, in design and PSF"
@@ -43,7 +30,7 @@ def camera(parser: argparse.ArgumentParser, *, exact: bool = True, across: float
 
 
 def element(parser: argparse.ArgumentParser) -> None:
-    """--element and what makes one: focus, design wavelength, levels; glass, pitch and span of a file."""
+    """--element and its design: focus, wavelength, levels; glass, pitch and span of a file."""
     group = parser.add_argument_group("element")
     group.add_argument(
         "--element",
@@ -53,33 +40,29 @@ def element(parser: argparse.ArgumentParser) -> None:
         help=f"{', '.join(ELEMENTS)} (default singlet), or a file: heights as .npy, .csv, .png, .tif, .dat, .grd, a "
         "smooth element as .json",
     )
-    group.add_argument(
-        "--focus",
-        metavar="MM",
-        type=positive,
-        default=1000.0,
-        help="object distance that a named element is made for; inf allowed (default 1000)",
+    _length(
+        group, "--focus", "object distance for which a named element is designed; inf allowed", 1000.0, type=positive
     )
-    group.add_argument(
+    _length(
+        group,
         "--design-wavelength",
+        "at which elements are designed and wrapped (default 0.55); heights of a file are wrapped only with it",
         metavar="UM",
-        type=positive_finite,
-        help="that it is made for, and wrapped at (default 0.55); a file's heights are wrapped only if this is given",
     )
     group.add_argument(
         "--levels", metavar="N", type=count, help="steps of a wave's height, of wrapped elements (default any height)"
     )
     group.add_argument("--glass", metavar="NAME", help="material of a file's element (default: that of its FILE.json)")
-    group.add_argument(
+    _length(
+        group,
         "--index",
+        "refractive index of a file's element at each --wavelength, instead of --glass",
         metavar="N",
-        type=positive_finite,
         nargs="+",
-        help="refractive index of a file's element at each --wavelength, instead of --glass",
     )
-    group.add_argument("--pitch", metavar="MM", type=positive_finite, help="of a file that does not say it")
+    _length(group, "--pitch", "of a file without it")
     group.add_argument(
-        "--span", metavar="MM", type=float, nargs=2, help="heights of black and white of a picture that does not say"
+        "--span", metavar="MM", type=float, nargs=2, help="height range of an image without metadata: black and white"
     )
     catalog(group)
 
@@ -90,7 +73,7 @@ def light(
     depths: tuple[float, ...] = (500.0, 1000.0, float("inf")),
     wavelengths: tuple[float, ...] = (0.46, 0.55, 0.64),
 ) -> None:
-    """--depth (where there are any), --wavelength: the point sources."""
+    """--depth (if there are any), --wavelength: the point sources."""
     group = parser.add_argument_group("light")
     if depths:
         listed = " ".join(f"{depth:g}" for depth in depths)
@@ -110,21 +93,19 @@ def light(
         type=positive_finite,
         nargs="+",
         default=list(wavelengths),
-        help=f"in µm (default {' '.join(f'{one:g}' for one in wavelengths)})",
+        help=f"in µm (default {' '.join(f'{wavelength:g}' for wavelength in wavelengths)})",
     )
 
 
 def pixels(parser: argparse.ArgumentParser, *, across: int = 128, pitch: float = 0.00369) -> None:
-    """--pixel, --size: the window of the PSF; across: pixels, pitch: mm, where they are not given."""
+    """--pixel, --size: the window of the PSF; across: pixels, pitch: mm, by default."""
     group = parser.add_argument_group("window")
-    group.add_argument(
-        "--pixel", metavar="MM", type=positive_finite, default=pitch, help=f"pixel pitch (default {pitch:g})"
-    )
+    _length(group, "--pixel", "pixel pitch", pitch)
     size(group, f"the window, centred on the axis (default {across})", default=across)
 
 
 def engine(parser: argparse.ArgumentParser) -> None:
-    """--engine, --samples, --tol: how PSFs are computed."""
+    """--engine, --samples, --tol: the computation of PSFs."""
     group = parser.add_argument_group("sampling")
     group.add_argument(
         "--engine",
@@ -144,7 +125,5 @@ def engine(parser: argparse.ArgumentParser) -> None:
 
 
 def feature(group, default: str) -> None:
-    """--feature: size of what heights are made in."""
-    group.add_argument(
-        "--feature", metavar="MM", type=positive_finite, help=f"size of the features of the heights (default {default})"
-    )
+    """--feature: size of the features of the heights."""
+    _length(group, "--feature", f"size of the features of the heights (default {default})")

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.descent import Descent, minimise
 from raytrace.imaging.pictures import Pictures, crop
 from raytrace.imaging.restoration import kernel_error, power_spectrum
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optimization.solver import TensorDescent, minimise_tensors
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance
@@ -94,13 +94,13 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
         ends = variables.bounds.get(variable.name, (-math.inf, math.inf))
         bounds.append(tuple(sorted((end - variable.start) / variable.unit for end in ends)))
 
-    def descend() -> Descent:
+    def descend() -> TensorDescent:
         # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-        return minimise(list(variables.parameters()), loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
+        return minimise_tensors(list(variables.parameters()), loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.
-    while variables.held is not None and descent.course[0] - descent.course[-1] > _SETTLED * descent.course[-1]:
+    while variables.held is not None and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]:
         descent = descend()
     names = tuple(variable.name for variable, at_end in zip(variables.variables, descent.at_end, strict=True) if at_end)
     names += (variables.held.by.name,) if variables.beyond() else ()

@@ -28,19 +28,20 @@ from raytrace.imaging.closed_form import (
     out_of_focus,
     patch_spectrum,
 )
-from raytrace.imaging.descent import NoOptimum
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
-from raytrace.imaging.variables import Variables, parse_bounds, parse_range
+from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
 from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
+from raytrace.optimization.solver import NoOptimum
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.parameter_paths import parse_range
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers
@@ -85,7 +86,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
     return Variables(
         lens_at_start(lens, settings),
         settings.vary,
-        bounds=parse_bounds(settings.bounds),
+        bounds=settings.bounds,
         hold=settings.hold,
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.files import write_atomically
-from raytrace.imaging.descent import minimise
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
@@ -27,6 +26,7 @@ from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored,
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.value import detached
+from raytrace.optimization.solver import minimise_tensors
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
@@ -168,7 +168,7 @@ def best_of_starts(
         def error(trial=trial, expected=expected) -> Tensor:
             return expected(trial())
 
-        lowest = min(minimise(list(trial.parameters()), error, steps=steps).course)
+        lowest = min(minimise_tensors(list(trial.parameters()), error, steps=steps).values)
         if lowest < least:
             best, least = trial, lowest
     return best

@@ -17,10 +17,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.optimize import linprog
 
-from raytrace.optimization.constraints import Condition
 from raytrace.optimization.merit import arguments
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import RELATIONS, NoProblem, Problem, typical_of
+from raytrace.optimization.problem import RELATIONS, Condition, NoProblem, Problem, typical_of
 from raytrace.optimization.variables import name_of
 
 EXACT = 1e-6  # tolerance of a condition, relative to its target, or to 1

@@ -1,21 +1,17 @@
-"""Glass: which glasses of the catalogs an optimisation ends with.
+"""Glass choice: the catalog glasses of an optimisation with variable glasses.
 
-1. The lens is optimised with its own glasses: nothing that follows may end worse.
-2. Glasses that vary become model glasses, whose numbers (n, V, ΔP) have bounds in common: the convex hull of the
-   catalogs. The lens is optimised with them too.
+1. The lens is optimised with its glasses: later steps may not end worse.
+2. Variable glasses become model glasses, whose numbers (n, V, ΔP) stay within the convex hull of the catalogs. The
+   lens is optimised with them.
 3. One element at a time, the one that loses most first, takes a glass of the catalogs.
-4. Then one glass at a time is exchanged, until no exchange helps.
+4. One glass at a time is exchanged, until no exchange lowers the merit.
 
-Which glasses are tried is told by an expansion of the merit. With the derivatives J_y by all other variables, and J_p
-by the numbers p of a glass, of the residuals r, what is left after the others have followed is, to second order,
+An expansion of the merit selects the glasses that are tried. With the derivatives J_y of the residuals r by all other
+variables, and J_p by the numbers p of a glass, the merit after the others have followed is, to second order,
 
     M²(p + d) = |N (r + J_p d)|²,   N = 1 - J_y (J_yᵀ J_y + λ D²)⁻¹ J_yᵀ
 
-so that NJ_p holds Schur's complement of the Hessian. The best few of the list are optimised; what they reach counts.
-
-Pool: the glasses of catalogs that a lens may take, by the numbers of model glasses, and the hull of these.
-
-Which glasses vary, and what varies beside them.
+so that NJ_p holds Schur's complement of the Hessian. The best few are optimised, and the merit reached decides.
 """
 
 import dataclasses
@@ -32,11 +28,11 @@ from scipy.spatial import ConvexHull, QhullError
 
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
-from raytrace.optimization.checkpoint import BadCheckpoint, Kept
-from raytrace.optimization.least_squares import State, least_squares
-from raytrace.optimization.lens_model import GLASS, Model
+from raytrace.optimization.checkpoint import BadCheckpoint, Stored
+from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.variables import MEDIA, Freedom
+from raytrace.optimization.solver import State, least_squares
+from raytrace.optimization.variables import GLASS, Freedom, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 
@@ -119,16 +115,16 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def catalogs_of(lens: Lens, catalog: Sequence[str | Path] = ()) -> tuple[Catalog, ...]:
     """Catalogs by their names or AGF files; without any those that the lens names, else SCHOTT. Raises CatalogError."""
     shipped = [name for name in lens.catalogs if name not in missing_catalogs([name])]
-    return tuple(_catalog(name) for name in (catalog or shipped or ("SCHOTT",)))
-
-
-def _catalog(name: str | Path) -> Catalog:
-    if Path(name).suffix or Path(name).is_file():
-        return load(name)
-    try:
-        return shipped_catalog(str(name))
-    except CatalogError as error:
-        raise NoProblem(f"`catalog`: {error}") from None
+    catalogs = []
+    for name in catalog or shipped or ("SCHOTT",):
+        if Path(name).suffix or Path(name).is_file():
+            catalogs.append(load(name))
+            continue
+        try:
+            catalogs.append(shipped_catalog(str(name)))
+        except CatalogError as error:
+            raise NoProblem(f"`catalog`: {error}") from None
+    return tuple(catalogs)
 
 
 def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
@@ -150,58 +146,6 @@ def charge(glass: Glass) -> float:
     return STATUSES.get(glass.status, max(STATUSES.values())) * max(price, 1.0) ** _PRICE
 
 
-def without_glass(free: Freedom, vary: str | Sequence | None) -> tuple[Freedom, tuple[int, ...]]:
-    """What varies but for glasses, and the surfaces whose glasses do.
-
-    Those that the file marks, where words mean all; other numbers of those glasses vary no more. The file's variables
-    follow where words name nothing but glasses. Raises NoProblem.
-    """
-    chosen = {one.surface for one in free.variables if one.quantity == "glass"}
-    if not chosen:
-        return free, ()
-    chosen = _marked(free.lens, vary, chosen) - set(followers(free.lens))
-    differing = [k for k in sorted(chosen) if _differs(free.lens, k)]
-    if differing or not chosen:
-        which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
-        raise NoProblem(f"`vary=glass`: the glass {which}")
-    own = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
-    others = _others(free.variables, chosen) or _others(own, chosen)
-    if not others:
-        raise NoProblem("`vary=glass`: nothing but glasses varies; name what follows them, as 'curvature glass'")
-    return dataclasses.replace(free, variables=others), tuple(sorted(chosen))
-
-
-def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
-    """The variables but for glasses, and for numbers of glasses that are chosen."""
-    of_media = (*MEDIA, *GLASS)
-    return tuple(
-        one for one in variables if one.quantity != "glass" and not (one.quantity in of_media and one.surface in chosen)
-    )
-
-
-def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[int]:
-    """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
-    words = vary if isinstance(vary, str) else " ".join(one for one in vary or () if isinstance(one, str))
-    kept = () if lens.optimization_data is None else lens.optimization_data.kept
-    told = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
-    all_meant = "glass" in words.split()
-    return (told & surfaces or surfaces) if all_meant else surfaces
-
-
-def followers(lens: Lens) -> dict[int, int]:
-    """Surfaces whose glass is that of another, and which one's."""
-    rules = () if lens.optimization_data is None else (*lens.optimization_data.solves, *lens.optimization_data.kept)
-    return {
-        one.surface: one.source
-        for one in rules
-        if (one.quantity, one.kind) == ("glass", "pickup") and one.operand is None
-    }
-
-
-def _differs(lens: Lens, surface: int) -> bool:
-    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.paths)
-
-
 def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:
     """The lens with other glasses behind its surfaces, and behind those that follow them."""
     surfaces = list(lens.surfaces)
@@ -220,7 +164,7 @@ _DAMPING = 1e-4  # of the variables that follow in the expansion
 _MET = 1e-5  # up to which a condition that is missed counts as met
 _ALIKE = 0.01  # of the width of the hull: glasses that are nearer are not both tried
 
-#: Kinds of steps, by what is told of them.
+#: Descriptions of the kinds of steps.
 WORDS = {
     "own": "all other variables, with the glasses of the lens",
     "model": "and with model glasses",
@@ -233,9 +177,9 @@ WORDS = {
 class GlassStep:
     """One step of the choice.
 
-    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the glass that was taken, 0 and "" of the former
-    two; replaced: the glass before. predicted, reached: merits. tried: (name, predicted, reached) of all that were
-    optimised.
+    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the new glass, 0 and "" of the former two;
+    replaced: the glass before. predicted, reached: merits. tried: (name, predicted, reached) of all candidates that
+    were optimised.
     """
 
     kind: str
@@ -258,13 +202,13 @@ class GlassStep:
         if not self.surface:
             return f"{WORDS[self.kind]:<52} {'':>14} {self.reached:>14.6g} {self.seconds:>8.1f}"
         instead = f" for {self.replaced}" if self.replaced else ""
-        said = f"{WORDS[self.kind]} {self.surface}: {self.name} ({self.catalog}){instead}"
-        return f"{said:<52} {self.predicted:>14.6g} {self.reached:>14.6g} {self.seconds:>8.1f}"
+        words = f"{WORDS[self.kind]} {self.surface}: {self.name} ({self.catalog}){instead}"
+        return f"{words:<52} {self.predicted:>14.6g} {self.reached:>14.6g} {self.seconds:>8.1f}"
 
 
 @dataclass(frozen=True)
 class Design:
-    """A state of the choice: variables x (n,) but for glasses, the glasses, and what the solver says there."""
+    """A state of the choice: variables x (n,) but for glasses, the glasses, and the state of the solver."""
 
     x: np.ndarray
     glasses: dict[int, Glass]
@@ -275,7 +219,7 @@ class Design:
         return float(np.sqrt(self.state.cost))
 
     def rank(self, charged: float = 1.0) -> tuple:
-        """Fewer rays lost, then conditions met, then less merit."""
+        """Fewer failed rays, then conditions met, then a lower merit."""
         missed = float(self.state.missed.max(initial=0.0))
         return self.state.lost, missed if missed > _MET else 0.0, self.merit * charged
 
@@ -289,7 +233,7 @@ class Expansion:
     hessian: np.ndarray
 
     def merit(self, d: np.ndarray) -> np.ndarray:
-        """(…) the merit that is foretold."""
+        """(…) the predicted merit."""
         square = self.cost + 2 * d @ self.gradient + np.einsum("...i,ij,...j", d, self.hessian, d)
         return np.sqrt(np.maximum(square, 0.0))
 
@@ -315,7 +259,7 @@ def expansion(state: State, own: np.ndarray, following: np.ndarray, fixed: np.nd
 
 
 class Choice:
-    """The glasses of surfaces of a lens, chosen from a pool; `run` gives the best design, its problem and the steps."""
+    """The glasses of surfaces of a lens, chosen from a pool; `run` returns the best design."""
 
     def __init__(
         self,
@@ -328,18 +272,17 @@ class Choice:
         *,
         cycles: int | None = None,
         until: float = np.inf,
-        tell: Callable[[GlassStep], None] | None = None,
-        keep: Callable[[Kept, float], None] | None = None,
+        keep: Callable[[Stored, float], None] | None = None,
         **options,
     ):
-        """cycles: of a stage, at most; until: a time of `time.monotonic`; tell: told of steps; keep: given the best
-        while glasses are exchanged, and its merit; options: of Problem."""
+        """cycles: of a stage, at most; until: a time of `time.monotonic`; keep: called with the best state while
+        glasses are exchanged, and its merit; options: of Problem."""
         self.free, self.surfaces, self.pool, self.bounds = free, tuple(surfaces), pool, bounds
         self.rows, self.conditions, self.options = rows, conditions, options
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
-        self.until, self.begun, self.evaluations, self.tell = until, time.monotonic(), 0, tell or (lambda step: None)
+        self.until, self.started, self.evaluations = until, time.monotonic(), 0
         self.descended = 0  # cycles
-        self.steps, self.keep = [], keep or (lambda kept, merit: None)
+        self.steps, self.keep = [], keep or (lambda stored, merit: None)
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
@@ -353,18 +296,18 @@ class Choice:
             found[k] = glasses, np.concatenate(numbers)
         return found
 
-    def run(self, x: np.ndarray, kept: Kept | None = None) -> Design:
-        """The best design from variables x, which are within their bounds; kept: from where exchanges go on."""
+    def run(self, x: np.ndarray, stored: Stored | None = None) -> Design:
+        """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
         own = {k: self.free.lens.surfaces[k].glass for k in self.surfaces}
-        if kept is not None and kept.glasses:
-            chosen = own | {k: self._named(k, *one) for k, one in kept.glasses.items()}
+        if stored is not None and stored.glasses:
+            chosen = own | {k: self._named(k, *one) for k, one in stored.glasses.items()}
             self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
-            if kept.course is None:  # else all exchanges were done
+            if stored.descent is None:  # else all exchanges were done
                 with suppress(KeyboardInterrupt):  # the best so far
-                    self.swap(kept.tested)
+                    self.swap(stored.tested)
             return self.best
         first = self.descend(Design(x, own, None), (), self.cycles)
-        self._tell(GlassStep("own", first.merit, self.seconds))
+        self.steps.append(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
             known = all(glass.catalog for glass in own.values())
@@ -385,14 +328,14 @@ class Choice:
 
     def _keep(self, tested: Sequence[int]) -> None:
         glasses = {k: (glass.catalog, glass.name) for k, glass in self.best.glasses.items()}
-        self.keep(Kept(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
+        self.keep(Stored(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
     def snapped(self, design: Design, *, known: bool) -> Design:
         """The design with model glasses first, then with glasses of the catalogs in their places, one by one; as it is
         where no time is left for that, and its glasses are known ones."""
         first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
         design = self.descend(Design(design.x, model, None), self.surfaces, self.cycles)
-        self._tell(GlassStep("model", design.merit, self.seconds))
+        self.steps.append(GlassStep("model", design.merit, self.seconds))
         waiting = list(self.surfaces)
         while waiting:
             if known and time.monotonic() > self.until:
@@ -402,11 +345,7 @@ class Choice:
 
     @property
     def seconds(self) -> float:
-        return time.monotonic() - self.begun
-
-    def _tell(self, step: GlassStep) -> None:
-        self.steps.append(step)
-        self.tell(step)
+        return time.monotonic() - self.started
 
     def problem(self, glasses: dict[int, Glass], open_: Sequence[int]) -> Problem:
         """With these glasses; the numbers of those of surfaces `open_` vary behind the other variables."""
@@ -445,7 +384,7 @@ class Choice:
         return np.concatenate([design.x, *numbers])
 
     def descend(self, design: Design, open_: Sequence[int], cycles: int) -> Design:
-        """The design at its least; glasses of surfaces `open_` are model glasses that vary."""
+        """The design at its minimum; glasses of surfaces `open_` are variable model glasses."""
         state = self.limited(self.problem(design.glasses, open_), open_)
         rest = np.full(self.pool.count * len(open_), np.inf)
         lower, upper = np.concatenate([self.bounds[0], -rest]), np.concatenate([self.bounds[1], rest])
@@ -461,8 +400,8 @@ class Choice:
         glasses = design.glasses | {s: self.pool.model(one) for s, one in numbers.items()}
         return Design(end[:count], glasses, found.state)
 
-    def foretold(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
-        """For surfaces the merits (G,) that their candidates are foretold to reach; those in `open_` follow too."""
+    def predicted(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
+        """For surfaces the predicted merits (G,) of their candidates; glasses of `open_` follow too."""
         models = {k: self.pool.model(self.numbers(design, k)) for k in self.surfaces}
         modelled = Design(design.x, models, None)
         x = self._start(modelled, self.surfaces)
@@ -472,52 +411,48 @@ class Choice:
         inside = np.arange(count)[(design.x > self.bounds[0]) & (design.x < self.bounds[1])]
         held = len(state.limits) - len(self.pool.normal) * len(self.surfaces)
         at = state.limits_slope[:held][np.abs(state.limits[:held]) < _MET]
-        found = {}
+        merits = {}
         for s in surfaces:
             following = np.concatenate([inside, *(columns[o] for o in open_ if o != s)]).astype(int)
-            merits = expansion(state, columns[s], following, at).merit(self.candidates[s][1] - self.numbers(design, s))
-            found[s] = merits
-        return found
+            change = self.candidates[s][1] - self.numbers(design, s)
+            merits[s] = expansion(state, columns[s], following, at).merit(change)
+        return merits
 
     def numbers(self, design: Design, surface: int) -> np.ndarray:
         glass = design.glasses[surface]
         return self.pool.numbers_of(glass) if glass.catalog else glass.coefficients.numpy()[: self.pool.count]
 
     def tried(self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]):
-        """(design, glass, merit that was foretold, all that were tried) of the best of the promising candidates."""
-        glasses, best, told = self.candidates[surface][0], None, []
-        for i in self._first(design.glasses[surface], surface, merits):
-            if told and time.monotonic() > self.until:
+        """(design, glass, predicted merit, all that were tried) of the best of the promising candidates."""
+        (glasses, numbers), current = self.candidates[surface], design.glasses[surface]
+        width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
+        candidates: list[int] = []  # none like another
+        for i in np.argsort(merits * [charge(glass) for glass in glasses], kind="stable"):
+            if glasses[i].name == current.name and current.catalog:
+                continue
+            if all(np.abs((numbers[i] - numbers[j]) / width).max() > _ALIKE for j in candidates):
+                candidates.append(int(i))
+            if len(candidates) == TRIED:
+                break
+        best, tried = None, []
+        for i in candidates:
+            if tried and time.monotonic() > self.until:
                 break
             trial = Design(design.x, design.glasses | {surface: glasses[i]}, None)
-            one = self.descend(trial, open_, min(TRIAL_CYCLES, self.cycles))
-            told.append((glasses[i].name, float(merits[i]), one.merit))
-            if best is None or one.rank(charge(glasses[i])) < best[0].rank(charge(best[1])):
-                best = one, glasses[i], float(merits[i])
-        return (*best, tuple(told)) if best else None
-
-    def _first(self, now: Glass, surface: int, merits: np.ndarray) -> list[int]:
-        """The candidates to try, none like another."""
-        glasses, numbers = self.candidates[surface]
-        width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
-        taken: list[int] = []
-        for i in np.argsort(merits * [charge(glass) for glass in glasses], kind="stable"):
-            if glasses[i].name == now.name and now.catalog:
-                continue
-            if all(np.abs((numbers[i] - numbers[j]) / width).max() > _ALIKE for j in taken):
-                taken.append(int(i))
-            if len(taken) == TRIED:
-                break
-        return taken
+            end = self.descend(trial, open_, min(TRIAL_CYCLES, self.cycles))
+            tried.append((glasses[i].name, float(merits[i]), end.merit))
+            if best is None or end.rank(charge(glasses[i])) < best[0].rank(charge(best[1])):
+                best = end, glasses[i], float(merits[i])
+        return (*best, tuple(tried)) if best else None
 
     def snap(self, design: Design, waiting: list[int]) -> Design:
         """The design in which the element that loses most by it has taken a glass of the catalogs."""
-        foretold = self.foretold(design, waiting, waiting)
-        surface = max(waiting, key=lambda k: float(foretold[k].min()))
+        merits = self.predicted(design, waiting, waiting)
+        surface = max(waiting, key=lambda k: float(merits[k].min()))
         waiting.remove(surface)
-        found, glass, predicted, told = self.tried(design, surface, foretold[surface], waiting)
-        self._took("snap", surface, glass, "", predicted, found, told)
-        return found
+        end, glass, predicted, tried = self.tried(design, surface, merits[surface], waiting)
+        self._took("snap", surface, glass, "", predicted, end, tried)
+        return end
 
     def swap(self, tested: Sequence[int] = ()) -> None:
         """Exchange one glass at a time, the most promising first, until none helps; tested: where none has helped."""
@@ -526,29 +461,29 @@ class Choice:
             left = [k for k in self.surfaces if k not in tested]
             if not left or time.monotonic() > self.until:
                 return
-            foretold = self.foretold(self.best, left, ())
-            surface = min(left, key=lambda k: float(foretold[k].min()))
+            merits = self.predicted(self.best, left, ())
+            surface = min(left, key=lambda k: float(merits[k].min()))
             tested.add(surface)
-            if self._swap(surface, foretold[surface]):
+            if self._swap(surface, merits[surface]):
                 tested = {surface}
             self._keep(tested)
 
-    def _swap(self, surface: int, foretold: np.ndarray) -> bool:
+    def _swap(self, surface: int, merits: np.ndarray) -> bool:
         """Exchange a glass, if that helps."""
         design, before = self.best, self.best.glasses[surface]
-        tried = self.tried(design, surface, foretold, ())
-        if tried is None:
+        best = self.tried(design, surface, merits, ())
+        if best is None:
             return False
-        found, glass, predicted, told = tried
-        if not found.rank(charge(glass)) < design.rank(charge(before) * (1 - _GAIN)):
+        end, glass, predicted, tried = best
+        if not end.rank(charge(glass)) < design.rank(charge(before) * (1 - _GAIN)):
             return False
-        found = self.descend(found, (), self.cycles)
-        if not found.rank() < design.rank():
+        end = self.descend(end, (), self.cycles)
+        if not end.rank() < design.rank():
             return False
-        self.best = found
-        self._took("swap", surface, glass, before.name, predicted, found, told)
+        self.best = end
+        self._took("swap", surface, glass, before.name, predicted, end, tried)
         return True
 
-    def _took(self, kind: str, surface: int, glass: Glass, replaced: str, predicted: float, found: Design, told):
-        taken = surface, glass.name, glass.catalog, replaced, predicted, told
-        self._tell(GlassStep(kind, found.merit, self.seconds, *taken))
+    def _took(self, kind: str, surface: int, glass: Glass, replaced: str, predicted: float, design: Design, tried):
+        taken = surface, glass.name, glass.catalog, replaced, predicted, tried
+        self.steps.append(GlassStep(kind, design.merit, self.seconds, *taken))

@@ -12,55 +12,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.materials.glass import is_air
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.variables import GLASS, Address, UnknownNumber, names_at, path_of, with_numbers_of
 from raytrace.system.lens import Lens, media
 from raytrace.system.optimization_data import Solve, Vary
-from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths, with_number
+from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths
 from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
+from raytrace.system.surface import gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of
-
-#: A number of a lens: of which surface, and which.
-Address = tuple[int, str]
 
 #: Numbers that a surface keeps at 0 as None.
 _AT_ZERO = ("curvature", "conic")
 
 #: Power of length of what a pickup between configurations adds.
 _POWERS = {"thickness": 1, "curvature": -1}
-
-#: Numbers of the medium behind a surface, where it is a model glass or a constant index.
-GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
-
-
-class UnknownNumber(ValueError):
-    """A variable, solve or pickup of a number that the lens does not have."""
-
-
-def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
-    """Where a surface holds a number. Raises UnknownNumber."""
-    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
-    if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
-        entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
-        known |= {name: ParameterPath(("glass", "coefficients"), entry) for name, entry in entries}
-    if quantity not in known:
-        raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
-    return known[quantity]
-
-
-def with_numbers_of(
-    lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
-) -> Lens:
-    """The lens with other numbers of its surfaces; known: their places, where they have been looked up before."""
-    surfaces = list(lens.surfaces)
-    for (surface, quantity), number in numbers.items():
-        place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
-        surfaces[surface] = with_number(surfaces[surface], place, number)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -365,15 +333,6 @@ def _overridden(lens: Lens) -> set[Address]:
             if place.path[0] == "surfaces" and operand.numbers is not None:
                 found |= {(place.path[1], name) for name in names_at(lens.surfaces[place.path[1]], place.path[2:])}
     return found
-
-
-def names_at(surface: Surface, path: tuple) -> list[str]:
-    """The names by which a surface's number at a path of `configurations` is known."""
-    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
-    entry = path[-1] if isinstance(path[-1], tuple) else None
-    fields = path[:-1] if entry is not None else path
-    flat = None if entry is None else entry[0] if len(entry) == 1 else None
-    return [name for name, place in known.items() if place.path == fields and place.entry == flat]
 
 
 def _open(lens: Lens) -> Lens:

@@ -1,96 +1,236 @@
-"""Problem: the rows of a merit function over a model, as the sum of squares and conditions that a solver descends on.
+"""Problem: a merit function and constraints over a model, as the sum of squares and conditions of the solver.
 
-Rows of positive weight are squared; rows of negative weight, and what is held, are conditions that are met exactly.
+Constraint syntax is "efl=50 total_track<=80 distortion<=2% bfd>=30": a name of WORDS, a relation and a number;
+efl@2=100 applies to configuration 2, thickness:3-5>=20 to the sum of these thicknesses, and REAY(8,0,0,1,0,0)=2 to any
+operand by its arguments.
 
-Lost rays: how far each misses the surface that it is lost at, with derivatives, so that a descent brings it back.
+Rows of positive weight are squared; rows of negative weight, and constraints, are conditions that are met exactly.
 
-A ray that meets no point of a conic misses it by the negative discriminant of its crossing; one that is totally
-reflected has the sine of its refraction beyond 1:
+Failed rays are charged by the amount by which each misses the surface at which it fails, with derivatives that lead it
+back. A ray that misses a conic has a negative discriminant; for one that is totally reflected the sine of refraction
+is above 1:
 
     A t² + 2 B t + C = 0,  missed by A C - B²;    (n/n')² sin² I - 1
 
-Both are without a unit and 0 where the ray just passes. At any other surface it is how far the ray stands outside the
+Both are dimensionless and 0 where the ray just passes. At any other surface it is the distance of the ray beyond the
 vertex sphere, c² r².
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.constraints import Condition as Condition
 from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.least_squares import Sides, State
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.merit import in_unit
 from raytrace.optimization.merit_rows import LOST, Evaluated, Evaluation
+from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.ray_bundle import Bundle, Ray
+from raytrace.optimization.solver import Sides, State
+from raytrace.optimization.variables import BadHold, constraint_words, has_power, split_constraint
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
+from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
+from raytrace.words import did_you_mean
 
-#: How much a miss of 1 weighs beside the loss itself, and how far inside a ray is brought back.
+
+@dataclass(frozen=True)
+class Condition:
+    """A constraint: the value of a row related to its target, lengths in mm; in a configuration, 0 the current one.
+
+    relation: "=", "<=" or ">="; name: in tables, by default the operand of the row.
+    """
+
+    row: Row
+    relation: str = "="
+    configuration: int = 0
+    name: str = ""
+
+
+#: The arguments of a row: two whole numbers, four numbers.
+Arguments = tuple[tuple[int, int], tuple[float, float, float, float]]
+
+_NONE: Arguments = ((0, 0), (0.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Word:
+    """A quantity of constraint syntax: an operand with its arguments, in mm or `unit`.
+
+    one_sided: whether the operand is the excess over its target, so that the relation has to be "<=".
+    """
+
+    operand: str
+    text: str
+    unit: str = "mm"
+    arguments: Callable[[Lens], Arguments] = lambda lens: _NONE
+    one_sided: bool = False
+
+
+def conditions_of(lens: Lens, hold: str | Sequence[str] | None) -> tuple[Condition, ...]:
+    """The conditions of constraint syntax. Raises BadHold."""
+    return tuple(_condition(lens, word) for word in constraint_words(hold))
+
+
+def conditions_in_unit(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
+    """The conditions of `hold`, from mm to the unit of length of the merit function."""
+    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
+    conditions = conditions_of(lens, hold) if in_words else hold
+    return tuple(dataclasses.replace(one, row=in_unit(one.row, 1.0, unit)) for one in conditions)
+
+
+def _condition(lens: Lens, word: str) -> Condition:
+    name, configuration, relation, number = split_constraint(word)
+    if configuration > len(lens.configurations):
+        raise BadHold(f"`hold`: {word!r}: configuration {configuration}; this lens has {len(lens.configurations)}")
+    view = lens.configuration(configuration) if configuration else lens
+    if name in WORDS:
+        known = WORDS[name]
+        arguments = known.arguments(view)
+    elif sum_of := re.fullmatch(r"thickness:(\d+)(?:-(\d+))?", name):
+        first, last = int(sum_of[1]), int(sum_of[2] or sum_of[1])
+        if not 0 <= first <= last <= sensor(lens):
+            raise BadHold(f"`hold`: {word!r}: this lens has gaps behind surfaces 0 to {sensor(lens)}")
+        known, arguments = Word("TTHI", "a sum of thicknesses"), ((first, last), _NONE[1])
+    elif operand := re.fullmatch(r"([A-Z][A-Z0-9]{3})(?:\(([^()]*)\))?", name):
+        if operand[1] not in OPERANDS:
+            raise BadHold(f"`hold`: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], OPERANDS)}")
+        known, arguments = Word(operand[1], "", ""), _arguments(operand[2] or "", word)
+    else:
+        meant = did_you_mean(name, WORDS)
+        raise BadHold(f"`hold`: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}")
+    if known.one_sided and relation != "<=":
+        raise BadHold(f"`hold`: {word!r}: {name} is the largest that there is; expected {name}<={number}")
+    try:
+        target = float(number.removesuffix(known.unit) if known.unit else number)
+    except ValueError:
+        target = float("nan")
+    if not abs(target) < float("inf"):
+        unit = f" in {known.unit}" if known.unit else ""
+        raise BadHold(f"`hold`: {word!r}: {number!r} is no number{unit}")
+    return Condition(Row(known.operand, *arguments, target=target), relation, configuration, name)
+
+
+def _arguments(text: str, word: str) -> Arguments:
+    """Arguments as in a row: two whole numbers, then up to four numbers."""
+    try:
+        numbers = [float(part) for part in text.split(",") if part]
+        first = [int(part) for part in numbers[:2]]
+    except ValueError:
+        numbers, first = [0.0] * 7, []
+    if len(numbers) > 6 or first != numbers[:2]:
+        raise BadHold(f"`hold`: {word!r}: expected two whole numbers and up to four numbers, as REAY(8,0,0,1,0,0)")
+    first, others = first + [0] * (2 - len(first)), numbers[2:] + [0.0] * (4 - len(numbers[2:]))
+    return (first[0], first[1]), (others[0], others[1], others[2], others[3])
+
+
+# -- arguments in a lens -----------------------------------------------------------------------------------------------
+
+
+def _behind_the_lens(lens: Lens) -> Arguments:
+    """From the last powered surface to the image."""
+    bending = [k for k in range(1, sensor(lens) + 1) if has_power(lens, k)]
+    return (max(bending, default=1), sensor(lens)), _NONE[1]
+
+
+def _chief_ray(lens: Lens) -> Arguments:
+    """The chief ray of the largest field on the image."""
+    radius = torch.hypot(lens.fields.x, lens.fields.y)
+    if not bool(radius.any()):
+        raise BadHold("`hold`: all fields are on the axis: there is no off-axis chief ray")
+    largest = int(radius.argmax())
+    field = (float(part[largest] / radius[largest]) for part in (lens.fields.x, lens.fields.y))
+    return (len(lens.surfaces) - 1, 0), (*field, 0.0, 0.0)
+
+
+def _outer_colours(lens: Lens) -> Arguments:
+    """The shortest and the longest wavelength."""
+    return (int(lens.wavelengths.argmin()) + 1, int(lens.wavelengths.argmax()) + 1), _NONE[1]
+
+
+#: Quantities of constraint syntax.
+WORDS = {
+    "efl": Word("EFFL", "effective focal length"),
+    "f_number": Word("ISFN", "focal length / entrance pupil diameter", ""),
+    "working_f_number": Word("WFNO", "of the real cone on the axis", ""),
+    "numerical_aperture": Word("ISNA", "of the image, paraxial", ""),
+    "magnification": Word("PMAG", "paraxial, of an object at a finite distance", ""),
+    "angular_magnification": Word("AMAG", "paraxial, of the chief ray", ""),
+    "total_track": Word("TOTR", "from surface 1 to the image"),
+    "bfd": Word("TTHI", "from the last powered surface to the image", arguments=_behind_the_lens),
+    "image_height": Word("REAR", "of the chief ray of the largest field", arguments=_chief_ray),
+    "paraxial_image_height": Word("PIMH", "of the largest field"),
+    "distortion": Word("DIMX", "the largest of all fields", "%", one_sided=True),
+    "petzval_radius": Word("PETZ", "of the image without astigmatism"),
+    "entrance_pupil_diameter": Word("EPDI", "of the beam"),
+    "entrance_pupil": Word("ENPP", "distance from surface 1"),
+    "exit_pupil": Word("EXPP", "distance from the image"),
+    "chief_ray_angle": Word("RAID", "between the chief ray of the largest field and the image's axis", "°", _chief_ray),
+    "lateral_colour": Word("LACL", "between the outer wavelengths", arguments=_outer_colours),
+    "axial_colour": Word("AXCL", "between the outer wavelengths", arguments=_outer_colours),
+}
+
+
+#: Weight of a miss of 1 relative to the charge for a failed ray, and the margin by which a ray is brought back.
 STEEP, MARGIN = 5.0, 0.1
 
 
 class Recovery:
-    """What is charged for the lost rays of the rows of a merit function."""
+    """The amounts by which failed rays of the rows of a merit function miss a surface."""
 
     def __init__(self, evaluation: Evaluation):
-        self.evaluation = evaluation
         self.planners = {line.number - 1: (planner, line) for planner, lines, _ in evaluation.groups for line in lines}
         self._bundles: dict = {}
 
     def excess(self, x: np.ndarray, rows: Sequence[int], *, derivatives: bool) -> tuple[np.ndarray, ...]:
-        """How far the rays of rows (K,), from 0, miss: (K,), by variables (K, n), and how many surfaces are left.
+        """Amounts (K,) by which the rays of rows (K,), from 0, miss, by variables (K, n), and number of surfaces left.
 
-        0 of a ray that runs along the surface, as behind a break of 90°: there is no way back that derivatives know.
+        0 of a ray along the surface, as behind a break of 90°: no derivative leads back.
         """
         variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
         missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
-        for view, wanted in self._by_view(rows).items():
-            state = view.state(variables)
-            with np.errstate(all="ignore"):
-                found = [*self._missed(view, state, wanted)]
-            for place, number, left in found:
-                behind[place], slope = left, slope_of(number, len(x))
-                if np.isfinite(value_of(number)) and np.isfinite(slope).all():  # else the ray runs along the surface
-                    missed[place], slopes[place] = float(value_of(number)), slope
-        return missed, slopes, behind
-
-    def _by_view(self, rows: Sequence[int]) -> dict:
-        """For every configuration: the places in `rows` and their rays."""
-        found: dict = {}
+        by_view: dict = {}
         for place, row in enumerate(rows):
             planner, line = self.planners[row]
             ray = Ray(line.wavelength, line.field, line.pupil)
-            if any(ray in bundle.rays for bundle in planner.bundles.values()):  # else a row of no ray
-                found.setdefault(planner.view, []).append((place, ray))
-        return found
+            if any(ray in bundle.rays for bundle in planner.bundles.values()):  # else the row traces no ray
+                by_view.setdefault(planner.view, []).append((place, ray))
+        for view, wanted in by_view.items():
+            state = view.state(variables)
+            with np.errstate(all="ignore"):
+                misses = [*self._missed(view, state, wanted)]
+            for place, miss, left in misses:
+                behind[place], slope = left, slope_of(miss, len(x))
+                if np.isfinite(value_of(miss)) and np.isfinite(slope).all():  # else the ray is along the surface
+                    missed[place], slopes[place] = float(value_of(miss)), slope
+        return missed, slopes, behind
 
     def _missed(self, view, state: LensState, wanted: list[tuple[int, Ray]]):
-        """(place, how far it misses, surfaces left) of every ray that is lost on its way to the image."""
+        """(place, miss, surfaces left) of every ray that fails on its way to the image."""
         rays = tuple(dict.fromkeys(ray for _, ray in wanted))
-        ended, traced = self._ends(view, state, rays), {}
-        for place, ray in wanted:
-            surface = ended.get(ray)
-            if surface is None or is_posed(view.lens.surfaces[surface]):
-                continue
-            before = self._before(view, state, rays, ray, surface, traced)
-            yield place, _miss(state, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
-
-    def _ends(self, view, state: LensState, rays: tuple[Ray, ...]) -> dict[Ray, int]:
-        """The surface at which each ray is lost."""
-        ended: dict[Ray, int] = {}
+        failed: dict[Ray, int] = {}  # surface
         plain = view.state(value_of(state.variables))
         for k in range(1, len(view.lens.surfaces)):
             bundle, numbers = self._bundle(view, k, rays)
             valid = bundle.hits(plain).at(numbers).valid
-            ended |= {ray: k for ray, there in zip(rays, valid, strict=True) if not there and ray not in ended}
-            if len(ended) == len(rays):
+            failed |= {ray: k for ray, inside in zip(rays, valid, strict=True) if not inside and ray not in failed}
+            if len(failed) == len(rays):
                 break
-        return ended
+        traced: dict = {}
+        for place, ray in wanted:
+            surface = failed.get(ray)
+            if surface is None or is_posed(view.lens.surfaces[surface]):
+                continue
+            before = self._before(view, state, rays, ray, surface, traced)
+            yield place, _miss(state, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
 
     def _bundle(self, view, last: int, rays: tuple[Ray, ...]) -> tuple[Bundle, np.ndarray]:
         key = id(view), last, rays
@@ -117,9 +257,10 @@ class Recovery:
 
 
 def _miss(state: LensState, surface: int, wavelength: int, position, direction):
-    """How far a ray misses a surface, or passes its critical angle."""
+    """The amount by which a ray misses a surface, or exceeds its critical angle."""
     (x, y, z), (L, M, N) = position, direction
-    c, k = state.curvature[surface], state.number(surface, "conic") if _has_conic(state, surface) else 0.0
+    has_conic = (surface, "conic") in state.numbers or state.lens.surfaces[surface].conic is not None
+    c, k = state.curvature[surface], state.number(surface, "conic") if has_conic else 0.0
     A = c * (1 + k * N * N)
     B = c * (x * L + y * M + (1 + k) * z * N) - N
     C = c * (x * x + y * y + (1 + k) * z * z) - 2 * z
@@ -135,20 +276,16 @@ def _miss(state: LensState, surface: int, wavelength: int, position, direction):
     return beyond if value_of(beyond) > 0 else c * c * (x * x + y * y)
 
 
-def _has_conic(state: LensState, surface: int) -> bool:
-    return (surface, "conic") in state.numbers or state.lens.surfaces[surface].conic is not None
-
-
 #: Signs by which a relation is a limit ≤ 0; equalities have none.
 RELATIONS = {"=": 0, "<=": 1, ">=": -1}
 
 
 class NoProblem(ValueError):
-    """Nothing that could be optimised; the message says what is missing."""
+    """An optimisation without variables, rows or light; the message says what is missing."""
 
 
 class Problem:
-    """The rows of a merit function, and conditions, over a model; `state` is what `least_squares` descends on."""
+    """The rows of a merit function, and conditions, over a model; `state` is the function of `least_squares`."""
 
     def __init__(
         self,
@@ -162,13 +299,9 @@ class Problem:
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
-        self._again = lambda model: Problem(
-            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, conventions=conventions
-        )
+        self._settings = {"unit": unit, "skip_unknown": skip_unknown, "conventions": conventions}
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
-        self.evaluation = Evaluation(
-            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, conventions=conventions
-        )
+        self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), **self._settings)
         weights = self.evaluation.weights
         if not len(model.variables):
             raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
@@ -180,74 +313,108 @@ class Problem:
 
     def through(self, opening: float) -> "Problem":
         """The same with rays through a part of the pupil and of the field alone."""
-        return self._again(dataclasses.replace(self.model, opening=opening))
+        model = dataclasses.replace(self.model, opening=opening)
+        return Problem(model, self.rows, self.conditions, **self._settings)
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)
 
     def state(self, x: np.ndarray, derivatives: bool) -> State:
-        """Residuals of rows of positive weight, and what the others miss, in units of their rows."""
-        found = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
-        of_row, weights = found.of_row, self.evaluation.weights
+        """Residuals of rows of positive weight, and violations of the others, in units of their rows."""
+        evaluated = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
+        of_row, weights, residuals = evaluated.of_row, self.evaluation.weights, evaluated.residuals
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
-        rows, excess, slopes = _joined(found.sides, len(x))
+        sides, count = evaluated.sides, len(x)
+        rows, excess, slopes = np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, count))
+        if sides:  # one-sided rows of all operands
+            rows, excess = (np.concatenate([one[k] for one in sides]) for k in range(2))
+            slopes = np.concatenate([np.zeros((len(one[1]), count)) if one[2] is None else one[2] for one in sides])
         sided = np.isin(of_row, rows)
         squared, exact = (weights[of_row] > 0) & ~sided, (weights[of_row] < 0) & ~sided
         equal, limit = exact & (signs == 0), exact & (signs != 0)
         soft, hard = weights[rows] > 0, weights[rows] < 0
-        own = self.evaluation.factors[rows[hard]]
-        jacobian = found.jacobian
-        return State(
+        of_hard = self.evaluation.factors[rows[hard]]
+        state = State(
             x,
-            found.residuals[squared],
-            int(found.lost[weights != 0].sum()),
+            residuals[squared],
+            int(evaluated.lost[weights != 0].sum()),
             Sides(excess[soft], slopes[soft], rows[soft]),
-            found.residuals[equal] / factors[equal],
-            np.concatenate([signs[limit] * found.residuals[limit] / factors[limit], excess[hard] / own]),
-            None if jacobian is None else np.where(np.isfinite(jacobian[squared]), jacobian[squared], 0.0),
-            None if jacobian is None else jacobian[equal] / factors[equal, None],
-            None
-            if jacobian is None
-            else np.concatenate(
-                [(signs[limit] / factors[limit])[:, None] * jacobian[limit], slopes[hard] / own[:, None]]
-            ),
+            residuals[equal] / factors[equal],
+            np.concatenate([signs[limit] * residuals[limit] / factors[limit], excess[hard] / of_hard]),
+        )
+        jacobian = evaluated.jacobian
+        if jacobian is None:
+            return state
+        of_limits = (signs[limit] / factors[limit])[:, None] * jacobian[limit], slopes[hard] / of_hard[:, None]
+        return dataclasses.replace(
+            state,
+            jacobian=np.where(np.isfinite(jacobian[squared]), jacobian[squared], 0.0),
+            held_slope=jacobian[equal] / factors[equal, None],
+            limits_slope=np.concatenate(of_limits),
         )
 
-    def _charged(self, found: Evaluated, x: np.ndarray) -> Evaluated:
-        """With more charged for a lost ray the earlier it is lost, and as a residual of its own how far it misses.
+    def _charged(self, evaluated: Evaluated, x: np.ndarray) -> Evaluated:
+        """The charge for a failed ray raised the earlier it fails, and its miss as a further residual.
 
-        The former tells which of two states is better, the latter, of which alone there are derivatives, the way back.
+        The former ranks two states; the latter alone has derivatives, which lead back.
         """
-        rows = np.unique(found.of_row[found.lost[found.of_row]])
+        failed = evaluated.lost[evaluated.of_row]
+        rows = np.unique(evaluated.of_row[failed])
         if not len(rows):
-            return found
-        missed, slopes, behind = self.recovery.excess(x, rows, derivatives=found.jacobian is not None)
+            return evaluated
+        missed, slopes, behind = self.recovery.excess(x, rows, derivatives=evaluated.jacobian is not None)
         fixed = LOST * self.evaluation.factors[rows]
-        residuals, gone = found.residuals.copy(), found.lost[found.of_row]
-        residuals[gone] *= 1 + behind[np.searchsorted(rows, found.of_row[gone])]
-        further = np.concatenate([residuals, STEEP * fixed * np.where(missed > 0, missed + MARGIN, 0.0)])
-        jacobian = found.jacobian
+        residuals, jacobian = evaluated.residuals.copy(), evaluated.jacobian
+        residuals[failed] *= 1 + behind[np.searchsorted(rows, evaluated.of_row[failed])]
         if jacobian is not None:
             jacobian = np.concatenate([jacobian, STEEP * fixed[:, None] * slopes])
         return dataclasses.replace(
-            found, residuals=further, jacobian=jacobian, of_row=np.concatenate([found.of_row, rows])
+            evaluated,
+            residuals=np.concatenate([residuals, STEEP * fixed * np.where(missed > 0, missed + MARGIN, 0.0)]),
+            jacobian=jacobian,
+            of_row=np.concatenate([evaluated.of_row, rows]),
         )
 
-    def merit(self, found: Evaluated) -> float:
+    def merit(self, evaluated: Evaluated) -> float:
         """M over the rows of the merit function alone."""
-        own = found.residuals[found.of_row < len(self.rows)]
-        return float(np.sqrt(own @ own))
+        residuals = evaluated.residuals[evaluated.of_row < len(self.rows)]
+        return float(np.sqrt(residuals @ residuals))
+
+
+class FunctionMerit:
+    """A function of a lens as a merit over the variables of a model, with its gradient, carried through solves.
+
+    evaluated: (E, n + 1 + n) variables, value and gradient of earlier evaluations: a resumed descent repeats these
+    without evaluating.
+    """
+
+    def __init__(self, model: Model, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()):
+        self.view = model.views[model.lens.current_configuration - 1]
+        self.function, self.evaluations, self.evaluated = function, 0, [*evaluated]
+        self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
+
+    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """The merit and its gradient (n,)."""
+        self.evaluations += 1
+        x = np.array(x, dtype=float)
+        if (known := self.known.get(x.tobytes())) is not None:
+            return float(known[len(x)]), known[len(x) + 1 :].copy()
+        state = self.view.state(Dual(x, np.eye(len(x))))
+        (merit,) = state.through_torch(lambda lens: [self.function(lens).reshape(())], clips=True)
+        value, slope = float(value_of(merit)), slope_of(merit, len(x))
+        self.evaluated.append(np.array([*x, value, *slope]))
+        return value, slope
 
 
 def optimization_data_of(model: Model, rows: Sequence[Row], unit: float) -> OptimizationData:
-    """What a lens is optimised for, where its file says nothing of it; all semi-diameters that it has stay given."""
+    """Optimisation data of a lens whose file has none; all semi-diameters that it has stay specified."""
     given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
     return OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
 
 
 def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:
-    """Rows that do not count among the squares, and the signs of their relations; rows before them say of which
-    configuration and primary wavelength they are, where the merit function or a condition does."""
+    """Rows of conditions and the signs of their relations; rows before them set configuration and primary wavelength,
+    where the merit function or a condition does."""
     if any(row.operand == "PRIM" for row in rows):
         yield Row("PRIM", (0, lens.primary_wavelength)), 0
     several = any(row.operand == "CONF" for row in rows) or any(one.configuration for one in conditions)
@@ -258,24 +425,14 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
 
 
 def typical_of(model: Model) -> np.ndarray:
-    """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
+    """Large changes (n,) of the variables: for beams h wide h in thickness, 1/10h in curvature; or inf."""
     state = model.views[model.lens.current_configuration - 1].state(model.start)
     h = 0.5 * float(state.entrance_pupil_diameter)
-    return np.array([_typical(one.quantity, h) for one in model.variables])
-
-
-def _typical(quantity: str, h: float) -> float:
-    if quantity[0] == "a" and quantity[1:].isdigit():
-        return 0.01 * h ** (1 - int(quantity[1:]))
-    return {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}.get(
-        quantity, np.inf
+    typical = {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}
+    names = [one.quantity for one in model.variables]
+    return np.array(
+        [
+            0.01 * h ** (1 - int(name[1:])) if name[0] == "a" and name[1:].isdigit() else typical.get(name, np.inf)
+            for name in names
+        ]
     )
-
-
-def _joined(sides: tuple[tuple, ...], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, excess and its slope of one-sided rows of all operands; slopes of 0 where none were asked for."""
-    if not sides:
-        return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, count))
-    rows, excess = (np.concatenate([one[k] for one in sides]) for k in range(2))
-    slopes = [np.zeros((len(one[1]), count)) if one[2] is None else one[2] for one in sides]
-    return rows, excess, np.concatenate(slopes)

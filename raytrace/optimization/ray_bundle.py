@@ -20,8 +20,9 @@ from torch.autograd import forward_ad
 
 from raytrace.maths.dual import Dual, Vector, slope_of, value_of
 from raytrace.maths.numerics import dot
-from raytrace.optimization.lens_model import GLASS, unbent
+from raytrace.optimization.lens_model import unbent
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.variables import GLASS
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.tracing.aiming import aiming_of, is_bent

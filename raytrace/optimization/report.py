@@ -7,18 +7,10 @@ from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.panels import first_order_text
 from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.maths.value import detached
+from raytrace.optimization.checkpoint import STOPPED
 from raytrace.plotting import style
 from raytrace.system.lens import Lens, field_label
 
-#: Why a descent ends, by `Optimized.stopped`.
-STOPPED = {
-    "gradient": "no variable makes the merit any less",
-    "step": "no step makes the merit any less",
-    "merit": "the merit hardly changes any more",
-    "cycles": "the limit on cycles was reached",
-    "seconds": "as much time as was asked for",
-    "interrupted": "interrupted; this is the best so far",
-}
 _MOST_FIELDS = 5
 _MOST_BARS = 10
 _MOST_CONFIGURATIONS = 4

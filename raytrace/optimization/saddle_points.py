@@ -1,18 +1,15 @@
-"""Insertion: from a minimum over saddles to the minima of lenses with one element more, two from every surface.
+"""Insertion: from a minimum over saddles to minima of lenses with one element more, two from every surface.
 
-A meniscus without thickness makes a saddle of the minimum. Down either side of it all but the new
-thicknesses vary; then these grow, a part of their least values at a time, and the lens follows; at last everything
-varies under the whole merit function.
+A meniscus without thickness makes a saddle of the minimum. On either side of it all but the new thicknesses vary; then
+these grow in parts of their minimum values while the lens follows; at last everything varies.
 
-Meniscus: a lens of no thickness beside a surface, which changes no ray, and the saddle of the merit that it makes.
-
-Before surface k between air and a glass two more of its shape are put, so that a lens of the same glass, without
-thickness, touches it. Of the curvatures (c₁, c₂, c₃) of the three the merit stays what it was for
+Before surface k between air and a glass two more surfaces of its shape are inserted, so that a lens of the same glass,
+without thickness, touches it. The merit is unchanged along two lines of the curvatures (c₁, c₂, c₃) of the three,
 
     c₁ = c₂, c₃ = c_k      and      c₁ = c_k, c₂ = c₃
 
-and where a lens is a minimum, its slope along (1, 1, 1) vanishes as well: all three vanish, and along the two lines the
-merit is flat while it is not between them. So the lens is a saddle with one way down, to two sides.
+and where the lens is a minimum, its slope along (1, 1, 1) vanishes as well: all three vanish, and along the two lines
+the merit is flat while it is not between them. So the lens is a saddle with one descent direction, to two sides.
 
 Source: Bociort & van Turnhout, Generating saddle points in the merit function landscape of optical systems, Proc. SPIE
 5962, 2005; van Turnhout & Bociort, Instabilities and fractal basins of attraction in optical system optimization,
@@ -28,13 +25,21 @@ import numpy as np
 from scipy.linalg import null_space
 
 from raytrace.materials.glass import is_air
-from raytrace.optimization.journal import Ended, Journal
-from raytrace.optimization.least_squares import Manner, State
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.optimization.search_result import Minima, Minimum
-from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
+from raytrace.optimization.search_tasks import (
+    FOLLOW,
+    LONG,
+    Journal,
+    Minima,
+    Minimum,
+    SearchProblem,
+    Stage,
+    TaskResult,
+    descended,
+)
+from raytrace.optimization.solver import SolverOptions, State
 from raytrace.optimization.variables import Freedom
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
@@ -46,10 +51,10 @@ _NEAR = 0.01  # of the residuals: by how much a step along a variable changes th
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
-# -- where one can stand -----------------------------------------------------------------------------------------------
+# -- surfaces for a meniscus -------------------------------------------------------------------------------------------
 
 
-def places_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
+def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
     """The surfaces at which a meniscus can stand, or those that are named. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
@@ -83,12 +88,12 @@ def _objection(free: Freedom, k: int) -> str:
 # -- the lens with one element more ------------------------------------------------------------------------------------
 
 
-def enlarged(lens: Lens, asked: Asked, k: int) -> Asked:
-    """What is searched of a lens with a meniscus before surface k, by what is asked of the lens itself."""
-    made, free = with_meniscus(lens, k), asked.free
+def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
+    """What is searched of a lens with a meniscus before surface k, by what is task of the lens itself."""
+    made, free = with_meniscus(lens, k), task.free
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
     old = [_moved(one, k) for one in free.variables]
-    own = {one: ends for one, *ends in zip(old, *asked.bounds, strict=True)}
+    own = {one: ends for one, *ends in zip(old, *task.bounds, strict=True)}
     steep = own[next(one for one in old if (one.surface, one.quantity) == (k + 2, "curvature"))]
     own |= {one: steep if one.quantity == "curvature" else (-np.inf, np.inf) for one in new}
     quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
@@ -97,21 +102,21 @@ def enlarged(lens: Lens, asked: Asked, k: int) -> Asked:
     if lens.optimization_data is not None:
         made = replace(made, optimization_data=_optimization_data(lens.optimization_data, k, variables, solves))
     return replace(
-        asked,
+        task,
         free=Freedom(made, variables, solves),
-        rows=tuple(_row(row, k) for row in asked.rows),
-        conditions=tuple(replace(one, row=_row(one.row, k)) for one in asked.conditions),
+        rows=tuple(_row(row, k) for row in task.rows),
+        conditions=tuple(replace(one, row=_row(one.row, k)) for one in task.conditions),
         bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
     )
 
 
-def new_gaps(asked: Asked, k: int) -> np.ndarray:
+def new_gaps(task: SearchProblem, k: int) -> np.ndarray:
     """(n,) which variables are the thicknesses of the meniscus and of the air beside it."""
-    return np.array([one.quantity == "thickness" and one.surface in (k, k + 1) for one in asked.free.variables])
+    return np.array([one.quantity == "thickness" and one.surface in (k, k + 1) for one in task.free.variables])
 
 
 def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
-    """The rows with that part of the least thicknesses asked of the new gaps, of 0 none; as many rows ahead of those
+    """The rows with that part of the least thicknesses task of the new gaps, of 0 none; as many rows ahead of those
     that are split off."""
     pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
     return (*(one[0] for one in pieces), *(row for one in pieces for row in one[1:]))
@@ -241,7 +246,7 @@ SIDES = {"one side": 1.0, "other side": -1.0}
 _PARTS = 0.25, 0.5, 0.75, 1.0  # of the least thicknesses, one after the other
 _OFF = np.geomspace(0.03, 10, 18)  # of the residuals: steps off the saddle that are tried
 _CYCLES = 15, 10  # off the saddle, and with every part of the thickness
-_CAREFUL = Manner(damping=0.1, bends=False)
+_CAREFUL = SolverOptions(damping=0.1, bends=False)
 _MEETINGS = 4  # of conditions, after a step off the saddle
 
 
@@ -250,26 +255,26 @@ class Place:
     """A lens with a meniscus before surface k: its problems by how much of its least thickness it has."""
 
     k: int
-    asked: Asked
+    task: SearchProblem
 
-    def stage(self, part: float, cycles: int, manner: Manner) -> Stage:
+    def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
         """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
-        gaps, space = new_gaps(self.asked, self.k), self.asked.space
+        gaps, space = new_gaps(self.task, self.k), self.task.space
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
-        problem = self.asked.problem(thinned(self.asked.rows, self.k, part))
-        return Stage(problem, cycles, manner, lower, upper)
+        problem = self.task.problem(thinned(self.task.rows, self.k, part))
+        return Stage(problem, cycles, options, lower, upper)
 
     @property
     def family(self) -> tuple:
         """What lenses have in common whose variables can be compared."""
-        lens = self.asked.free.lens
-        variables = tuple((one.surface, one.quantity) for one in self.asked.free.variables)
+        lens = self.task.free.lens
+        variables = tuple((one.surface, one.quantity) for one in self.task.free.variables)
         media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
         return media, lens.stop, variables
 
-    def gone(self, sign: float, until: float = np.inf) -> Ended:
-        """The minimum on one side of the saddle, of a lens of real thickness. Raises Stopped."""
+    def gone(self, sign: float, until: float = np.inf) -> TaskResult:
+        """The minimum on one side of the saddle, of a lens of real thickness. Raises SearchStopped."""
         first = self.stage(0.0, _CYCLES[0], _CAREFUL)
         thicker = [self.stage(part, _CYCLES[1], _CAREFUL) for part in _PARTS]
         x = self.beside(first, sign)
@@ -277,7 +282,7 @@ class Place:
 
     def beside(self, stage: Stage, sign: float) -> np.ndarray:
         """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
-        x, problem = self.asked.model.start, stage.problem
+        x, problem = self.task.model.start, stage.problem
         way = saddle(problem, x, stage.moves(x)).descent
         way = sign * way / np.abs(way[np.argmax(np.abs(way))]) * np.sign(way[np.argmax(np.abs(way))])
         columns = np.sqrt((problem.state(x, True).jacobian ** 2).sum(0))
@@ -312,32 +317,32 @@ class Place:
 class Insertion:
     """The search from a lens, over menisci at some of its surfaces."""
 
-    asked: Asked
+    task: SearchProblem
     journal: Journal
     places: Sequence[int]
     found: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
-    begun: int = 0  # descents
+    started: int = 0  # descents
 
     DONE: ClassVar[str] = "surfaces"
 
     @property
     def followed(self) -> int:
         """Descents that were followed to their end."""
-        return self.begun
+        return self.started
 
     def through(self, progress: Callable | None) -> None:
-        """The lens itself, then both sides at every place. Raises Stopped and NoProblem."""
-        model, space = self.asked.model, self.asked.space
-        stage = Stage(self.asked.whole, LONG, FOLLOW, space.lower, space.upper)
+        """The lens itself, then both sides at every place. Raises SearchStopped and NoProblem."""
+        model, space = self.task.model, self.task.space
+        stage = Stage(self.task.whole, LONG, FOLLOW, space.lower, space.upper)
         until = self.journal.until
         own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
-        if not own.is_whole:
+        if not own.is_valid:
             raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
         lens, work = model.lens_at(own.x), own.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:
             for k in self.places:
-                work += self._both(Place(k, enlarged(lens, self.asked, k)), work, bar)
+                work += self._both(Place(k, enlarged(lens, self.task, k)), work, bar)
         finally:
             if bar is not None:
                 bar.close()
@@ -348,14 +353,14 @@ class Insertion:
             (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))
             for side, sign in SIDES.items()
         ]
-        space = place.asked.space
+        space = place.task.space
         ends = self.journal.each(tasks, len(space.lower))
         ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.found.setdefault(place.family, (place.asked.whole, Minima(ranges)))
+        _, minima = self.found.setdefault(place.family, (place.task.whole, Minima(ranges)))
         for (key, _), end in zip(tasks, ends, strict=True):
             work += end.seconds
             minima.add(end, key, work)
-            self.begun += 1
+            self.started += 1
             if bar is not None:
                 bar.update(1)
                 bar.set_postfix_str(self._words())
@@ -363,9 +368,9 @@ class Insertion:
 
     def _words(self) -> str:
         each = self.each()
-        return f"{len(each)} minima, the best {each[0][1].ended.merit:.6g}" if each else ""
+        return f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else ""
 
     def each(self) -> list[tuple[Problem, Minimum]]:
         """All minima, the best first, each with the problem that it is one of."""
         found = [(problem, one) for problem, minima in self.found.values() for one in minima.each]
-        return sorted(found, key=lambda pair: pair[1].ended.merit)
+        return sorted(found, key=lambda pair: pair[1].result.merit)

@@ -1,8 +1,8 @@
-"""Searching: the distinct minima of a merit function between bounds, the best lens first.
+"""Search: the distinct minima of a merit function between bounds, the best lens first.
 
-In batches: starts spread evenly (`starts.py`), the best of several points each, descend a little on a narrow beam and
-then on the whole one; the best of a batch are followed to their minima; and from the best minima so far the search
-hops over their walls. What a batch decides follows from the batches before it alone, never from the clock.
+In batches: starts are spread evenly over the bounds, the best of several points each, and descend a little on a narrow
+beam and then on the whole one; the best of a batch are followed to their minima; further descents start from points
+drawn around the best minima so far. The decisions of a batch depend on earlier batches alone, never on the clock.
 """
 
 import time
@@ -10,31 +10,229 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from raytrace.files import NotWritten, check_output_folder
-from raytrace.io import LensFileError
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.analysis.spot_diagram import spot
+from raytrace.files import NotWritten, check_output_folder, write_table
+from raytrace.io import LensFileError, LensFileWarning, write_lens
+from raytrace.maths.result import Result, cell
+from raytrace.maths.value import detached, value
 from raytrace.optimization.attained import refuse_contradictions
-from raytrace.optimization.constraints import Condition, conditions_of
 from raytrace.optimization.default_merit import KINDS, DefaultMerit
-from raytrace.optimization.journal import Ended, Journal, Stopped
-from raytrace.optimization.least_squares import Manner
-from raytrace.optimization.merit import Merit, in_unit, merit_for
+from raytrace.optimization.merit import Merit, merit_for
 from raytrace.optimization.optimize import opened
-from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.optimization.saddle_points import Insertion, places_of
-from raytrace.optimization.search_result import Minima, Minimum, Searched, searched
-from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
-from raytrace.optimization.starts import Space
-from raytrace.optimization.variables import Freedom, bounds_of, freedom
+from raytrace.optimization.problem import Condition, NoProblem, Problem, conditions_in_unit, optimization_data_of
+from raytrace.optimization.report import drawn_fields
+from raytrace.optimization.saddle_points import Insertion, surfaces_of
+from raytrace.optimization.search_tasks import (
+    FOLLOW,
+    LONG,
+    Journal,
+    Minima,
+    Minimum,
+    SearchProblem,
+    SearchStopped,
+    Space,
+    Stage,
+    TaskResult,
+    descended,
+)
+from raytrace.optimization.solver import SolverOptions
+from raytrace.optimization.variables import bounds_of, freedom
+from raytrace.plotting import style
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level
+
+#: Why a search ends.
+STOPPED = {
+    "starts": "all starts were tried",
+    "surfaces": "both sides of every surface",
+    "seconds": "the limit on time was reached",
+    "interrupted": "interrupted; these were found so far",
+}
+MOST = 40  # minima of a result
+_MOST, _COLUMNS = 9, 3  # lenses of the figure
+
+
+@value
+class Searched(Result):
+    """The minima (M,), the best first.
+
+    lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
+    weights; found: number of followed descents to it; after: processor seconds until the first; tasks: key of that
+    one. variables: (M, n). starts, descents: numbers of starts, and of descents that were followed to their end.
+    """
+
+    before: Lens
+    lenses: tuple[Lens, ...]
+    names: tuple[str, ...]
+    tasks: tuple[str, ...]
+    variables: Tensor
+    merit: Tensor
+    focal_length: Tensor
+    spots: Tensor
+    found: Tensor
+    after: Tensor
+    starts: int
+    descents: int
+    seconds: float
+    stopped: str
+
+    @property
+    def lens(self) -> Lens:
+        """The best one."""
+        return self.lenses[0]
+
+    def columns(self) -> dict[str, Tensor]:
+        fields = {f"rms_{f}": self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
+        variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
+        number = torch.arange(1, len(self.lenses) + 1)
+        of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields}
+        return {**of_lens, "found": self.found, "seconds": self.after, **variables}
+
+    def document(self) -> dict:
+        counts = {"starts": self.starts, "descents": self.descents, "seconds": round(self.seconds, 3)}
+        return {**counts, "stopped": self.stopped, **Result.document(self)}
+
+    def __str__(self) -> str:
+        width = max(8 * self.spots.shape[1], 8)
+        count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
+        lines = [
+            self.before.name,
+            f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            f"  found: by how many of the {self.descents} descents that were followed to their end\n",
+            f"  {'':>7} {'':>12} {'EFL':>10} {'RMS spots':>{width}}\n  {'minimum':>7} {'merit':>12} {'mm':>10} "
+            f"{'µm, by field':>{width}} {'found':>6}",
+        ]
+        for k in range(len(self.lenses)):
+            spots = "".join(cell(1e3 * float(one), "8.2f") for one in self.spots[k])
+            length = cell(float(self.focal_length[k]), "10.4f")
+            merit, found = float(self.merit[k]), int(self.found[k])
+            lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")
+        return "\n".join(lines)
+
+    @style.styled
+    def draw(self):
+        """The best lenses on one scale, each with its merit, its spots and how many descents reached it."""
+        count = min(_MOST, len(self.lenses))
+        columns = min(_COLUMNS, count)
+        rows = -(-count // columns)
+        figure = style.new_figure(3.6 * max(columns, 2), 2.5 * rows + 0.5)
+        figure.suptitle(
+            style.fill(self.before.name or "Lens", figure.get_figwidth(), 11, bold=True), fontsize=11, fontweight="bold"
+        )
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for k, axes in enumerate(panels):
+            if k < count:
+                _draw(axes, self, k)
+            else:
+                axes.set_axis_off()
+        on_one_scale(panels[:count])
+        return figure
+
+    def save(self, folder: str | PathLike) -> None:
+        """Write a lens file and a thumbnail of every minimum, the table, and a figure of the best side by side."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for number, lens in enumerate(self.lenses, 1):
+            with warnings.catch_warnings():
+                if number > 1:  # what a file cannot hold is the same of all
+                    warnings.simplefilter("ignore", LensFileWarning)
+                write_lens(lens, folder / f"minimum_{number:02d}.zmx")
+            thumbnail(lens, folder / f"minimum_{number:02d}.png")
+        for path in folder.glob("minimum_*.*"):
+            if path.stem.removeprefix("minimum_").isdigit() and int(path.stem.removeprefix("minimum_")) > number:
+                path.unlink()
+        columns = {name: column.tolist() for name, column in self.columns().items()}
+        write_table(
+            folder / "minima.csv", [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        )
+        self.plot(folder / "best.png")
+
+
+def searched(
+    lens: Lens, each: Sequence[tuple[Problem, Minimum]], *, starts: int, descents: int, stopped: str, seconds: float
+) -> Searched:
+    """The result: minima, the best first, each with its problem. Raises NoProblem without any."""
+    if not each:
+        raise NoProblem(
+            f"no lens of all light, and of what is held, from {starts} starts: allow more by `starts`, `seconds` or "
+            "wider `bounds`, or hold less"
+        )
+    minima, lenses, tables = each[:MOST], [], []
+    for k, (problem, one) in enumerate(minima, 1):
+        model = problem.model
+        design = model.lens_at(one.result.x)
+        data = design.optimization_data or optimization_data_of(model, problem.rows, problem.unit)
+        name = f"{lens.name}, minimum {k}".removeprefix(", ")
+        lenses.append(replace(design, name=name, optimization_data=data))
+        tables.append(
+            {f"{v.quantity}_{v.surface}": number for v, number in zip(model.variables, one.result.x, strict=True)}
+        )
+    names = tuple(dict.fromkeys(name for table in tables for name in table))
+    tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
+    return Searched(
+        before=lens,
+        lenses=tuple(lenses),
+        names=names,
+        tasks=tuple(one.task for _, one in minima),
+        variables=tensor([[table.get(name, np.nan) for name in names] for table in tables]),
+        merit=tensor([one.result.merit for _, one in minima]),
+        focal_length=torch.stack([first_order(one).effective_focal_length.reshape(()) for one in lenses]),
+        spots=torch.stack([_spots(one) for one in lenses]),
+        found=torch.tensor([one.found for _, one in minima]),
+        after=tensor([one.seconds for _, one in minima]),
+        starts=starts,
+        descents=descents,
+        stopped=stopped,
+        seconds=seconds,
+    )
+
+
+def _spots(lens: Lens) -> Tensor:
+    """RMS radius (F,) in mm about the centroid of all wavelengths, by their weights."""
+    each = spot(lens, wavelengths=lens.wavelengths)
+    share = lens.wavelength_weights / lens.wavelength_weights.sum()
+    centre = (each.centroid * share).sum(-1, keepdim=True)
+    apart = (each.centroid - centre).square().sum(0)
+    return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
+
+
+def _draw(axes, found: Searched, k: int) -> None:
+    _draw_lens(axes, found.lenses[k])
+    spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
+    times = int(found.found[k])
+    axes.set_title(
+        f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
+        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
+    )  # fmt: skip
+
+
+def _draw_lens(axes, lens: Lens) -> None:
+    lens = detached(lens)
+    draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
+
+
+@style.styled
+def thumbnail(lens: Lens, path: str | PathLike) -> None:
+    """Write the cross section alone, small."""
+    figure = style.new_figure(3.0, 1.8)
+    _draw_lens(figure.add_subplot(), lens)
+    style.save(figure, path, dpi=80)
+
+
+# -- the search --------------------------------------------------------------------------------------------------------
 
 STARTS = 64
 _BATCH = 16  # starts; what is done in a batch is shared by processes
@@ -45,7 +243,7 @@ _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
 _REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
-_DAMPED = Manner(damping=0.1, bends=False)
+_DAMPED = SolverOptions(damping=0.1, bends=False)
 
 _DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.values()} - {"MTFA"}
 
@@ -65,21 +263,21 @@ def search(
     progress: Callable | None = None,
     share: Share | None = None,
 ) -> Searched:
-    """The distinct minima of a merit function, from starts spread over all that the bounds allow; the lens is one.
+    """The distinct minima of a merit function globally, within bounds; the lens is one of the starts.
 
-    merit, vary, bounds, hold: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
+    merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
     which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
     more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. folder: keeps the minima as lens
-    files, a table and figures, and how far the search has come: called again it goes on, and ends as if it had never
-    ended before. Ctrl-C ends with what was found.
+    files, a table and figures, and the journal: called again the search resumes, with the same result as without the
+    interruption. Ctrl-C ends with the minima so far.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
     """
     if folder is not None:
         check_output_folder(folder)
     prepare()
     warn_of_filling(lens, field_points(None, like=lens))
-    begun = time.monotonic()
+    started = time.monotonic()
     function = merit_for(lens, merit)
     free = freedom(lens, vary)
     if any(one.quantity == "glass" for one in free.variables):
@@ -87,92 +285,73 @@ def search(
             "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
         )
     glass, air = function.boundaries.glass, function.boundaries.air
-    ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
-    how = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
-    until = begun + (np.inf if seconds is None else seconds)
-    places = () if insert is None or insert is False else _places(free, insert, starts)
+    ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
+    settings = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
+    task = SearchProblem(free, tuple(function.rows), conditions, ends, glass, air, settings)
+    until = started + (np.inf if seconds is None else seconds)
+    surfaces = ()
+    if insert is not None and insert is not False:
+        if starts is not None:
+            raise NoProblem(
+                "`starts` goes without `insert`, which begins at the lens alone, on both sides of every surface"
+            )
+        surfaces = surfaces_of(free, () if insert is True else tuple(insert))
     if conditions:
-        low, high = asked.space.lower, asked.space.upper
-        refuse_contradictions(asked.whole, np.clip(asked.model.start, low, high), lower=low, upper=high)
-    if not places:
-        run = _Run(asked, Journal(folder, asked.about(seed), until), seed, STARTS if starts is None else starts)
+        low, high = task.space.lower, task.space.upper
+        refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
+    if surfaces:
+        run = Insertion(task, Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until), surfaces)
     else:
-        journal = Journal(folder, {**asked.about(seed), "insert": list(places)}, until)
-        run = Insertion(asked, journal, places)
-    stopped = _stopped(run, progress)
-    found = searched(
-        lens, run.each(), starts=run.begun, descents=run.followed, stopped=stopped, seconds=time.monotonic() - begun
+        run = _Run(task, Journal(folder, task.about(seed), until), seed, STARTS if starts is None else starts)
+    stopped = run.DONE
+    try:
+        run.through(progress)
+    except SearchStopped:
+        stopped = "seconds" if time.monotonic() > until else "interrupted"
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    result = searched(
+        lens, run.each(), starts=run.started, descents=run.followed, stopped=stopped, seconds=time.monotonic() - started
     )
     if folder is not None and not (share and share.rank):
         try:
-            found.save(folder)
+            result.save(folder)
         except (OSError, LensFileError) as error:
             warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=calling_level())
-    return found
-
-
-def _places(free: Freedom, insert: bool | Sequence[int], starts: int | None) -> tuple[int, ...]:
-    """Surfaces at which a meniscus is inserted. Raises NoProblem."""
-    if starts is not None:
-        raise NoProblem(
-            "`starts` goes without `insert`, which begins at the lens alone, on both sides of every surface"
-        )
-    return places_of(free, () if insert is True else tuple(insert))
-
-
-def _stopped(run: "_Run | Insertion", progress: Callable | None) -> str:
-    """Why a search ended: a key of `search_result.STOPPED`."""
-    try:
-        run.through(progress)
-    except Stopped:
-        return "seconds" if time.monotonic() > run.journal.until else "interrupted"
-    except KeyboardInterrupt:
-        return "interrupted"
-    return run.DONE
-
-
-def _conditions(lens: Lens, hold, unit: float) -> tuple[Condition, ...]:
-    """What is held, from mm to the unit of length of the merit function."""
-    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
-    found = conditions_of(lens, hold) if in_words else hold
-    return tuple(replace(one, row=in_unit(one.row, 1.0, unit)) for one in found)
-
-
-def _narrowed(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """The rows with the rays of default merit functions nearer to the axis, in pupil and field."""
-    pupil, field = _NARROW
-    scale = np.array([field, field, pupil, pupil])
-    return tuple(
-        replace(row, numbers=tuple((scale * row.numbers).tolist())) if row.operand in _DEFAULT else row for row in rows
-    )
+    return result
 
 
 @dataclass
 class _Run:
-    """A search under way."""
+    """A search from starts."""
 
-    asked: Asked
+    task: SearchProblem
     journal: Journal
     seed: int
     starts: int
-    begun: int = 0  # starts
+    started: int = 0  # starts
     followed: int = 0  # descents
     work: float = 0.0  # s
 
     DONE: ClassVar[str] = "starts"
 
     def __post_init__(self):
-        self.narrow = self.asked.problem(_narrowed(self.asked.rows))
-        self.whole, self.space = self.asked.whole, self.asked.space
-        self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _turned(self.space))
+        pupil, field = _NARROW  # the rays of default merit functions nearer to the axis
+        scale = np.array([field, field, pupil, pupil])
+        rows = [
+            replace(row, numbers=tuple((scale * row.numbers).tolist())) if row.operand in _DEFAULT else row
+            for row in self.task.rows
+        ]
+        self.narrow, self.whole, self.space = self.task.problem(tuple(rows)), self.task.whole, self.task.space
+        self.bounds = self.space.lower, self.space.upper
+        self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _reversal(self.space))
 
     def each(self) -> list[tuple[Problem, Minimum]]:
-        """All minima, the best first, each with the problem that it is one of."""
+        """All minima, the best first, each with its problem."""
         return [(self.whole, one) for one in self.minima.each]
 
     def through(self, progress: Callable | None) -> None:
-        """All batches. Raises Stopped."""
+        """All batches. Raises SearchStopped."""
         bar = None if progress is None else progress(self.starts, "start")
         try:
             for first in range(0, self.starts, _BATCH):
@@ -182,58 +361,54 @@ class _Run:
                 bar.close()
 
     def _batch(self, numbers: range, bar) -> None:
+        def start(number: int) -> TaskResult:
+            result = self._start(number)
+            if bar is not None:
+                bar.update(1)
+            return result
+
         keys = [f"start {i}" for i in numbers]
-        ends = self._each(
-            [(key, _watched(lambda i=i: self._start(i), bar)) for key, i in zip(keys, numbers, strict=True)]
-        )
-        self.begun = numbers[-1] + 1
+        ends = self._results([(key, lambda i=i: start(i)) for key, i in zip(keys, numbers, strict=True)])
+        self.started = numbers[-1] + 1
         best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
         self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
         springs = self.minima.each[:_SPRINGS]
-        hops = [(f"hop {numbers[0] + k}", springs[k % len(springs)].ended.x) for k in range(_HOPS)] if springs else []
+        hops = [(f"hop {numbers[0] + k}", springs[k % len(springs)].result.x) for k in range(_HOPS)] if springs else []
         self._follow([(key, self._hopped(key, x)) for key, x in hops], bar)
 
-    def _each(self, tasks) -> list[Ended]:
+    def _results(self, tasks) -> list[TaskResult]:
         ends = self.journal.each(tasks, len(self.space.lower))
         self.work += sum(end.seconds for end in ends)
         return ends
 
     def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
-        ends = self._each(
-            [
-                (key, lambda x=x: descended(x, [Stage(self.whole, LONG, FOLLOW, *self._bounds)], self.journal.until))
-                for key, x in tasks
-            ]
-        )
+        stages = [Stage(self.whole, LONG, FOLLOW, *self.bounds)]
+        ends = self._results([(key, lambda x=x: descended(x, stages, self.journal.until)) for key, x in tasks])
         self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:
-                bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].ended.merit:.6g}")
+                bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].result.merit:.6g}")
 
-    def _start(self, number: int) -> Ended:
+    def _start(self, number: int) -> TaskResult:
         """The lens as it is, or the best of some points between the bounds; both descended a little."""
-        model = self.asked.model
-        points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(model.start, *self._bounds)[None]
-        points = [self.space.prepared(x) for x in points]
-        best = min(points, key=self._worth)
-        if self._worth(best)[0]:
+        start = self.task.model.start
+        points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(start, *self.bounds)[None]
+        best, worth = None, (np.inf, np.inf)  # failed rays and squares on the narrow beam
+        for x in map(self.space.prepared, points):
+            with np.errstate(all="ignore"):
+                evaluated = self.narrow.evaluated(x)
+            rank = float(evaluated.lost.sum()), float(np.nansum(evaluated.residuals**2))
+            if best is None or rank < worth:
+                best, worth = x, rank
+        if worth[0]:
             best = opened(self.whole, best, lower=self.space.lower, upper=self.space.upper, until=self.journal.until)
             if time.monotonic() > self.journal.until:
-                raise Stopped
-        narrow = Stage(self.narrow, _SHORT[0], _DAMPED, *self._bounds)
-        stages = [narrow, Stage(self.whole, _SHORT[1], Manner(), *self._bounds)]
+                raise SearchStopped
+        stages = [
+            Stage(self.narrow, _SHORT[0], _DAMPED, *self.bounds),
+            Stage(self.whole, _SHORT[1], SolverOptions(), *self.bounds),
+        ]
         return descended(best, stages, self.journal.until)
-
-    @property
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.space.lower, self.space.upper
-
-    def _worth(self, x: np.ndarray) -> tuple[float, float]:
-        """Lost rays and squares of a point on the narrow beam."""
-        with np.errstate(all="ignore"):
-            found = self.narrow.evaluated(x)
-        squares = float(np.nansum(found.residuals**2))
-        return float(found.lost.sum()), squares
 
     def _hopped(self, key: str, x: np.ndarray) -> np.ndarray:
         """A point beyond a minimum, drawn by the name of the hop."""
@@ -242,20 +417,8 @@ class _Run:
         return self.space.prepared(x + size * (self.space.high - self.space.low) * draw.normal(size=len(x)))
 
 
-def _watched(task: Callable[[], Ended], bar) -> Callable[[], Ended]:
-    """The task, after which the bar moves."""
-
-    def done() -> Ended:
-        end = task()
-        if bar is not None:
-            bar.update(1)
-        return end
-
-    return done
-
-
-def _turned(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
-    """Which variable takes the place of each in the lens turned round, and its sign; None where no lens is."""
+def _reversal(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
+    """The variable that each becomes in the reversed lens, and its sign; None where the reversal has others."""
     lens = space.model.lens
     if not np.isfinite(float(lens.surfaces[0].thickness)):
         return None
@@ -263,6 +426,6 @@ def _turned(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
     at = {(one.surface, one.quantity): k for k, one in enumerate(variables)}
     partner = {"curvature": lambda k: last + 1 - k, "thickness": lambda k: last - k}
     other = [(partner.get(one.quantity, lambda k: -1)(one.surface), one.quantity) for one in variables]
-    if any(place not in at for place in other):
+    if any(address not in at for address in other):
         return None
-    return np.array([at[place] for place in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)
+    return np.array([at[address] for address in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)

@@ -1,23 +1,26 @@
-"""Vary: what an optimisation may change and what follows, as words name it.
+"""Variable syntax: design variables, solves and pickups, bounds and constraints of `optimize`, `search` and cameras.
 
-curvature thickness           all surfaces that bend light; all gaps from surface 1 to the image
+curvature thickness           all refracting and reflecting surfaces; all gaps from surface 1 to the image
 curvature:1-4,7 conic:3 a4:3  of some surfaces
 tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose
 sensor                        the last gap
 index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
-thickness:6@2                 in configuration 2, of a number that differs from one to the next
-curvature:4=-curvature:3      follows: a number times another and one more, as thickness:8=2*thickness:2+1
-curvature:7=f_number(4)       follows: a solve, a row of SOLVED_BY
+thickness:6@2                 in configuration 2, of a number that differs between configurations
+curvature:4=-curvature:3      pickup: a factor times another number plus an offset, as thickness:8=2*thickness:2+1
+curvature:7=f_number(4)       solve, a row of SOLVED_BY
+thickness:2..15 sensor:57,58  bounds, of `bounds_of`; an open end is left out
+efl=50 total_track<=80        constraints, split by `constraint_words`
 """
 
 import dataclasses
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from raytrace.materials.glass import (
     Glass,
@@ -28,21 +31,28 @@ from raytrace.materials.glass import (
     normal_line_deviation,
     refractive_index,
 )
-from raytrace.optimization.lens_model import GLASS, Address, names_at
 from raytrace.system.configurations import same
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     BadVariables,
+    ParameterPath,
     counted,
     joined,
     modelled,
     parameter_paths,
     parse_bounds,
     sensor,
+    with_number,
 )
-from raytrace.system.surface import medium_surfaces
+from raytrace.system.surface import Surface, medium_surfaces
 from raytrace.words import calling_level, did_you_mean
+
+#: A number of a lens: of which surface, and which.
+Address = tuple[int, str]
+
+#: Numbers of the medium behind a surface, where it is a model glass or a constant index.
+GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
 
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
@@ -67,71 +77,121 @@ _SOLVE = re.compile(r"([a-z]\w*)\(([^()]*)\)")
 
 
 class VariedGlass(UserWarning):
-    """A glass of a catalog is a model glass now, whose numbers can vary."""
+    """A glass of a catalog is replaced by a model glass, whose numbers can vary."""
+
+
+class UnknownNumber(ValueError):
+    """A variable, solve or pickup of a number that the lens does not have."""
+
+
+def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
+    """Where a surface holds a number. Raises UnknownNumber."""
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
+    if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
+        entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
+        known |= {name: ParameterPath(("glass", "coefficients"), entry) for name, entry in entries}
+    if quantity not in known:
+        raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
+    return known[quantity]
+
+
+def with_numbers_of(
+    lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
+) -> Lens:
+    """The lens with other numbers of its surfaces; known: their places, where they have been looked up before."""
+    surfaces = list(lens.surfaces)
+    for (surface, quantity), number in numbers.items():
+        place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
+        surfaces[surface] = with_number(surfaces[surface], place, number)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def names_at(surface: Surface, path: tuple) -> list[str]:
+    """The names by which a surface's number at a path of `configurations` is known."""
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
+    entry = path[-1] if isinstance(path[-1], tuple) else None
+    fields = path[:-1] if entry is not None else path
+    flat = None if entry is None else entry[0] if len(entry) == 1 else None
+    return [name for name, place in known.items() if place.path == fields and place.entry == flat]
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """What varies and what follows: of a lens in which all of it is modelled, also where it is 0 now."""
+    """Variables, solves and pickups, and the lens in which all of these numbers are modelled, also where they are 0."""
 
     lens: Lens
     variables: tuple[Vary, ...]
     solves: tuple[Solve, ...] = ()
 
 
-def freedom(lens: Lens, vary: str | Sequence[str] | None = None) -> Freedom:
-    """What varies of a lens: what words name, or without any what its file does.
+def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freedom:
+    """The variables, solves and pickups of a lens by variable syntax, or by default those of its file.
 
-    Solves of the file hold where no word says otherwise: a number that is named varies, and one that belongs to no
-    surface's name ("curvature") varies where no solve holds. Raises BadVariables.
+    Solves of the file are kept unless the syntax overrides them: a number that is named varies, and a word without
+    surfaces ("curvature") leaves solved numbers out. Raises BadVariables.
     """
-    own = () if lens.optimization_data is None else lens.optimization_data.solves
+    data = lens.optimization_data
+    of_file = () if data is None else data.solves
     if vary is None:
-        if lens.optimization_data is None or not lens.optimization_data.variables:
-            raise BadVariables("the file tells no variables: `vary` names them, as 'curvature thickness'")
-        return Freedom(lens, lens.optimization_data.variables, own)
-    words = _words(joined(vary))
-    told = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
-    found: dict[str, Vary] = {}
+        if data is None or not data.variables:
+            raise BadVariables("the file has no variables: `vary` names them, as 'curvature thickness'")
+        return Freedom(lens, data.variables, of_file)
+    if not isinstance(vary, str) and not all(isinstance(one, str) for one in vary):
+        return Freedom(lens, tuple(vary), of_file)
+    words = split_words(vary)
+    new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
+    variables: dict[str, Vary] = {}
     for word in words:
         if "=" not in word:
-            follow = set() if ":" in word or word == "sensor" else _addresses((*told, *own))
-            found |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & follow}
-    if not found:
+            solved = set() if ":" in word or word == "sensor" else _addresses((*new, *of_file))
+            variables |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & solved}
+    if not variables:
         raise BadVariables(
             f"`vary={joined(vary)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
         )
-    free = _addresses(found.values())
-    for surface, quantity, *_ in free & _addresses(told):
+    free, solved = _addresses(variables.values()), _addresses(new)
+    for surface, quantity, *_ in free & solved:
         raise BadVariables(f"{quantity}:{surface} is to vary and to follow: leave one out")
-    solves = (*(one for one in own if not _addresses([one]) & (free | _addresses(told))), *told)
-    _refuse_circles(solves)
-    return Freedom(with_modelled(lens, (*found.values(), *told)), tuple(found.values()), solves)
-
-
-def _address(one: Vary | Solve) -> Address:
-    return one.surface, one.quantity
+    solves = (*(one for one in of_file if not _addresses([one]) & (free | solved)), *new)
+    after = {
+        (one.surface, one.quantity): (one.source, one.quantity_of_source or one.quantity)
+        for one in solves
+        if one.kind == "pickup" and one.operand is None
+    }
+    for start in after:
+        at, passed = after[start], 0
+        while at in after and passed <= len(after):
+            at, passed = after[at], passed + 1
+        if passed > len(after):
+            raise BadVariables(f"{start[1]}:{start[0]} follows itself, by way of other numbers")
+    return Freedom(with_modelled(lens, (*variables.values(), *new)), tuple(variables.values()), solves)
 
 
 def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
-    """Those of numbers; a glass that follows another with all its numbers, one of the configurations as that alone."""
-    found: set[tuple] = set()
+    """Of numbers; of a glass pickup all numbers of the glass; of a number of one configuration that configuration."""
+    addresses: set[tuple] = set()
     for one in several:
-        follows = isinstance(one, Solve)
-        if not (follows and one.operand is not None):
-            found.add(_address(one))
+        at, is_solve = (one.surface, one.quantity), isinstance(one, Solve)
+        if not (is_solve and one.operand is not None):
+            addresses.add(at)
         if one.operand is not None:
-            found.add((*_address(one), one.configuration))
-        if follows and one.quantity == "glass":
-            found |= {(one.surface, name) for name in GLASS}
-    return found
+            addresses.add((*at, one.configuration))
+        if is_solve and one.quantity == "glass":
+            addresses |= {(one.surface, name) for name in GLASS}
+    return addresses
 
 
 def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     """The numbers that one word names, by surface and configuration. Raises BadVariables."""
     named, _, configurations = word.partition("@")
     kind, colon, numbers = named.partition(":")
-    _refuse_kind(lens, kind, bool(colon), word)
+    of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
+    known = dict.fromkeys(["thickness", "sensor", *MEDIA, *GROUPS, *of_surfaces])
+    if (kind == "sensor" and colon) or (kind in _INSTEAD and kind not in known):
+        meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
+        raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
+    if kind not in known:
+        raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
     if kind == "sensor":
         kind, surfaces = "thickness", [sensor(lens)]
     elif numbers or colon:
@@ -139,13 +199,19 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     else:
         surfaces = [k for k in range(1, sensor(lens) + 1) if _makes_sense(lens, kind, k)]
     only = counted(word, configurations, "configuration") if configurations else []
-    found = [one for k in surfaces for quantity in _quantities(lens, kind, k, word) for one in _each(lens, k, quantity)]
-    found = [one for one in found if not only or one.configuration in only]
-    if found:
-        return tuple(dict.fromkeys(found))
+    numbers = [one for k in surfaces for name in _quantities(lens, kind, k, word) for one in _each(lens, k, name)]
+    numbers = [one for one in numbers if not only or one.configuration in only]
+    if numbers:
+        return tuple(dict.fromkeys(numbers))
     if only:
-        raise BadVariables(f"{word!r}: no such number differs in {_listed('configuration', only)}; leave @ out")
+        listed = f"configuration{'s' if len(only) > 1 else ''} {', '.join(map(str, only))}"
+        raise BadVariables(f"{word!r}: no such number differs in {listed}; leave @ out")
     raise BadVariables(f"{word!r}: no surface has that yet; name surfaces, as {kind}:3")
+
+
+def split_words(vary: str | Sequence[str]) -> list[str]:
+    """The words of variable syntax; a solve or pickup may have spaces around its signs."""
+    return re.sub(r"\s*([-=*+,(])\s*|\s*(\))", r"\1\2", joined(vary)).split()
 
 
 def name_of(one: Vary) -> str:
@@ -154,23 +220,31 @@ def name_of(one: Vary) -> str:
 
 
 def bounds_of(
-    lens: Lens, variables: Sequence[Vary], text: str | Sequence[str] | None = None
+    lens: Lens,
+    variables: Sequence[Vary],
+    bounds: str | Sequence[str] | Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest value (n,) of every variable, of words like "thickness:2..15 curvature_3:-0.1,0".
+    """Smallest and largest value (n,) of the variables, by words as "thickness:2..15 curvature_3:-0.1,0", or by name.
 
-    A name stands for all variables of a kind, for one of a surface (thickness_3, or thickness:3-5 of several), or for
-    one in a configuration (thickness_3@2); what comes later in the text counts. Raises BadVariables for a name that
-    none of them has.
+    A name means all variables of a kind, one of a surface (thickness_3, or thickness:3-5 of several), or one in a
+    configuration (thickness_3@2); later names override earlier ones. Raises BadVariables for a name of no variable.
     """
-    own = [one.bounds or (-np.inf, np.inf) for one in variables]
-    low, high = (np.array([ends[k] for ends in own], dtype=float) for k in range(2))
-    for name, ends in parse_bounds(joined(text or "")).items():
+    of_file = [one.bounds or (-np.inf, np.inf) for one in variables]
+    low, high = (np.array([ends[k] for ends in of_file], dtype=float) for k in range(2))
+    ends_by_name = bounds if isinstance(bounds, Mapping) else parse_bounds(joined(bounds or ""))
+    names = []
+    for one in variables:
+        groups = {name for name, quantities in GROUPS.items() if one.quantity in quantities}
+        kinds = {one.quantity, *groups}
+        last = {"sensor"} if (one.surface, one.quantity) == (sensor(lens), "thickness") else set()
+        names.append({name_of(one), *kinds, *(f"{kind}_{one.surface}" for kind in kinds), *last})
+    for name, ends in ends_by_name.items():
         kind, _, surfaces = name.partition(":")
         wanted = {f"{kind}_{k}" for k in counted(name, surfaces)} if surfaces else {name}
-        chosen = [position for position, one in enumerate(variables) if wanted & _names(lens, one)]
+        chosen = [position for position, known in enumerate(names) if wanted & known]
         if not chosen:
-            known = [known for one in variables for known in _names(lens, one)]
-            raise BadVariables(f"`bounds` for {name}, not among the variables{did_you_mean(name, known)}")
+            meant = did_you_mean(name, [one for known in names for one in known])
+            raise BadVariables(f"`bounds` for {name}, not among the variables{meant}")
         low[chosen], high[chosen] = ends
     return low, high
 
@@ -204,34 +278,11 @@ def _model_of(glass: Glass, surface: int, lens: Lens) -> Glass:
     return found
 
 
-def _names(lens: Lens, one: Vary) -> set[str]:
-    group = {name for name, quantities in GROUPS.items() if one.quantity in quantities}
-    kinds = {one.quantity, *group}
-    last = {"sensor"} if (one.surface, one.quantity) == (sensor(lens), "thickness") else set()
-    return {name_of(one), *kinds, *(f"{kind}_{one.surface}" for kind in kinds), *last}
-
-
-def _words(text: str) -> list[str]:
-    """The words of a list; in what follows spaces may stand around signs."""
-    return re.sub(r"\s*([-=*+,(])\s*|\s*(\))", r"\1\2", text).split()
-
-
-def _refuse_kind(lens: Lens, kind: str, of_surfaces: bool, word: str) -> None:
-    """Raise BadVariables for what is no number of any surface."""
-    if (kind == "sensor" and of_surfaces) or kind in _INSTEAD:
-        meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
-        raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
-    own = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
-    known = dict.fromkeys(["thickness", "sensor", *MEDIA, *GROUPS, *own])
-    if kind not in known:
-        raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
-
-
 def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
     """Whether a kind that is named alone means surface k too."""
     surface = lens.surfaces[k]
     if kind == "curvature":
-        return bends_light(lens, k)
+        return has_power(lens, k)
     if kind == "thickness":
         return k == sensor(lens) or bool(surface.thickness != 0)
     if kind in MEDIA:
@@ -242,7 +293,7 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
     return any(quantity in present for quantity in GROUPS.get(kind, (kind,)))
 
 
-def bends_light(lens: Lens, k: int) -> bool:
+def has_power(lens: Lens, k: int) -> bool:
     """Whether a surface is a mirror, or has other media before and behind it."""
     surfaces, media = lens.surfaces, medium_surfaces(lens.surfaces[: k + 1])
     return surfaces[k].is_mirror or not same(surfaces[media[k - 1]].glass, surfaces[media[k]].glass)
@@ -279,6 +330,61 @@ def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
                 at = (own[1], first) if first else (k, quantity)
                 return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]
     return [Vary(k, quantity)]
+
+
+# -- glasses that vary ------------------------------------------------------------------------------------------------
+
+
+def without_glass(free: Freedom, vary: str | Sequence | None) -> tuple[Freedom, tuple[int, ...]]:
+    """What varies but for glasses, and the surfaces whose glasses do.
+
+    Those that the file marks, where words mean all; other numbers of those glasses vary no more. The file's variables
+    follow where words name nothing but glasses. Raises BadVariables.
+    """
+    chosen = {one.surface for one in free.variables if one.quantity == "glass"}
+    if not chosen:
+        return free, ()
+    chosen = _marked(free.lens, vary, chosen) - set(followers(free.lens))
+    differing = [k for k in sorted(chosen) if _differs(free.lens, k)]
+    if differing or not chosen:
+        which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
+        raise BadVariables(f"`vary=glass`: the glass {which}")
+    own = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
+    others = _others(free.variables, chosen) or _others(own, chosen)
+    if not others:
+        raise BadVariables("`vary=glass`: nothing but glasses varies; name what follows them, as 'curvature glass'")
+    return dataclasses.replace(free, variables=others), tuple(sorted(chosen))
+
+
+def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
+    """The variables but for glasses, and for numbers of glasses that are chosen."""
+    of_media = (*MEDIA, *GLASS)
+    return tuple(
+        one for one in variables if one.quantity != "glass" and not (one.quantity in of_media and one.surface in chosen)
+    )
+
+
+def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[int]:
+    """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
+    words = vary if isinstance(vary, str) else " ".join(one for one in vary or () if isinstance(one, str))
+    kept = () if lens.optimization_data is None else lens.optimization_data.kept
+    told = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
+    all_meant = "glass" in words.split()
+    return (told & surfaces or surfaces) if all_meant else surfaces
+
+
+def followers(lens: Lens) -> dict[int, int]:
+    """Surfaces whose glass is that of another, and which one's."""
+    rules = () if lens.optimization_data is None else (*lens.optimization_data.solves, *lens.optimization_data.kept)
+    return {
+        one.surface: one.source
+        for one in rules
+        if (one.quantity, one.kind) == ("glass", "pickup") and one.operand is None
+    }
+
+
+def _differs(lens: Lens, surface: int) -> bool:
+    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.paths)
 
 
 # -- what follows ------------------------------------------------------------------------------------------------------
@@ -330,20 +436,24 @@ def _arguments(word: str, solve: str, quantity: str, text: str) -> tuple[float, 
     return (*found, 0.0) if most == 2 and len(found) == 1 else found
 
 
-def _refuse_circles(solves: Sequence[Solve]) -> None:
-    """Raise BadVariables for numbers that follow one another round a circle."""
-    after = {
-        _address(one): (one.source, one.quantity_of_source or one.quantity)
-        for one in solves
-        if one.kind == "pickup" and one.operand is None
-    }
-    for start in after:
-        at, passed = after[start], 0
-        while at in after and passed <= len(after):
-            at, passed = after[at], passed + 1
-        if passed > len(after):
-            raise BadVariables(f"{start[1]}:{start[0]} follows itself, by way of other numbers")
+# -- constraints -------------------------------------------------------------------------------------------------------
+
+#: Relations of constraints by their spellings.
+_RELATIONS = {"=": "=", "==": "=", "<=": "<=", "<": "<=", "≤": "<=", ">=": ">=", ">": ">=", "≥": ">="}
 
 
-def _listed(noun: str, numbers: Sequence[int]) -> str:
-    return f"{noun}{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+class BadHold(ValueError):
+    """Constraints that cannot be read, or of a quantity that the lens does not have."""
+
+
+def constraint_words(hold: str | Sequence[str] | None) -> list[str]:
+    """The words of constraint syntax, like "efl=50 total_track<=80"."""
+    return re.sub(r"\s*([<>=≤≥,(])\s*|\s+([)%])", r"\1\2", joined(hold or "")).split()
+
+
+def split_constraint(word: str) -> tuple[str, int, str, str]:
+    """Name, configuration (0: the current one), relation (=, <= or >=) and number of "efl@2=100". Raises BadHold."""
+    parts = re.fullmatch(r"([^<>=≤≥@]+?)(?:@(\d+))?(<=|>=|==|[<>=≤≥])(.+)", word)
+    if not parts:
+        raise BadHold(f"`hold`: {word!r}: expected a name, = or <= or >=, and a number, as efl=50")
+    return parts[1], int(parts[2] or 0), _RELATIONS[parts[3]], parts[4]

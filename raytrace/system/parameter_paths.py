@@ -20,7 +20,6 @@ from raytrace.system.lens import Lens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
-from raytrace.words import did_you_mean
 
 _POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
 
@@ -137,18 +136,6 @@ def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
             raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {what} {MOST}, which no lens has")
         found += range(first, last + 1)
     return found
-
-
-def parameter_path(lens: Lens, kind: str, number: int, word: str) -> ParameterPath:
-    """Where a surface holds a number of that name; "sensor" is a thickness. Raises BadVariables."""
-    if not 1 <= number <= len(lens.surfaces) - 2:
-        raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
-    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(lens.surfaces[number])}
-    wanted = "thickness" if kind == "sensor" else kind
-    if wanted not in known:
-        meant = did_you_mean(kind, known)
-        raise BadVariables(f"{word!r}: surface {number} has no {kind}; it has {', '.join(known)}{meant}")
-    return known[wanted]
 
 
 def sensor(lens: Lens) -> int:

@@ -4,6 +4,7 @@ Arrivals: where every ray of a spot meets the sensor, from which field, colour a
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -142,6 +143,8 @@ class Arrivals(Result):
     pupil: (2, P); fields: (2, F); wavelengths: (W,) µm.
     The table has a row a ray, its status in words; x and y are empty where it is not on the sensor.
     """
+
+    UNITS: ClassVar = {"field_x": "", "field_y": ""}  # of the lens, which is not stored
 
     rays: Rays
     status: Tensor

@@ -1,4 +1,6 @@
-"""A merit function of Optiland's sample lenses, in Optiland and in this package.
+"""The optimiser compared with those of Optiland: Optiland's sample lenses with one merit function, in both programs.
+
+    python docs/experiments/bench_optiland.py
 
     M² = Σ w (v - t)² / Σ w
 
@@ -9,27 +11,37 @@ so that all rays of a wavelength are traced in one call of `trace_generic`, in t
     "rays": a residual for x and y of every ray;
     "spots": the root mean square of every field and wavelength, as in Optiland's tutorials.
 
-Importing this file imports Optiland.
+Variables, their scales, the solvers and their derivatives are Optiland's: least squares (MINPACK's Levenberg-Marquardt
+by differences, numpy), and Adam with autograd (torch, float64) with the rate of its defaults. Both programs start from
+the same lens and trace the same rays. Time is processor time of one thread. The ratio compares the time of Optiland's
+solver with the time after which this package reaches the same M². Needs the extra [bench].
 """
 
+import argparse
 import dataclasses
 import math
-from collections.abc import Sequence
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import optiland.backend as be
 import torch
 from optiland.optic import Optic
-from optiland.optimization import OptimizationProblem
+from optiland.optimization import LeastSquares, OptimizationProblem, TorchAdamOptimizer
 from optiland.optimization.operand.operand import operand_registry
 from optiland.samples.objectives import CookeTriplet, DoubleGauss
 from torch import Tensor
 
+from raytrace.bench.report import digits, table
 from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.pupil import gauss_legendre
+from raytrace.optimization.optimize import optimize
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import trace_lens
@@ -242,3 +254,113 @@ def posed(optic: Optic, rows: Sequence[Row], variables: Sequence[Vary], how: str
         kind = {"curvature": "radius", "thickness": "thickness"}[vary.quantity]
         found.add_variable(optic, kind, surface_number=vary.surface)
     return found
+
+
+# -- solvers -----------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run of a solver: M² at its ends, processor seconds, evaluations; reached: seconds in which this package gets
+    to its end, nan for the package itself."""
+
+    lens: str
+    moved: float
+    solver: str
+    start: float
+    end: float
+    seconds: float
+    evaluations: int
+    reached: float = math.nan
+
+
+class _Counted(LeastSquares):
+    """Optiland's least squares with a count of its evaluations."""
+
+    evaluations = 0
+
+    def _compute_residuals_vector(self, x):
+        self.evaluations += 1
+        return super()._compute_residuals_vector(x)
+
+
+def least_squares(problem: Problem, *, tolerance: float = 1e-3) -> Run:
+    """Optiland's least squares; tolerance: of the sum of squares, its default."""
+    be.set_backend("numpy")
+    asked = posed(problem.optic(), problem.rows, problem.variables, "rays")
+    solver = _Counted(asked)
+    name = f"least squares, rays, tolerance {tolerance:g}"
+    return _run(problem, name, asked, lambda: solver.optimize(tol=tolerance), lambda: solver.evaluations)
+
+
+def adam(problem: Problem, steps: int) -> Run:
+    """Optiland's Adam with the rate 1e-2 and the decay 0.99 of its defaults."""
+    be.set_backend("torch")
+    be.set_precision("float64")
+    be.grad_mode.disable()
+    optic = problem.optic()
+    be.grad_mode.enable()
+    try:
+        asked = posed(optic, problem.rows, problem.variables, "spots")
+        solve = lambda: TorchAdamOptimizer(asked).optimize(n_steps=steps, lr=1e-2, gamma=0.99, disp=False)  # noqa: E731
+        return _run(problem, f"Adam, spots, {steps} steps of 0.01 · 0.99ⁿ", asked, solve, lambda: steps)
+    finally:
+        be.grad_mode.disable()
+        be.set_backend("numpy")
+
+
+def _run(problem: Problem, name: str, asked: OptimizationProblem, solve: Callable, evaluations: Callable) -> Run:
+    start = float(asked.sum_squared())  # compiles its loops, too
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        began = time.process_time()
+        solve()
+        seconds = time.process_time() - began
+    return Run(problem.name, problem.moved, name, start, float(asked.sum_squared()), seconds, evaluations())
+
+
+def compared(name: str, moved: float, steps: int) -> list[Run]:
+    """A sample lens optimised by this package and by both solvers of Optiland."""
+    same = problem(name, moved=moved)
+    others = [least_squares(same), adam(same, steps)]
+    began = time.process_time()
+    result = optimize(same.lens)
+    seconds, merits = time.process_time() - began, result.history[:, 0].square()
+    ends = result.merit_before**2, result.merit_after**2
+    runs = [Run(name, moved, "this package", *ends, seconds, result.evaluations)]
+    for run in others:
+        cycles = (merits <= run.end).nonzero()
+        reached = float(result.history[int(cycles[0]), 4]) if len(cycles) else math.inf
+        runs.append(dataclasses.replace(run, reached=reached))
+    return runs
+
+
+def report(runs: Sequence[Run]) -> list[str]:
+    """The table of docs/optimise.md."""
+    columns = {
+        "lens": lambda run: run.lens,
+        "start": lambda run: f"sample ± {run.moved:.0%}" if run.moved else "sample",
+        "solver": lambda run: run.solver,
+        "M² before": lambda run: f"{run.start:.5g}",
+        "M² after": lambda run: f"{run.end:.6g}",
+        "processor s": lambda run: f"{run.seconds:.3g}",
+        "evaluations": lambda run: str(run.evaluations),
+        "this package reaches it in, s": lambda run: digits(run.reached, ".3g", "–"),
+        "ratio": lambda run: digits(run.seconds / run.reached, ".0f", "–") if run.reached else "–",
+    }
+    return table(columns, runs)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--lens", choices=PROBLEMS, nargs="+", default=[*PROBLEMS], help="sample lenses of Optiland")
+    parser.add_argument("--steps", metavar="N", type=int, default=40, help="steps of Adam (default 40)")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    prepare()
+    runs = [run for name in arguments.lens for moved in (0.0, 0.02) for run in compared(name, moved, arguments.steps)]
+    print("\n".join(report(runs)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,11 +4,13 @@ import math
 
 import pytest
 import torch
+from scripts import script
 
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
 
-peers = pytest.importorskip("optiland_merit", reason="needs the extra [bench]", exc_type=ImportError)
+pytest.importorskip("optiland", reason="needs the extra [bench]")
+peers = script("bench_optiland")
 
 pytestmark = pytest.mark.usefixtures("same_threads")
 
@@ -43,3 +45,10 @@ def test_variables_are_those_of_the_table():
             if one is not None and not torch.allclose(one, other, rtol=1e-6, atol=0):
                 changed.append((number, quantity))
     assert sorted(changed) == sorted((v.surface, v.quantity) for v in plain.variables)
+
+
+def test_the_script_compares_the_solvers(capsys):
+    peers.main(["--lens", "cooke triplet", "--steps", "2"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 2 * 3  # a heading, and three solvers from two starts
+    assert "least squares, rays" in lines[3]
