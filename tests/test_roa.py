@@ -118,6 +118,12 @@ def test_mirrors_and_pupils_of_the_image(read):
     assert [one.is_mirror for one in lens.surfaces] == [False, True, True, False]
 
 
+def test_an_image_f_number_of_a_near_object_is_that_of_the_paraxial_cone(read):
+    lens, _ = read(model(SINGLET[0], [gap(100.0), *SINGLET[1][1:]], pupil=("image", "f/#", 10.0)))
+    assert lens.aperture.kind == "paraxial_working_f_number"
+    assert float(rt.first_order(lens).paraxial_working_f_number) == pytest.approx(10.0, rel=1e-12)
+
+
 def test_decentres_and_odd_terms(read):
     """Tilts alpha and beta are left-handed; a radial polynomial begins with r, and ec is the conic constant + 1."""
     tilt = part("DecenterData", _dtype="decenter", dec=[1.0, 2.0, 0.0], euler=[10.0, -5.0, 3.0])

@@ -162,15 +162,15 @@ def _surface(interface: Part, profiles: object, thickness: float, glass: Glass, 
         kind = f"an interface of class {interface.kind[:40]}"
         kind = "a thin lens, a hologram there," if interface.kind == "ThinLens" else kind
         raise interface.unsupported(f"{kind} is not modelled; modelled is Surface")
-    mode, ends = interface.text("interact_mode", "transmit"), interface.place.surface == 0
+    mode = interface.text("interact_mode", "transmit")
     if mode not in ("transmit", "reflect", "dummy"):
-        raise interface.unsupported(
-            f"interact_mode {shown(mode)} is not modelled; modelled are transmit, reflect, dummy"
-        )
-    if mode == "reflect" and ends:
+        modelled = "modelled are transmit, reflect, dummy"
+        raise interface.unsupported(f"interact_mode {shown(mode)} is not modelled; {modelled}")
+    if mode == "reflect" and interface.place.surface == 0:
         raise interface.error("the object is a mirror")
     before, behind = _poses(interface.part("decenter"), unit) if interface.has("decenter") else (None, None)
     size = abs(interface.number("max_aperture", 0.0)) * unit
+    clear = interface.parts("clear_apertures") if interface.has("clear_apertures") else ()
     return Surface(
         thickness=double(thickness),
         **_profile(interface, profiles, unit, report),
@@ -179,9 +179,7 @@ def _surface(interface: Part, profiles: object, thickness: float, glass: Glass, 
         after=behind,
         glass=MIRROR if mode == "reflect" else glass,
         semi_diameter=size if 0 < size < 1e8 else None,
-        apertures=tuple(_clear(part, unit) for part in interface.parts("clear_apertures"))
-        if interface.has("clear_apertures")
-        else (),
+        apertures=tuple(_clear(part, unit) for part in clear),
         comment=interface.text("label").strip(),
     )
 
@@ -235,10 +233,8 @@ def _phase(element: Part, unit: float, report: Draft) -> RadialPhase:
     report.met(element.kind[:40], READ, element.place)
     function = element.text("phase_fct_name", element.kind)
     if element.kind != "DiffractiveElement" or function != "radial_phase_fct":
-        message = (
-            f"a phase of class {element.kind[:40]} ({function[:40]}) is not modelled; modelled is radial_phase_fct"
-        )
-        raise element.unsupported(message)
+        kind = f"a phase of class {element.kind[:40]} ({function[:40]})"
+        raise element.unsupported(f"{kind} is not modelled; modelled is radial_phase_fct")
     wave = element.number("ref_wl") * 1e-6  # mm
     if not wave > 0:
         raise element.error("ref_wl is expected above 0")
@@ -299,9 +295,7 @@ def _medium(medium: Part, wavelengths: list[float], catalogs: Sequence[Path], re
         report.glass(surface, name, f"constant index {index!r}")
         return AIR if index == 1 else constant(_positive(medium, index), name)
     if kind in ("InterpolatedMedium", "InterpolatedGlass"):
-        waves, indices = (
-            [value * scale for value in medium.numbers(key)] for key, scale in (("wvls", 1e-3), ("rndx", 1.0))
-        )
+        waves, indices = [1e-3 * wave for wave in medium.numbers("wvls")], medium.numbers("rndx")
         report.glass(surface, name, f"a formula for its {len(waves)} indices")
         try:
             return from_table(waves, indices, name=name)
@@ -443,22 +437,20 @@ def _aperture(pupil: Part, surfaces: list[Surface], wavelength: float, unit: flo
             raise pupil.error(f"an NA of {size:g} of an image space of index {index:g}")
         kind, size = "f/#", 0.5 / (index * math.tan(math.asin(size / index)))
     if space == "image" and kind == "f/#":
-        return "image_f_number" if at_infinity else "working_f_number", size
+        return "image_f_number" if at_infinity else "paraxial_working_f_number", size
     raise pupil.error(f"a pupil by {space} {kind} is not modelled; expected object epd or NA, image f/# or NA")
 
 
 def _fields(view: Part, unit: float, report: Draft) -> dict:
     key = _key(view)
     if key not in _FIELDS:
-        expected = "expected object angle, height, image height"
-        raise view.error(f"fields by {' '.join(key)} are not modelled; {expected}")
+        raise view.error(f"fields by {' '.join(key)} are not modelled; expected object angle, height, image height")
     points = view.parts("fields")
     if not points:
         raise view.error("no fields")
     kind = _FIELDS[key]
-    length = (1.0 if kind == "angle" else unit) * (
-        view.number("value", 1.0) if view.attributes.get("is_relative") else 1.0
-    )
+    length = 1.0 if kind == "angle" else unit
+    length *= view.number("value", 1.0) if view.attributes.get("is_relative") else 1.0
     rows = []
     for point in points:  # decentre and compression in x and y, from the fractions cut off on either side
         low_x, high_x, low_y, high_y = (point.number(f"v{side}{axis}", 0.0) for axis in "xy" for side in "lu")

@@ -61,7 +61,6 @@ from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row, Table, cleaned, parse
 from raytrace.materials.catalogs import Catalog
-from raytrace.materials.environment import Environment
 from raytrace.materials.glass import (
     AIR,
     LINES,
@@ -84,10 +83,8 @@ _NOTHING = ("", "-", "0", "0.0", "∞", "inf", "infinity", "nan", "none")
 
 def _figures(cells: dict[str, str]) -> dict[str, str]:
     """The cells of a row that give its medium by numbers, by column: "index d", "abbe d", "pgf", "dpgf"."""
-    named = {
-        name: cell for name, cell in cells.items() if name.startswith(("index ", "abbe ")) or name in ("pgf", "dpgf")
-    }
-    return {name: cell for name, cell in named.items() if cell.lower() not in _NOTHING}
+    is_figure = re.compile("index .*|abbe .*|d?pgf").fullmatch
+    return {name: cell for name, cell in cells.items() if is_figure(name) and cell.lower() not in _NOTHING}
 
 
 def _medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
@@ -197,10 +194,15 @@ def _words(text: str) -> list[str]:
 def _surface(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Surface:
     """The surface of a row, its lengths in units of `unit` mm."""
     cells, place = row.cells, row.place
-    conic = _cell(row, "conic")
+    conic, distance = _cell(row, "conic"), cells.get("thickness", "")
+    is_far = is_infinite(distance) and place.surface == 0 and not distance.startswith("-")
+    thickness = float("inf") if is_far else _cell(row, "thickness")
     kind, coefficients = _terms(row, unit)
+    environment = [key for key in ENVIRONMENT if key in cells]
+    if len(environment) == 1:
+        raise LensFileError(f"a {environment[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
     return Surface(
-        thickness=double(_thickness(row) * unit),
+        thickness=double(0.0 if thickness is None else thickness * unit),
         curvature=_curvature(row, unit),
         conic=nonzero(conic),
         coefficients=coefficients,
@@ -210,16 +212,9 @@ def _surface(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Seq
         apertures=tuple(
             _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
         ),
-        environment=_environment(cells, place),
+        environment=environment_of(cells, place) if environment else None,
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
-
-
-def _environment(cells: Mapping[str, str], place: Place) -> Environment | None:
-    keys = [key for key in ENVIRONMENT if key in cells]
-    if len(keys) == 1:
-        raise LensFileError(f"a {keys[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
-    return environment_of(cells, place) if keys else None
 
 
 def _cell(row: Row, column: str) -> float | None:
@@ -228,14 +223,6 @@ def _cell(row: Row, column: str) -> float | None:
     if text is None or text.lower() in ("-", "nan", "none"):
         return None
     return number(text, column, row.place)
-
-
-def _thickness(row: Row) -> float:
-    text = row.cells.get("thickness", "")
-    if is_infinite(text) and row.place.surface == 0 and not text.startswith("-"):
-        return float("inf")
-    thickness = _cell(row, "thickness")
-    return 0.0 if thickness is None else thickness
 
 
 def _curvature(row: Row, unit: float) -> Tensor | None:
@@ -394,10 +381,6 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources
     return lens
 
 
-def _role(row: Row) -> str:
-    return f"{row.cells.get('type', '')} | {row.cells.get('label', '')}"
-
-
 def _numbered(table: Table) -> list[Row]:
     """The rows with their surface numbers, unsupported types refused."""
     if len(table.rows) < 2:
@@ -405,7 +388,9 @@ def _numbered(table: Table) -> list[Row]:
         raise LensFileError(message, table.place)
     first = table.rows[0]
     label = first.cells.get("label", "")
-    is_object = _OBJECT.search(_role(first)) or (is_number(label) and number(label, "surface", first.place) == 0)
+    is_object = _OBJECT.search(f"{first.cells.get('type', '')} | {label}") or (
+        is_number(label) and number(label, "surface", first.place) == 0
+    )
     start = 0 if is_object else 1
     rows = cleaned([Row(row.place._replace(surface=k), row.cells) for k, row in enumerate(table.rows, start)])
     _refuse_unsupported(rows)
@@ -437,14 +422,14 @@ def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> l
             raise LensFileError("no thickness; expected a number (0 for surfaces in contact)", row.place)
     if rows[0].place.surface == 0 and len(rows) < 3:
         raise LensFileError("only object and image; expected a surface between them", last.place)
-    if _IMAGE.search(_role(last)):
+    label = last.cells.get("label", "")
+    if _IMAGE.search(f"{last.cells.get('type', '')} | {label}"):
         return []
     if surfaces[-1].thickness != 0:
         message = f"no row of the image: added {float(surfaces[-1].thickness):g} mm behind the last surface"
         report.warn(message, last.place)
         return [Surface(thickness=double(0.0))]
-    label = last.cells.get("label", "")
-    ends_glass = len(surfaces) > 1 and surfaces[-2].glass.formula not in ("mirror",) and surfaces[-2].glass is not AIR
+    ends_glass = len(surfaces) > 1 and not surfaces[-2].is_mirror and surfaces[-2].glass is not AIR
     if surfaces[-1].curvature is not None or ends_glass or surfaces[-1].glass is not AIR:
         message = "the last row is a surface of the lens without a distance to the image"
         raise LensFileError(f"{message}; fill in its thickness, or add a row 'Image'", last.place)
@@ -456,11 +441,8 @@ def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> l
 def _warn_of_zero_radii(rows: list[Row], surfaces: list[Surface], report: Draft) -> None:
     """Warn of radius 0 of a refracting surface, which is a plane or a missing number."""
     refracting = [k for k in range(1, len(surfaces)) if surfaces[k].glass is not surfaces[k - 1].glass]
-    places = []
-    for row in rows:
-        radius = row.cells.get("radius", "")
-        if row.place.surface in refracting and is_number(radius) and number(radius, "radius", row.place) == 0:
-            places.append(row.place)
+    radii = [(row.place, row.cells.get("radius", "")) for row in rows if row.place.surface in refracting]
+    places = [place for place, cell in radii if is_number(cell) and number(cell, "radius", place) == 0]
     if places:
         listed = ", ".join(str(place.surface) for place in places)
         message = f"radius 0 of surface {listed} is taken as a plane; write inf if it is one"

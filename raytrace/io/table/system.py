@@ -93,9 +93,8 @@ def ray_aiming(table: Table) -> str:
 def environment(table: Table) -> Environment | None:
     """Temperature in °C and pressure in atm; None where the header has neither."""
     lines = {key: table.metadata[key] for key in ENVIRONMENT if key in table.metadata}
-    if not lines:
-        return None
-    return environment_of({key: value for key, (value, _) in lines.items()}, [*lines.values()][-1][1])
+    places = [place for _, place in lines.values()]
+    return environment_of({key: value for key, (value, _) in lines.items()}, places[-1]) if lines else None
 
 
 def environment_of(cells: Mapping[str, str], place: Place) -> Environment:
@@ -118,24 +117,21 @@ def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> tup
         table.report.warn(message, table.place)
         return "image_f_number", DEFAULT_F_NUMBER
     value, place = table.metadata["aperture"]
-    kind, size = _aperture_words(value, place)
+    text = " ".join(value.replace("_", " ").replace("=", " ").split())
+    named = ((name, kind) for kind in APERTURE_KINDS if text.lower().startswith(name := kind.replace("_", " ")))
+    name, kind = next(named, ("", ""))
+    size = text[len(name) :].strip()
+    if not kind:
+        number_behind = r"\s*((?:\d|\.|[+-]\s*\d).*|)"
+        matches = ((re.fullmatch(f"(?:{row}){number_behind}", text, re.IGNORECASE), kind) for row, kind in _APERTURES)
+        match, kind = next(((match, kind) for match, kind in matches if match), (None, ""))
+        if match is None:
+            raise LensFileError(f"aperture is {shown(value)}, expected for example 'EPD 33.33', 'F/3', 'NA 0.1'", place)
+        size = match[1]
     if not size and kind == "float_by_stop" and stop_semi_diameter:
         return kind, stop_semi_diameter
     amount = number(size.removesuffix("mm").removesuffix("deg").strip() or "?", "aperture", place)
     return kind, amount * unit if kind in ("entrance_pupil_diameter", "float_by_stop") else amount
-
-
-def _aperture_words(value: str, place: Place) -> tuple[str, str]:
-    text = " ".join(value.replace("_", " ").replace("=", " ").split())
-    for kind in APERTURE_KINDS:
-        name = kind.replace("_", " ")
-        if text.lower().startswith(name):
-            return kind, text[len(name) :].strip()
-    for pattern, kind in _APERTURES:
-        match = re.fullmatch(rf"(?:{pattern})\s*((?:\d|\.|[+-]\s*\d).*|)", text, re.IGNORECASE)
-        if match:
-            return kind, match[1]
-    raise LensFileError(f"aperture is {shown(value)}, expected for example 'EPD 33.33', 'F/3', 'NA 0.1'", place)
 
 
 def fields(table: Table, unit: float) -> dict:
@@ -179,18 +175,27 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
 
 def _per_field(table: Table, key: str, count: int, default: float) -> list[float]:
     numbers = _numbers(table, key)
-    if numbers is None:
-        return [default] * count
-    if len(numbers) != count:
+    if numbers is not None and len(numbers) != count:
         raise LensFileError(f"{key} has {len(numbers)} values for {count} fields", table.metadata[key][1])
-    return numbers
+    return [default] * count if numbers is None else numbers
 
 
 def wavelengths(table: Table) -> dict:
     """Wavelengths in µm, weights, number of the primary one; the d line, with a warning, if there are none."""
     waves, report = [LINES["d"]], table.report
     if "wavelengths" in table.metadata:
-        waves = _wavelengths(*table.metadata["wavelengths"])
+        value, place = table.metadata["wavelengths"]
+        words = [word for word in _NUMBERS.split(value) if word]
+        unit = "" if words and is_number(words[-1]) else (words or ["?"]).pop()
+        powers = {"": 0, "µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
+        if unit not in powers or not words or len(words) > 1000:
+            raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
+        # rounded once: 486.1 nm is 0.4861 µm
+        waves = [float(Decimal(repr(number(word, "wavelength", place))).scaleb(powers[unit])) for word in words]
+        for wavelength in waves:
+            if not 0 < wavelength < (math.inf if unit else _LONGEST):
+                expected = f"expected 0 to {_LONGEST:g} µm; in nm write '587.6 nm', and '3000 µm' where that is meant"
+                raise LensFileError(f"a wavelength of {wavelength:g} µm, {expected}", place)
     else:
         report.warn(f"no wavelengths: {LINES['d']} µm (d) is taken; write '# wavelengths: 0.5876'", table.place)
     value, place = table.metadata.get("primary wavelength", ("1", table.place))
@@ -201,21 +206,6 @@ def wavelengths(table: Table) -> dict:
         "wavelength_weights": _numbers(table, "wavelength weights") or None,
         "primary_wavelength": integer(value, "primary wavelength", place),
     }
-
-
-def _wavelengths(value: str, place: Place) -> list[float]:
-    words = [word for word in _NUMBERS.split(value) if word]
-    unit = "" if words and is_number(words[-1]) else (words or ["?"]).pop()
-    powers = {"": 0, "µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
-    if unit not in powers or not words or len(words) > 1000:
-        raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
-    # rounded once: 486.1 nm is 0.4861 µm
-    waves = [float(Decimal(repr(number(word, "wavelength", place))).scaleb(powers[unit])) for word in words]
-    for wavelength in waves:
-        if not 0 < wavelength < (math.inf if unit else _LONGEST):
-            expected = f"expected 0 to {_LONGEST:g} µm; in nm write '587.6 nm', and '3000 µm' where that is meant"
-            raise LensFileError(f"a wavelength of {wavelength:g} µm, {expected}", place)
-    return waves
 
 
 def written_environment(air: Environment | None, place: Place) -> dict[str, str]:
