@@ -223,7 +223,7 @@ def test_nothing_near_is_nothing_said():
 @pytest.mark.parametrize(
     "analysis", ["mtf", "ray-fan", "opd-fan", "wavefront", "distortion", "encircled-energy", "incidence"]
 )
-def test_a_field_out_of_reach_is_told_with_cause_and_help(command, analysis, lens):
+def test_a_field_out_of_reach_is_reported_with_cause_and_help(command, analysis, lens):
     field = 5 if lens == "hubble" else 60
     code, out, err = command(analysis, lens, "--field", field, "--plot", "figure.png")
     assert (code, out) == (1, "")

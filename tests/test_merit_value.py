@@ -68,7 +68,7 @@ def test_rows_of_arithmetic_keep_to_their_rows_when_they_move(lens, spot):
     assert float(alone.values[2]) == pytest.approx(float(alone.values[1] / alone.values[0]), rel=1e-12)
 
 
-def test_configurations_are_told_apart(lens):
+def test_configurations_are_distinguished(lens):
     zoom = lens.with_configurations(thickness={6: [12.4281, 16.0], 11: [57.9, 52.0]})
     found = rt.evaluate(zoom, merit="spot")
     assert {*found.configurations.tolist()} == {1, 2}
@@ -142,7 +142,7 @@ def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
     assert edged.rows[-1].target == pytest.approx(0.1)
 
 
-def test_lost_rays_are_told(lens):
+def test_failed_rays_are_reported(lens):
     wide = lens.at(fields=[0, 80])
     found = rt.evaluate(wide, merit="spot")
     assert bool(found.lost.any())

@@ -209,7 +209,7 @@ def test_spot_of_all_wavelengths():
     assert found.rays.tolist() == [4000] * 3
 
 
-def test_largest_distance_of_many_rays_lies_between_what_is_told(monkeypatch):
+def test_largest_distance_of_many_rays_lies_between_the_bounds_reported(monkeypatch):
     monkeypatch.setattr(streaming, "_PILOT", 64)
     system = double_gauss()
     points, weights = pupil.sobol(5000)
@@ -250,10 +250,10 @@ def test_float32_rays_are_summed_in_float64():
 
 
 def test_progress_counts_every_ray():
-    told = []
-    stream_spot(double_gauss(), 3000, wavelengths=COLOURS, max_bytes=SMALL, progress=told.append)
-    assert sum(told) == 3000 * 6
-    assert max(told) <= 512
+    counts = []
+    stream_spot(double_gauss(), 3000, wavelengths=COLOURS, max_bytes=SMALL, progress=counts.append)
+    assert sum(counts) == 3000 * 6
+    assert max(counts) <= 512
 
 
 # ---------------------------------------------------------------- PSFs
