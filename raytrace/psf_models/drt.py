@@ -88,8 +88,7 @@ def splat_cells(
     To first order the image of a cell is a parallelogram c ± a ± b; on a caustic it folds to a segment or a point.
     Along x it has the density of the sum of two uniform variables of half widths |a_x| and |b_x|, so its share on
     either side of a pixel edge is exact. At a pixel corner the joint share F_x F_y + cov f_x f_y is used, whose mean
-    over all positions of the corner is exact (Hoeffding), clamped to the range that the marginal shares allow. There is
-    no bias as cells shrink.
+    over all positions of the corner is exact (Hoeffding), clamped to the range that the marginal shares allow.
 
     points: (2, ..., A, N) mm, N nodes on each of A lines at equal angles; radius: (N,) of the nodes.
     clearances: each (..., A, N), positive where light passes; the share of a cell below 0 is cut away.

@@ -20,10 +20,10 @@ _MOST_PIXELS = 16  # across a panel, whose edges are drawn
 def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
-    Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
-    fills, with the edges of the pixels. close_up: that light, if it is there already.
-    Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
-    Below each: the energy inside the window (or that it was normalised by), and that of the brightest pixel.
+    Where its pixels were specified, or rays are independent, pixels are drawn; else the light itself in windows that
+    it fills, with the edges of the pixels. close_up: that light, if it is already computed. Kernels of each wavelength
+    have a row each, fields outermost. log: four decades of brightness below the peak. Below each: the energy inside the
+    window, and that of the brightest pixel.
     """
     if close_up is None and not psfs.framed and psfs.order is not None:
         close_up = light_of(psfs)
@@ -64,7 +64,7 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
 def panels(kernels, halves, distances, labels, notes, log: bool):
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
-    Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
+    Distances are above and labels on the left; kernels of one distance follow each other in lines of four, each under
     its label.
     """
     from matplotlib.colors import LogNorm, Normalize

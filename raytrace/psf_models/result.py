@@ -234,13 +234,11 @@ def centroid_and_covariance(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor
 
 
 def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) and covariance (3, ...) of all light of K distributions (2, ..., K), (3, ..., K).
-
-    energy: (..., K), theirs.
+    """Centroid (2, ...) and covariance (3, ...) of the light of K distributions, (2, ..., K) and (3, ..., K).
 
         m = Σ_k s_k m_k,   C = Σ_k s_k (C_k + (m_k - m)(m_k - m)ᵀ),   s_k = E_k / Σ E
 
-    Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
+    Nothing large is subtracted (Chan, Golub and LeVeque, Stanford STAN-CS-79-773, 1979, eq. 2.1).
     """
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
     mean, apart = centroid_and_covariance(*centroid, share)

@@ -83,17 +83,13 @@ class ElementPsf(Result):
 
     @property
     def peak(self) -> Tensor:
-        """(D, W): the most light in one pixel, of those of the window and one centred on the axis, so that windows of
-        an even and of an odd number of pixels have the same peak.
-        """
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis."""
         brightest = self.kernel.amax((-2, -1))
         return brightest if self.axial is None else torch.maximum(brightest, self.axial)
 
     @property
     def half_energy_radius(self) -> Tensor:
-        """(D, W) mm about the axis that holds half of all light through the aperture, to half a pixel; inf where the
-        window does not hold it.
-        """
+        """(D, W) mm about the axis that holds half of all light, to half a pixel; inf where the window does not."""
         x, y = centres(self.grid)
         distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
         inside = (self.kernel.flatten(-2)[..., order].cumsum(-1) < 0.5).sum(-1)
@@ -169,8 +165,8 @@ def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None,
     """PSFs of a scene, differentiable in every number of it.
 
     sampling: engine, samples, nodes, tol, pad, band_limit as `plan.plan` takes them, and its errors. plan: of an
-    earlier call, instead of them: for loops, nothing is estimated. memo: sums that do not depend on the heights, reused
-    while the rest of the scene stays as it is.
+    earlier call, instead of them: for loops. memo: sums that do not depend on the heights, reused while the rest of the
+    scene stays as it is.
     """
     plan = planning.plan(scene, **sampling) if plan is None else plan
     engine, sums = planning.ENGINES[plan.engine], None

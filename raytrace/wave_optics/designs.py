@@ -169,11 +169,11 @@ def achromat(
     """The diffractive achromat: rings of fused silica, heights within one wave, that maximise Σ_λ log E_λ(spot).
 
     After Peng, Fu, Heide and Heidrich, ACM Trans. Graph. 35, 31 (2016), with a gradient ascent of the product of
-    encircled energies instead of their greedy search for equal spectra.
+    encircled energies instead of their greedy search for equal spectra. Starts from the rings whose phases agree best
+    with the lenses of all wavelengths; the same numbers give the same rings.
 
     wavelengths: µm; spot: radius of the circle, mm; pitch: of the rings, mm; rate: of Adam, on the logit of the height;
-    encircled: the engine that gives E, by default `encircled_energy`. Starts from the rings whose phases agree best
-    with the lenses of all wavelengths. The same numbers give the same rings.
+    encircled: the engine that gives E, by default `encircled_energy`.
     """
     glass = find_glass("F_SILICA")
     colours = torch.tensor(wavelengths, dtype=torch.float64, device=aim.radius.device)
@@ -206,9 +206,9 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
 
         U(ρ) = (2π/λz) Σ_rings e^(ik (n - 1) h) ∫ e^(ik e(r)) J0(2πρr/λz) r dr,   E = ∫ |U|² 2πρ dρ / πR²
 
-    with e(r) the path from the point and to the sensor. The integral over a ring, in `inner` parts of constant e(r),
-    does not depend on the heights: it is done once, and E is a sum of squares of linear forms. The circle is integrated
-    by a Gauss rule of 32 points. Exact in the parabolic approximation. wavelengths: (W,) µm.
+    with e(r) the path from the point and to the sensor, constant in each of `inner` parts of a ring. These integrals do
+    not depend on the heights: E is a sum of squares of linear forms, by a Gauss rule of 32 radii ρ. Parabolic
+    approximation. wavelengths: (W,) µm.
     """
     wavelengths, radius = wavelengths.double(), aim.radius.detach().double()
     count = features(radius, torch.tensor(pitch, dtype=torch.float64))

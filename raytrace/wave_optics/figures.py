@@ -30,7 +30,10 @@ def psf_figure(psfs):
     kernels, energy, peak = array(psfs.kernel), array(psfs.energy), array(psfs.peak)
     wavelengths = psfs.wavelengths.tolist()
     colours, together = style.wavelength_colours(wavelengths), len(wavelengths) > 1
-    columns = len(wavelengths) + together
+    columns, order = len(wavelengths) + together, np.argsort(wavelengths)[::-1]
+    place = np.linspace(0, 2, len(order))
+    channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
+    shares = channels / channels.sum(1, keepdims=True).clip(1e-9)
     # From black through the colour to white: the peak is white, as on film.
     ramps = [[(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")] for colour in colours]
     maps = [LinearSegmentedColormap.from_list("light", ramp) for ramp in ramps]
@@ -47,7 +50,11 @@ def psf_figure(psfs):
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         if together:
-            axes[row][-1].imshow(_mixed(kernels[row], wavelengths), origin="lower", interpolation="nearest")
+            # The longest wavelengths red, the shortest blue.
+            picture = np.tensordot(shares, kernels[row][order], 1)
+            bright = np.clip(picture, 0, None) / (picture.max() if picture.max() > 0 else 1)
+            image = np.moveaxis(bright**_GAMMA, 0, -1)
+            axes[row][-1].imshow(image, origin="lower", interpolation="nearest")
             if row == 0:
                 axes[row][-1].set_title("together")
         axes[row][0].set_ylabel(_depth(depth))
@@ -161,16 +168,6 @@ def _profile(panel, element: Element, first: float, last: float) -> None:
     panel.plot(array(x), values, color=style.field_colour(0), linewidth=0.7)
     panel.set(xlim=(first, last), ylabel="height, µm")
     panel.grid(True, color=style.FAINT, linewidth=0.5)
-
-
-def _mixed(kernels: np.ndarray, wavelengths: Sequence[float]) -> np.ndarray:
-    """Kernels (W, rows, columns) as one picture (rows, columns, 3): the longest wavelengths red, the shortest blue."""
-    order = np.argsort(wavelengths)[::-1]
-    place = np.linspace(0, 2, len(order))
-    channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
-    picture = np.tensordot(channels / channels.sum(1, keepdims=True).clip(1e-9), kernels[order], 1)
-    peak = picture.max()
-    return np.moveaxis((np.clip(picture, 0, None) / (peak if peak > 0 else 1)) ** _GAMMA, 0, -1)
 
 
 def _depth(distance: float) -> str:

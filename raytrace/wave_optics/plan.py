@@ -25,7 +25,7 @@ from torch import Tensor
 
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms
+from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms, sub_pixels
 from raytrace.psf_models.models import NotConverged
 from raytrace.psf_models.radial import is_centred, reach
 from raytrace.wave_optics import mixed, propagation, pupil
@@ -116,9 +116,7 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
     position = torch.stack([x, y])[:, None, None]
     for v in ((1 / scene.depths.detach())[:, None, None], 1 / z):
         total = total + position * (v / torch.sqrt(1 + r2 * v * v) if scene.exact else v)
-    for element in scene.elements:
-        if is_flat(element):
-            continue
+    for element in (element for element in scene.elements if not is_flat(element)):
         power = excess_index(element, scene.wavelengths.detach(), x)
         if diffracted and element.period is not None:
             power = wavelength / element.period.detach()
@@ -149,10 +147,9 @@ def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) 
     """Path (W, P) in waves of elements; a wrapped height counts whole, in periods: the first order."""
     total = x.new_zeros(len(scene.wavelengths), len(x))
     for element in elements:
-        h = designed_height(element, x, y)
         excess = excess_index(element, scene.wavelengths, x) / millimetres(scene)
         scale = excess if element.period is None else (1 / element.period).expand_as(excess)
-        total = total + scale[:, None] * h
+        total = total + scale[:, None] * designed_height(element, x, y)
     return total
 
 
@@ -431,10 +428,9 @@ def plan(
 
     engine: a name of ENGINES, or "auto": `radial` for round elements and a window on the axis, else `pupil`. samples,
     nodes: to be used as they are (`Plan`). pad, band_limit: of the transfer functions; pad 1.5 without a band limit is
-    that of Sitzmann et al. (2018).
-    Raises AliasedSampling where copies of the image would lie in the window, ValueError where an engine cannot hold
-    the scene; warns `psf_models.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the
-    finest sampling does not meet tol.
+    that of Sitzmann et al. (2018). Raises AliasedSampling where copies of the image would lie in the window, ValueError
+    where an engine cannot hold the scene; warns `psf_models.dft.Aliased` where the converging field is undersampled,
+    and `NotConverged` where the finest sampling does not meet tol.
     """
     check(scene)
     round_scene = is_round(scene) and is_centred(scene.grid)
@@ -445,9 +441,8 @@ def plan(
     if engine == "radial" and not round_scene:
         raise ValueError("the radial engine needs round elements and a grid centred on the axis; use engine='pupil'")
     row, setting = ENGINES[engine], setting_of(scene)
-    sampling = row.plan(
-        scene, setting, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
-    )
+    options = {"engine": engine, "samples": samples, "nodes": nodes, "pad": pad, "band_limit": band_limit}
+    sampling = row.plan(scene, setting, tol=tol, **options)
     # An engine that samples the converging field itself is a reference: not held to a tolerance.
     if row.prepare is not None and samples is None and nodes is None and sampling.error > tol:
         message = (
@@ -590,9 +585,15 @@ def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
 
 
 def _transfer_kernels(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
-    options = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
-    light, weight = propagation.transfer_function_intensity(scene, samples=plan.samples, nodes=plan.nodes, **options)
-    return integrate(light, weight, scene.grid.pitch)
+    (u, v, weight), pitch, fields = sub_pixels(scene.grid, plan.nodes), 2 * aperture(scene) / plan.samples, []
+    options = {"band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
+    options["size"] = propagation.padded(plan.samples, plan.pad)
+    for k, wavelength in enumerate(millimetres(scene)):
+        field = propagation.behind(scene, k, plan.samples)
+        field = propagation.propagate(field, pitch, scene.sensor_distance, wavelength, **options)
+        fields.append(propagation.at_nodes(field, pitch, u, v))
+    U = torch.stack(fields, 1)
+    return integrate(U.real**2 + U.imag**2, weight, scene.grid.pitch)
 
 
 class Engine(NamedTuple):

@@ -27,32 +27,13 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.psf_models.dft import bessel_j0, phasor, sub_pixels
+from raytrace.psf_models.dft import bessel_j0, phasor
 from raytrace.psf_models.radial import radii_of_waves, unfold
 from raytrace.wave_optics.element import Rings, designed_height, path
 from raytrace.wave_optics.pupil import disc_cells
 from raytrace.wave_optics.scene import WaveScene, aperture, excess, millimetres, spheres
 
 _LOBES = 24  # samples on either side in the interpolation from the field's grid to the nodes of the pixels
-
-
-def transfer_function_intensity(
-    scene: WaveScene, *, samples: int, nodes: int, pad: float, band_limit: bool, spectrum: bool
-) -> tuple[Tensor, Tensor]:
-    """Light per mm² (D, W, Y, X) at the nodes of the pixels, and the weights of the nodes.
-
-    samples: across the diameter; pad: width of the transform over the diameter. spectrum: the angular spectrum's
-    transfer function instead of Fresnel's.
-    """
-    pitch = 2 * aperture(scene) / samples
-    u, v, weight = sub_pixels(scene.grid, nodes)
-    options = {"size": padded(samples, pad), "band_limit": band_limit, "spectrum": spectrum}
-    fields = []
-    for k, wavelength in enumerate(millimetres(scene)):
-        field = propagate(behind(scene, k, samples), pitch, scene.sensor_distance, wavelength, **options)
-        fields.append(at_nodes(field, pitch, u, v))
-    U = torch.stack(fields, 1)
-    return U.real**2 + U.imag**2, weight
 
 
 def padded(samples: int, pad: float) -> int:

@@ -153,9 +153,8 @@ def disc_cells(samples: int, extent: float = 1.0) -> np.ndarray:
 def smooth_cells(samples: int) -> np.ndarray:
     """Weights (N + 2·margin, …) of smooth values at the centres of cells, N across the unit disc, in its integral.
 
-    w_j = ∬_disc φ(x - x_j) φ(y - y_j) dx dy, φ the cardinal function of six-point Lagrange interpolation: inside it is
-    one cell, at the edge the polynomial through the values is integrated up to the edge, where areas alone err by the
-    square of the cell (measured on a blurred spot, N = 160: 3e-4 instead of 2.5e-3).
+    w_j = ∬_disc φ(x - x_j) φ(y - y_j) dx dy, φ the cardinal function of six-point Lagrange interpolation. Areas alone
+    err by the square of the cell (measured on a blurred spot, N = 160: 3e-4 instead of 2.5e-3).
     """
     size = samples + 2 * _MARGIN
     sub = 2 * max(2, min(8, 1024 // size))
