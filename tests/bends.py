@@ -10,8 +10,8 @@ import raytrace as rt
 
 def pose(**numbers) -> rt.Pose:
     flag = numbers.pop("tilts_first", False)
-    told = {name: number if isinstance(number, torch.Tensor) else real(number) for name, number in numbers.items()}
-    return rt.Pose(**told, tilts_first=flag)
+    tensors = {name: number if isinstance(number, torch.Tensor) else real(number) for name, number in numbers.items()}
+    return rt.Pose(**tensors, tilts_first=flag)
 
 
 def _minus(number):
@@ -20,8 +20,8 @@ def _minus(number):
 
 def flipped(surface: rt.Surface) -> rt.Surface:
     """A surface for light that runs the other way along z."""
-    told = {name: _minus(getattr(surface, name)) for name in ("thickness", "curvature", "coefficients")}
-    return dataclasses.replace(surface, **told)
+    changes = {name: _minus(getattr(surface, name)) for name in ("thickness", "curvature", "coefficients")}
+    return dataclasses.replace(surface, **changes)
 
 
 def inserted(lens: rt.Lens, behind: int, new: list[rt.Surface], rest=lambda surface: surface) -> rt.Lens:
@@ -35,8 +35,8 @@ def folded(lens: rt.Lens, behind: int, share: float = 0.5, **tilts) -> rt.Lens:
     """The lens with a plane mirror in the gap behind a surface, at a share of it; its axes follow the light."""
     gap = lens.surfaces[behind].thickness
     # With R = Rx Ry the mirror turns the axes by R D Rᵀ D, D = diag(1, 1, -1): R before it, Ry Rx behind.
-    told = {"before": pose(**tilts), "after": pose(**tilts, tilts_first=True)}
-    mirror = rt.Surface(thickness=(share - 1) * gap, glass=rt.MIRROR, **told)
+    poses = {"before": pose(**tilts), "after": pose(**tilts, tilts_first=True)}
+    mirror = rt.Surface(thickness=(share - 1) * gap, glass=rt.MIRROR, **poses)
     return inserted(lens.replace(behind, thickness=share * gap), behind, [mirror], flipped)
 
 

@@ -110,7 +110,7 @@ def _floor(name: str) -> int:
 
 
 def walks() -> dict[str, Callable[[], object]]:
-    """One refraction at a sphere, the PSF of traced rays, and a training step of lens and network."""
+    """One refraction at a sphere, the PSF of traced rays, a cycle of optimize, and a training step."""
     lens = rt.read_lens("double_gauss").at(object_distance=25e3)
     first, second = media(lens, lens.wavelengths[:1])[:2]
     start, along = (torch.tensor(v, dtype=torch.float64)[:, None] for v in ([0.0, 5.0, 0.0], [0.0, 0.0, 1.0]))
@@ -118,10 +118,12 @@ def walks() -> dict[str, Callable[[], object]]:
     pictures, distances = torch.rand(2, 84, 84), torch.tensor([2e4, 3e4], dtype=torch.float64)
     rays = rt.Rays(start, along, torch.ones(1, dtype=torch.bool))
     psf, read_lens = rt.psf, rt.read_lens
+    optimize, triplet = rt.optimize, rt.read_lens("cooke_triplet")
     return {
         "read_lens": lambda: read_lens("double_gauss"),
         "refraction": lambda: cross(lens.surfaces[1], rays, None, 1, first, second),
         'psf(lens, "drt")': lambda: psf(lens, "drt"),
+        "optimize": lambda: optimize(triplet, merit="spot", vary="curvature", cycles=1),
         "training step": lambda: (camera(pictures, distances) - camera.target(pictures)).abs().mean().backward(),
     }
 

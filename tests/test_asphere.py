@@ -110,7 +110,7 @@ def test_root_of_a_batch_equals_roots_one_by_one():
 
 
 @pytest.mark.parametrize("kind", ["curvature", "conic", "coefficients", "position"])
-def test_derivatives_through_the_search_with_lost_rays(kind):
+def test_derivatives_through_the_search_with_failed_rays(kind):
     """First and second derivatives of the hit, in a batch with a ray that misses and one found by the bracket."""
     numbers = {
         "curvature": tensor(0.01),

@@ -10,6 +10,7 @@ import pytest
 import torch
 from systems_beyond import SYSTEMS, error_of, spectrometer
 
+from raytrace.bench import trace
 from raytrace.bench.measure import (
     SAMPLE,
     Own,
@@ -39,6 +40,14 @@ BOUNDS = {"float32": (100.0, 0.1, 1e-3), "float64": (1e-6, 1e-8, 1e-11)}
 
 def tensor(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_rays_of_the_reference():
+    """Of the command: its reference by differences in many digits takes a second for 24 rays of each tracer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trace, "SAMPLE", 6)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,7 @@ def processes(monkeypatch):
     monkeypatch.setattr(extended, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
     monkeypatch.setattr(extended, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
     monkeypatch.setattr(timing, "SHORTEST", 0.0)  # one call a turn
+    monkeypatch.setattr(speed, "SAMPLE", 6)
 
 
 @pytest.fixture(scope="module")

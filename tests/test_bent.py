@@ -16,11 +16,11 @@ from raytrace.tracing.focus import along_normal, focus_of_rms
 from raytrace.tracing.scene import symmetry
 from raytrace.tracing.wavefront import rms, wavefront_of
 
-FIELDS = [0.0, 7.0, 14.0]
+FIELDS = [0.0, 14.0]
 
 
 def lens_in_focus() -> rt.Lens:
-    return rt.focus(rt.read_lens("double_gauss")).lens.at(fields=FIELDS, wavelengths=[0.5876, 0.4861, 0.6563])
+    return rt.focus(rt.read_lens("double_gauss")).lens.at(fields=FIELDS, wavelengths=[0.5876, 0.4861])
 
 
 def folds(lens: rt.Lens) -> dict[str, rt.Lens]:
@@ -202,7 +202,7 @@ def test_a_spectrum_stands_apart_on_the_sensor():
     )
 
 
-def test_lost_rays_behind_turned_axes_are_no_wavefront():
+def test_failed_rays_behind_turned_axes_are_no_wavefront():
     """A ray that missed a surface has numbers of its own behind a fold: they are not taken for a vignetted ray's."""
     lens = rt.lens(
         [{"thickness": 20.0}, {"radius": 12.0, "thickness": 4.0, "glass": 1.5}, {"radius": -12.0, "thickness": 14.0}],
@@ -234,7 +234,7 @@ def test_derivatives_by_tilts():
             scene_of(lens, torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)), points, weights
         )
         mtf = rt.mtf(lens, [5.0], geometric=True)
-        kernel = rt.psf(lens, rt.Gaussian(order=3), center="axis", size=9, pixel=0.2).kernel
+        kernel = rt.psf(lens, rt.Gaussian(order=3), center="axis", size=5, pixel=0.36).kernel
         return rt.spot(lens, rings=4).mean_square_radius, 1e3 * rms(front), mtf.tangential, mtf.sagittal, kernel
 
     at = [real(number).requires_grad_() for number in (3.0, 0.5)]
@@ -287,7 +287,7 @@ def test_two_foci_show_in_focus_field_curvature_and_mtf():
 
 
 def test_models_of_one_focus_refuse_two():
-    with pytest.raises(Bent, match=r"needs one focus, but surface 1 bends light differently along x and y; take model"):
+    with pytest.raises(Bent, match=r"needs one focus, but surface 1 has different powers along x and y; take model"):
         rt.psf(cylinders(), "paraxial")
     with pytest.raises(Bent, match="needs one focus"):
         rt.psf(cylinders(), "fourier")

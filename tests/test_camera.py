@@ -131,7 +131,7 @@ def test_a_lens_user_learns_lens_and_network_in_a_few_lines():
     assert MICROMETRE < abs(own.variables.numbers()["sensor"] - start) < 11 * MICROMETRE
 
 
-def test_experiment_starts_where_it_is_told():
+def test_experiment_starts_where_it_is_asked():
     lens, wavelength = read_lens(LENS), number(0.53)
     by_start = {s: lens_at_start(lens, CodesignSettings(start=s)) for s in ("paraxial", "rms", "58.1")}
     places = {s: float(one.surfaces[-2].thickness) for s, one in by_start.items()}

@@ -174,7 +174,7 @@ def test_a_name_of_two_glasses_is_reported_unless_the_lens_file_decides():
         find_glass("N-BK7")
 
 
-def test_capitals_and_small_letters_are_not_told_apart_and_the_name_stays_as_written():
+def test_capitals_and_small_letters_are_not_distinguished_and_the_name_stays_as_written():
     glass = find_glass("n-bk7hti", catalogs=["SCHOTT"])
     assert (glass.name, glass.listed_name) == ("n-bk7hti", "N-BK7HTi")
 
@@ -404,7 +404,7 @@ def test_what_is_left_aside_is_said(tmp_path):
         assert read_agf(path).glasses["ONE"].nd_listed == 1.5168
 
 
-def test_the_edition_of_a_glass_is_told(tmp_path):
+def test_the_edition_of_a_glass_is_reported(tmp_path):
     """By the sources of a shipped glass, by the comment of a user's one; and where a newer edition is in use."""
     assert re.match(r"date not stated; \d+ sources agree: .*SCHOTT", catalogs.edition(find_glass("N-BK7"))[0])
     for (catalog, name), (newer, _) in catalogs.OLDER_EDITIONS.items():

@@ -33,7 +33,7 @@ def test_nanometres_are_refused_by_every_command(run, command):
 
 
 @pytest.mark.parametrize("command", ["info", "spot", "focus", "trace", "psf --model paraxial", "distortion", "layout"])
-def test_extrapolation_is_told_once_for_each_glass(run, command):
+def test_extrapolation_is_reported_once_for_each_glass(run, command):
     verb, *options = command.split()
     found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if verb == "layout" else []))
     assert found.code == 0
@@ -42,7 +42,7 @@ def test_extrapolation_is_told_once_for_each_glass(run, command):
     assert warned[0].endswith("is extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm")
 
 
-def test_extrapolation_is_told_of_a_wavelength_of_codesign(run):
+def test_extrapolation_is_reported_of_a_wavelength_of_codesign(run):
     found = run("codesign", "double_gauss", "--loss", "spectral", "--wavelength", 3, "--data", "missing")
     assert found.err.count("is extrapolated to 3 µm") == 3
 
@@ -64,7 +64,7 @@ NA = {"ENPD 12.5": "OBNA 0.1 0", "DISZ INFINITY": "DISZ 200"}
 
 
 @pytest.mark.parametrize("command", ["spot", "spot --rays 500", "focus --field 0", "compare"])
-def test_an_object_na_far_away_is_told_with_what_would_hold_the_beam(run, command):
+def test_an_object_na_far_away_is_reported_with_what_would_hold_the_beam(run, command):
     """An entrance pupil of 5 m in front of a lens of 12 mm."""
     text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
     for old, new in NA.items():

@@ -264,7 +264,7 @@ WRONG = {
     "folder": (["--data", "nowhere"], "nowhere: no such folder"),
     "empty": (["--data", "."], r"\.: no pictures found"),
     "small": (["--patch", "64"], "none of 10 pictures has 70 × 70 pixels"),
-    "variables": (["--vary", "radius:3"], "'radius:3': surface 3 has no radius; it has thickness, curvature, conic"),
+    "variables": (["--vary", "radius:3"], "'radius:3': expected a number of a lens; did you mean curvature"),
     "surface": (["--vary", "thickness:99"], "surface 99; this lens has surfaces 1 to 11 to vary"),
     "range": (["--near", "60000"], "--near 60000 is not nearer than --far 50000"),
     "start": (
@@ -276,7 +276,7 @@ WRONG = {
     "resume": (["--resume"], "out: no run was begun here"),
     "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
     "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8,12"),
-    "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables: sensor"),
+    "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables"),
     "field": (["--field", "95"], "a field angle is below 90 degrees"),
 }
 

@@ -103,7 +103,7 @@ def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
             assert f is None or not f.any()
             continue
         assert torch.isfinite(f).all()
-        # Sums over rays of both signs: what cancels is told by the largest of a kind.
+        # Sums over rays of both signs: compared with the largest of their kind.
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 

@@ -121,7 +121,7 @@ def test_the_tangents_are_those_of_torch(name, dtype, close):
 
 
 @two_of_each
-def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
+def test_gradients_by_differences_and_their_gradients_with_failed_rays(name):
     face = FACES[name]
     rays = Rays(*(part[..., 46:54] for part in (some_rays().position, some_rays().direction, some_rays().valid)))
 

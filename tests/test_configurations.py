@@ -213,7 +213,7 @@ def test_configurations_are_made_from_plain_numbers(tmp_path):
     for wrong, said in (
         ({"glass": {1: [1.5]}}, "'glass' does not differ"),
         ({"thickness": {99: [1.0]}}, "surface 99"),
-        ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "as many"),
+        ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "lists of values of one length"),
     ):
         with pytest.raises(ValueError, match=said):
             lens.with_configurations(**wrong)
@@ -237,7 +237,7 @@ def test_a_configuration_that_is_not_there_is_refused():
         ("THIC 1 {} 1e{}99", "too large"),
     ],
 )
-def test_what_is_not_followed_is_told_and_the_configuration_refused(line, said):
+def test_what_is_not_followed_is_reported_and_the_configuration_refused(line, said):
     text = file(tail=operands(line.format(1, 0), line.format(2, 7)))
     lens, report = read(text)
     number = text.splitlines().index(line.format(1, 0)) + 1
@@ -248,7 +248,7 @@ def test_what_is_not_followed_is_told_and_the_configuration_refused(line, said):
         read(text, configuration=2)
 
 
-def test_an_operand_of_an_aperture_that_is_not_stored_is_told_and_its_configuration_refused():
+def test_an_operand_of_an_aperture_that_is_not_stored_is_reported_and_its_configuration_refused():
     lens, report = read(file(tail=operands("APMX 1 1 5 0 0", "APMX 1 2 3 0 0")))
     assert any("APMX" in warning and "no such part" in warning for warning in report.warnings)
     assert lens.surfaces[1].apertures == ()
@@ -256,7 +256,7 @@ def test_an_operand_of_an_aperture_that_is_not_stored_is_told_and_its_configurat
         lens.configuration(2)
 
 
-def test_operands_that_contradict_the_surfaces_are_told_with_line_and_number():
+def test_operands_that_contradict_the_surfaces_are_reported_with_line_and_number():
     text = file(tail=operands("CRVT 1 1 0.021 0 0", "CRVT 1 2 0.03 0 0", "THIC 1 1 4 0 0", "THIC 1 2 5 0 0"))
     warnings = read(text)[1].warnings
     line = text.splitlines().index("CRVT 1 1 0.021 0 0") + 1
@@ -276,7 +276,7 @@ def test_unknown_known_and_missing_operands_are_reported():
         assert piece in said
 
 
-def test_what_rays_are_solved_for_is_told_where_operands_bend_them():
+def test_what_rays_are_solved_for_is_reported_where_operands_bend_them():
     solved = {"stop": "MAZH 0 0"}
     text = file(tail=two("THIC", 1, "4", "5"), **solved)
     assert any(

@@ -6,7 +6,6 @@ import inspect
 import json
 import pkgutil
 import re
-import subprocess
 import sys
 
 import pandas as pd
@@ -43,11 +42,6 @@ def test_every_public_name_is_what_the_table_says_when_all_of_the_package_is_imp
         defined = getattr(importlib.import_module(f"raytrace.{module}"), own or name)
         assert (found.__wrapped__ if inspect.isfunction(found) else found) is defined, name
         assert not isinstance(found, type(sys)), name
-
-
-def test_importing_the_package_loads_no_torch():
-    code = "import raytrace, sys; sys.exit(bool({'torch', 'pandas', 'matplotlib'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
 
 
 def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):
@@ -138,7 +132,7 @@ def test_conditions_are_those_asked_for_and_the_rest_stays():
         (lambda lens: rt.lens(ROWS, stop=1, f_number=4, field_kind="angles"), "expected one of angle"),
     ],
 )
-def test_what_makes_no_lens_is_told(call, said):
+def test_what_makes_no_lens_is_reported(call, said):
     lens = rt.lens(ROWS, stop=1, f_number=5)
     with pytest.raises(ValueError, match=re.escape(said)):
         call(lens)
@@ -201,7 +195,7 @@ def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
 
     slope = (merit(curvature.detach() + step) - merit(curvature.detach() - step)) / (2 * step)
     assert float(curvature.grad) == pytest.approx(slope, rel=1e-5)
-    assert found.to_frame().rms_radius.tolist() == found.rms_radius.flatten().tolist()
+    assert found.to_frame().rms_radius_um.tolist() == (1e3 * found.rms_radius).flatten().tolist()
     assert len(found.plot(tmp_path / "spot.png").axes) == 2
     assert (tmp_path / "spot.png").stat().st_size > 0
     found.save(tmp_path / "rays.csv")
@@ -429,7 +423,7 @@ ANALYSES = (
     ),
     ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
-    ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms", "all, weighted"),
+    ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms_um", "all, weighted"),
     ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "diffraction_limit", "1/mm"),
     (
         "mtf",

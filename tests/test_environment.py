@@ -107,12 +107,12 @@ def test_vacuum_of_the_catalog_is_vacuum_everywhere():
 
 
 @pytest.mark.parametrize("glass", [constant(1.333, "WATER"), model_glass(1.517, 64.2), AIR])
-def test_a_medium_told_by_numbers_keeps_its_index_beside_the_air_around_it(glass):
+def test_a_medium_given_by_numbers_keeps_its_index_beside_the_air_around_it(glass):
     line = float64([0.45, 0.6])
-    told = refractive_index(glass, line)
-    assert torch.equal(index_in(glass, line, place(60.0, 0.2)), told)
+    expected = refractive_index(glass, line)
+    assert torch.equal(index_in(glass, line, place(60.0, 0.2)), expected)
     beside = index_in(glass, line, place(20.0, 1.0), place(20.0, 0.0)) * air_index(line, 20.0, 1.0)
-    assert (beside - told).abs().max() <= 3e-16
+    assert (beside - expected).abs().max() <= 3e-16
 
 
 @pytest.mark.parametrize("name", ["N-BK7", "S-FPL53", "GERMANIUM", "H-ZF52"])
@@ -264,7 +264,7 @@ def test_temperatures_side_by_side():
     assert len(set(alone)) == 3
 
 
-# -- what is refused, and what is told --------------------------------------------------------------------------------
+# -- refusals and warnings -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -288,15 +288,15 @@ def test_a_surface_in_an_air_that_there_is_not_is_refused():
         lens.at(f_number=4)
 
 
-def test_a_glass_whose_change_is_not_known_is_told_once_with_its_surface():
+def test_a_glass_whose_change_is_not_known_is_reported_once_with_its_surface():
     rows = [dict(radius=50.0, thickness=5.0, glass=glass) for glass in ("LZ_K8", (1.6, 40.0), "LZ_K8", "N-BK7")]
     lens = rt.lens(rows, stop=1, f_number=8)
     with pytest.warns(NoThermalCoefficients) as caught:
         lens.at(temperature=40)
-    told = [str(warning.message) for warning in caught]
-    assert len(told) == 2
-    assert told[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it keeps its index")
-    assert told[1].startswith("surface 2: the medium of index 1.6 is not of a catalog")
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 2
+    assert messages[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it keeps its index")
+    assert messages[1].startswith("surface 2: the medium of index 1.6 is not of a catalog")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens.at(temperature=20, pressure=1)
@@ -461,7 +461,7 @@ def test_pressures_with_no_surface_between_them_hold_for_none(tmp_path):
         ("hot 1 1", None, r"cell.zmx:4: .*temperature is 'hot', expected a finite number"),
     ],
 )
-def test_environment_of_a_file_is_followed_or_told(tmp_path, environment, kept, said):
+def test_environment_of_a_file_is_followed_or_reported(tmp_path, environment, kept, said):
     path = cell_file(tmp_path, environment, "")
     if said:
         with pytest.raises(rt.LensFileError, match=said):

@@ -77,12 +77,12 @@ def test_the_miss_of_the_stop_is_that_of_traced_rays():
     assert found.chief[0] < 1e-12 < TOLERANCE < found.chief[2]
 
 
-def test_a_beam_that_misses_the_stop_is_told_once_with_figures_and_a_remedy(capsys):
+def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(capsys):
     lens = fisheye()
     with pytest.warns(UnfilledStop, match=r"field 40 degrees: rays miss the stop, .* chief ray by .* % of it from the "
-                      r"centre, marginal rays by .* \(1 of 2 fields .*`ray_aiming=real`") as told:  # fmt: skip
+                      r"centre, marginal rays by .* \(1 of 2 fields .*`ray_aiming=real`") as warned:  # fmt: skip
         rt.spot(lens, fields=[0, 40])
-    assert len(told) == 1
+    assert len(warned) == 1
     for verb in (rt.layout, rt.ray_fan, rt.wavefront, rt.mtf, rt.psf, rt.trace, rt.focus, rt.relative_illumination):
         with pytest.warns(UnfilledStop, match="field 40 degrees"):
             verb(lens, fields=[40])
@@ -98,9 +98,9 @@ def test_a_beam_that_misses_the_stop_is_told_once_with_figures_and_a_remedy(caps
     from raytrace.cli import main
 
     assert main(["spot", "retrofocus", "--ray-aiming", "off"]) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "miss the stop" in line]
-    assert len(told) == 1
-    assert "--ray-aiming real aims them" in told[0]
+    messages = [line for line in capsys.readouterr().err.splitlines() if "miss the stop" in line]
+    assert len(messages) == 1
+    assert "--ray-aiming real aims them" in messages[0]
 
 
 #: Commands that trace no rays of a lens whose aiming may be chosen.
@@ -138,8 +138,8 @@ def test_the_entrance_pupil_of_a_sequence_is_that_of_the_real_beam_on_the_axis()
     assert rim[1, 1].item() == pytest.approx(25.0, abs=1e-6)
     assert launch(lens, RIM, ray_aiming="paraxial").position[1, 0, 0, 1].item() > 25.1  # of the paraxial stop
     assert any("EPD holds on the axis" in note for note in report.notes)
-    told, report = read(SEQUENCE.replace("GO\n", "!raytrace aiming paraxial\nGO\n"))
-    assert told.ray_aiming == "paraxial"
+    lens, report = read(SEQUENCE.replace("GO\n", "!raytrace aiming paraxial\nGO\n"))
+    assert lens.ray_aiming == "paraxial"
     assert not any("aiming" in note for note in report.notes)
 
 

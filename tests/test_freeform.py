@@ -166,7 +166,7 @@ LONG = dict.fromkeys(("fringe", "irregular", "polynomial on a toroid"), pytest.m
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=LONG.get(name, ())) for name in ALL])
-def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
+def test_derivatives_of_the_hit_by_every_number_with_failed_rays(name):
     surface = ALL[name]
     position = vector(0.3, 2.0, -1.5, 900.0, 0.4, -1.0, 2.2, 900.0, -9.0, -8.0, -9.0, -7.0).reshape(3, 4)
     direction = vector(0.1, -0.2, 0.05, 0.0, -0.1, 0.1, 0.2, 0.0, 1.0, 1.0, 1.0, 1.0).reshape(3, 4)

@@ -117,9 +117,9 @@ def test_commands_warn_with_one_wording(command, tmp_path, capsys):
         "optimize": ["--merit", "spot", "--vary", "sensor", "--cycles", "1"],
     }
     assert main([command, str(path), *more.get(command, [])]) == 0
-    told = capsys.readouterr()
+    output = capsys.readouterr()
     words = "warning: surface 2 does not reach its semi-diameter of 10 mm: it closes at 9.84252 mm"
-    assert words in (told.out if command == "check" else told.err)
+    assert words in (output.out if command == "check" else output.err)
 
 
 def test_python_warns_too():

@@ -142,7 +142,7 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
     assert found.no_optimum == ""
 
 
-def test_a_held_space_below_nothing_is_told_with_the_end_of_the_sensor(lens):
+def test_a_held_space_below_nothing_is_reported_with_the_end_of_the_sensor(lens):
     """It has no bounds of its own, while the sensor stands at an end of its bounds."""
     bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
     own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))

@@ -76,7 +76,7 @@ def test_a_point_becomes_the_kernel():
 
 
 @pytest.mark.parametrize(("origin", "shift"), [("pixel", -0.5), ("grid", 0.0)])
-def test_an_even_symmetric_kernel_shifts_by_half_a_pixel_unless_told(origin, shift):
+def test_an_even_symmetric_kernel_shifts_by_half_a_pixel_unless_given(origin, shift):
     """A wave stays in phase, or lags by half a pixel: what a PSF on an even Grid does."""
     x = torch.arange(32, dtype=torch.float64)
     wave = (2 * math.pi * 3 / 32 * x).cos().expand(16, 32)

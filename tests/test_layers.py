@@ -186,11 +186,10 @@ def test_every_entry_of_the_table_of_floors_is_a_number_and_no_module_is_unnamed
         assert isinstance(floor(name), int)
 
 
-@pytest.mark.parametrize("library", ["matplotlib", "pandas", "scipy", "tqdm"])
-def test_importing_the_package_loads_no(library):
-    code = f"import raytrace, sys; sys.exit({library!r} in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, timeout=120)
-    assert done.returncode == 0, f"import raytrace loads {library}"
+def test_importing_the_package_loads_no_other():
+    code = "import raytrace, sys; print({'torch', 'matplotlib', 'pandas', 'scipy', 'tqdm'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, timeout=120, capture_output=True, text=True)
+    assert done.stdout == "set()\n", done
 
 
 #: What may not stand in a physics file, and why (docstrings and comments are not code and are not read).

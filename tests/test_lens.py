@@ -1,4 +1,4 @@
-"""Lens: wavelengths in another unit are refused, glasses used outside their range are told of, at every door."""
+"""Lens: wavelengths in another unit are refused, glasses used outside their range are warned of, everywhere."""
 
 import dataclasses
 import warnings
@@ -58,14 +58,14 @@ def test_the_range_of_a_glass_is_believed_beyond_the_bounds():
 
 def test_extrapolated_glasses_are_named_with_their_range_each_once():
     gauss = read_lens(LENSES / "double_gauss.zmx")
-    with pytest.warns(OutOfRange) as told:
+    with pytest.warns(OutOfRange) as warned:
         moved = with_wavelengths(gauss, [3.0], where="gauss")
-    assert [str(w.message).split(" is ")[0] for w in told] == [
+    assert [str(w.message).split(" is ")[0] for w in warned] == [
         "gauss, surface 1: SK2 (SCHOTT)",
         "gauss, surface 3: SK16 (SCHOTT)",
         "gauss, surface 4: F5 (SCHOTT)",
     ]
-    assert "extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm" in str(told[0].message)
+    assert "extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm" in str(warned[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with_wavelengths(moved, [3.0, 0.55])  # known since the lens has it

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import pytest
 import torch
@@ -36,8 +37,7 @@ def bound(what):
     return next((most for model, most in RULES.items() if is_rule and f"{model} " in what), ROUNDING)
 
 
-def double_gauss() -> Lens:
-    return read_lens("double_gauss")
+double_gauss = partial(read_lens, "double_gauss")
 
 
 def _traced(count: int) -> dict[str, tuple[Callable, Callable]]:

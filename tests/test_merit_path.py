@@ -291,7 +291,7 @@ LOST = (0.0, 2.4)  # a pupil point whose ray misses a surface, and one whose fie
     "conventions", [Conventions(), Conventions(opd_tilt="common", opd_chief="primary", opd_sign="shorter")]
 )
 @pytest.mark.parametrize("operand", ["OPDC", "OPDM", "OPDX", "OPTH", "PLEN"])
-def test_derivatives_with_lost_rays(operand, conventions):
+def test_derivatives_with_failed_rays(operand, conventions):
     lens = rt.read_lens("cooke_triplet")
     last = len(lens.surfaces) - 1
     asked = rows(operand, fields=[(0.0, 0.7), (0.4, 0.6)], points=[*POINTS, LOST])

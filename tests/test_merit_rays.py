@@ -36,7 +36,7 @@ def test_derivatives(name):
 
 
 @pytest.mark.parametrize("name", ["near", "double Gauss"])
-def test_rows_of_lost_rays_do_not_move_and_leave_the_others_alone(name):
+def test_rows_of_failed_rays_do_not_move_and_leave_the_others_alone(name):
     """Each counts as an error of LOST; the others are what they are without them."""
     model = model_of(name)
     kept = [Row("TRAR", (0, 1), (0.0, 0.6, 0.3, 0.5), 0.0, 1.0), Row("REAY", (3, 1), (0.0, 0.6, 0.3, 0.5), 0.0, 1.0)]

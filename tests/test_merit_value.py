@@ -68,7 +68,7 @@ def test_rows_of_arithmetic_keep_to_their_rows_when_they_move(lens, spot):
     assert float(alone.values[2]) == pytest.approx(float(alone.values[1] / alone.values[0]), rel=1e-12)
 
 
-def test_configurations_are_told_apart(lens):
+def test_configurations_are_distinguished(lens):
     zoom = lens.with_configurations(thickness={6: [12.4281, 16.0], 11: [57.9, 52.0]})
     found = rt.evaluate(zoom, merit="spot")
     assert {*found.configurations.tolist()} == {1, 2}
@@ -142,7 +142,7 @@ def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
     assert edged.rows[-1].target == pytest.approx(0.1)
 
 
-def test_lost_rays_are_told(lens):
+def test_failed_rays_are_reported(lens):
     wide = lens.at(fields=[0, 80])
     found = rt.evaluate(wide, merit="spot")
     assert bool(found.lost.any())
@@ -185,9 +185,9 @@ def test_the_command_says_what_the_verb_does(command):
     assert [*document] == ["analysis", "merit", "unit", "skipped", "results"]
     assert document["results"][0] == {
         **{"row": 3, "configuration": 1, "operand": "TRAC", "target": 0.0, "lost": False},
-        **{name: document["results"][0][name] for name in ("arguments", "weight", "value", "contribution")},
+        **{name: document["results"][0][name] for name in ("arguments", "weight", "value", "contribution_percent")},
     }
-    assert sum(one["contribution"] for one in document["results"]) == pytest.approx(1)
+    assert sum(one["contribution_percent"] for one in document["results"]) == pytest.approx(100)
 
 
 def test_boundaries_are_rows_of_the_command(command):

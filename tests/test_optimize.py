@@ -195,8 +195,8 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
     variables = tuple(Vary(k, "curvature") for k in (1, 2, 3))
     ends = []
     for unit in (1.0, 25.4):
-        told = dataclasses.replace(triplet, optimization_data=OptimizationData(variables, (), rows, unit=unit))
-        ends.append(rt.optimize(told))
+        in_unit = dataclasses.replace(triplet, optimization_data=OptimizationData(variables, (), rows, unit=unit))
+        ends.append(rt.optimize(in_unit))
     assert ends[0].merit_after == pytest.approx(25.4 * ends[1].merit_after, rel=1e-9)
     assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-6)
 
@@ -268,7 +268,7 @@ def bent_too_far(lens):
     return lens.replace(4, curvature=torch.tensor(-0.06, dtype=torch.float64))
 
 
-def test_what_a_lost_ray_misses_by_has_the_derivative_of_differences(triplet):
+def test_what_a_failed_ray_misses_by_has_the_derivative_of_differences(triplet):
     problem = problem_of(bent_too_far(triplet), "curvature thickness")
     x = problem.model.start
     found = problem.evaluated(x)
@@ -300,17 +300,17 @@ def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
     words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary"]
     done = command_line(*words, "curvature sensor", "--json", "-o", "better.zmx", "--cycles", 6)
     assert done.code == 0, done.err
-    told = done.document
-    assert [*told] == [
+    document = done.document
+    assert [*document] == [
         "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
         "conditions",
     ]  # fmt: skip
-    assert [*told["variables"][0]] == ["name", "before", "after"]
-    assert [*told["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
-    assert told["cycles"] <= 6
+    assert [*document["variables"][0]] == ["name", "before", "after"]
+    assert [*document["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
+    assert document["cycles"] <= 6
     own = command_line("optimize", "better.zmx", "--json", "--cycles", 1).document
-    assert own["merit_before"] == pytest.approx(told["merit_after"], rel=1e-9)
-    assert sorted(one["name"] for one in own["variables"]) == sorted(one["name"] for one in told["variables"])
+    assert own["merit_before"] == pytest.approx(document["merit_after"], rel=1e-9)
+    assert sorted(one["name"] for one in own["variables"]) == sorted(one["name"] for one in document["variables"])
 
 
 def test_log_checkpoint_and_resume(command_line, tmp_path):
@@ -338,7 +338,7 @@ def test_log_checkpoint_and_resume(command_line, tmp_path):
         (["--merit", "spots", "--vary", "curvature"], "did you mean spot"),
     ],
 )
-def test_what_cannot_be_optimised_is_told_in_a_line(words, said, command_line):
+def test_what_cannot_be_optimised_is_reported_in_a_line(words, said, command_line):
     assert said in command_line("optimize", "cooke_triplet", *words).error
 
 

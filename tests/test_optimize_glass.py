@@ -120,7 +120,7 @@ def test_the_expansion_of_a_linear_merit_is_what_the_others_reach():
 
 
 @pytest.mark.slow
-def test_what_is_foretold_ranks_what_is_reached(triplet):
+def test_what_is_predicted_ranks_what_is_reached(triplet):
     """Spearman's correlation, over glasses from all of the map, each optimised in place of the last one's."""
     choice = choice_of(triplet)
     start = least_squares(

@@ -496,7 +496,7 @@ def test_glasses_are_looked_up_and_never_replaced():
     assert torch.equal(found.surfaces[1].glass.coefficients, find_glass("N-BK7").coefficients)
 
 
-def test_commands_that_change_nothing_are_told_with_their_reason():
+def test_commands_that_change_nothing_are_reported_with_their_reason():
     surfaces = (FAR, "RD 50; GLA N-BK7; TH 4; TCE 71; DRW ON; LMO ELE; TOX 0", "RD -50; TH 40")
     _, report = read(surfaces, "EBR 5; TELE OFF; FOO 1", tail="CFG NEW\nTH 1 2 8\nEND\n")
     statuses = {keyword.name: (keyword.status, keyword.reason) for keyword in report.keywords}

@@ -90,7 +90,7 @@ def test_a_result_that_cannot_be_saved_is_printed(lens, command_line, monkeypatc
         assert document.document
 
 
-def test_what_a_search_cannot_write_is_told_and_its_minima_are_printed(lens, command_line, monkeypatch):
+def test_what_a_search_cannot_write_is_reported_and_its_minima_are_printed(lens, command_line, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device", "minimum_01.zmx")
 

@@ -241,16 +241,16 @@ def test_the_chief_ray_s_slope_and_the_pupils_keep_lagrange_s_invariant(system):
     assert data.angular_magnification.abs().item() == pytest.approx(ratio.item(), rel=1e-12)
 
 
-def test_the_invariant_is_the_same_however_the_field_is_told():
+def test_the_invariant_is_the_same_however_the_field_is_given():
     """Angle, object height and image height of one field: |n ū y| = |n u h| = |n′ u′ h′|."""
     system = with_object_distance(thick_lens(), 300.0)
     data = first_order(system)
     angle = 6.0
     height = math.tan(math.radians(angle)) * (300.0 + float(data.entrance_pupil_position))
-    told = {"angle": angle, "object_height": height, "paraxial_image_height": height * float(data.magnification)}
+    sizes = {"angle": angle, "object_height": height, "paraxial_image_height": height * float(data.magnification)}
     found = [
         first_order(dataclasses.replace(system, fields=fields(kind, (y,)))).optical_invariant.item()
-        for kind, y in told.items()
+        for kind, y in sizes.items()
     ]
     assert found == pytest.approx([found[0]] * 3, rel=1e-12)
 

@@ -151,7 +151,7 @@ def one_surface(curvature: float, index: float, aperture: float, apertures: tupl
         (-1 / 40, 9.0, (Aperture("circular", (0.0, 5.0)),), "vignetted"),
     ],
 )
-def test_a_lost_ray_ends_at_the_surface_that_lost_it(curvature, aperture, apertures, status):
+def test_a_failed_or_vignetted_ray_ends_at_its_surface(curvature, aperture, apertures, status):
     lens = one_surface(curvature, 1.5, aperture, apertures)
     (paths,) = fans(lens, 3)
     assert [path.status for path in paths] == [status, "ok", status]
@@ -224,7 +224,7 @@ def test_printed_radii_are_those_of_the_spot():
     assert "Field angle 8.4°" in text
 
 
-def test_wavelengths_that_are_given_weigh_the_same_unless_told():
+def test_wavelengths_that_are_given_weigh_the_same_unless_given():
     lens = dataclasses.replace(read_lens("cooke_triplet"), wavelength_weights=number([1.0, 2.0, 1.0]))
     assert shares_of(lens, None, None).tolist() == [1, 2, 1]
     assert shares_of(lens, number([0.5, 0.6]), None).tolist() == [1, 1]

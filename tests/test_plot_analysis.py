@@ -100,7 +100,7 @@ def test_curves_are_drawn_finer_than_they_are_printed_and_what_was_asked_is_mark
             assert min(np.abs(y - mark.get_ydata()).max() for y in near) < 0.01
 
 
-def test_mtf_through_focus_is_smooth_and_passes_through_what_is_told():
+def test_mtf_through_focus_is_smooth_and_passes_through_the_value_reported():
     found = rt.mtf(read_lens(LENSES / "cooke_triplet.zmx"), [20], through_focus=0.3, geometric=True, fields=[0, 10])
     (panel,) = found.plot().axes
     lines = curves(panel)

@@ -23,10 +23,10 @@ def test_a_pose_is_the_matrices_of_its_definition(tilts_first):
     x, y, z = (rotation(axis, SOME[f"tilt_{axis}"]) for axis in "xyz")
     d = torch.tensor([SOME["x"], SOME["y"], SOME["z"]], dtype=torch.float64)
     old = z @ y @ x @ (new + d) if tilts_first else d + x @ y @ z @ new
-    told = torch.stack(list(point_in(pose(**SOME, tilts_first=tilts_first), old.unbind(0))))
-    assert (told - new).abs().max() < 1e-14
+    inside = torch.stack(list(point_in(pose(**SOME, tilts_first=tilts_first), old.unbind(0))))
+    assert (inside - new).abs().max() < 1e-14
     there = pose(**SOME, tilts_first=tilts_first)
-    assert (torch.stack(list(point_out(there, told.unbind(0)))) - old).abs().max() < 1e-14
+    assert (torch.stack(list(point_out(there, inside.unbind(0)))) - old).abs().max() < 1e-14
     way = direction_out(there, direction_in(there, old.unbind(0)))
     assert (torch.stack(list(way)) - old).abs().max() < 1e-14
 

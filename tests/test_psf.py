@@ -111,7 +111,7 @@ def test_a_psf_is_a_table_a_document_and_words(per_wavelength):
         assert [row.field_x, row.field_y] == entry["field"]
         assert row.object_distance == (entry["object_distance"] or math.inf)
         assert [row.centroid_x, row.centroid_y] == entry["centroid"]
-        assert row.sigma_x**2 == pytest.approx(entry["covariance"][0][0], rel=1e-12)
+        assert (1e-3 * row.sigma_x_um) ** 2 == pytest.approx(entry["covariance"][0][0], rel=1e-12)
         assert row.energy == entry["energy"]
         assert f"{row.energy:.4f}" in line
         assert not per_wavelength or row.wavelength == entry["wavelength"]

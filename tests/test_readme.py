@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.cli import main
+from raytrace.bench import trace
+from raytrace.cli import codesign_run, main
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -73,6 +74,8 @@ def test_extras_that_the_readme_installs_exist():
 def test_examples_run(line, tmp_path, monkeypatch, capsys):
     (tmp_path / "lenses").symlink_to(ROOT / "lenses")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(codesign_run, "_LEAVES", 16)  # pictures: a hundred take 8 s to draw
+    monkeypatch.setattr(trace, "SAMPLE", 6)
     assert main(shlex.split(line)) == 0, capsys.readouterr().err
     words = shlex.split(line)
     for option in ("-o", "--plot"):

@@ -6,7 +6,7 @@ from test_zemax_types import CASES, read, text
 import raytrace as rt
 from raytrace.tracing.lens_report import entries, remarks
 
-TOLD = {
+REMARKS = {
     "standard": [],
     "break": ["coordinate break", "decentre x 1.5 y -2 mm", "tilt x 7° y -5° z 11°"],
     "break of order 1": ["coordinate break", "tilt x 7° y -5° z 11°", "decentre x 1.5 y -2 mm"],
@@ -23,13 +23,13 @@ TOLD = {
 }
 
 
-@pytest.mark.parametrize("name", TOLD)
-def test_a_surface_is_told_in_the_words_of_the_field(name):
+@pytest.mark.parametrize("name", REMARKS)
+def test_a_surface_is_described_in_the_words_of_the_field(name):
     lens = read(text(name))[0]
-    assert remarks(lens.surfaces[2]) == TOLD[name]
+    assert remarks(lens.surfaces[2]) == REMARKS[name]
     row = str(rt.info(lens)).split("\n")[-3]
-    assert row.endswith(", ".join([*(["conic -0.4"] if name == "standard" else []), *TOLD[name], "the second"])) or (
-        ", ".join(TOLD[name]) in row and name in ("toroid", "biconic")  # their conic stands before
+    assert row.endswith(", ".join([*(["conic -0.4"] if name == "standard" else []), *REMARKS[name], "the second"])) or (
+        ", ".join(REMARKS[name]) in row and name in ("toroid", "biconic")  # their conic stands before
     )
     assert (row.split()[1] == "-") == ("break" in name)
 

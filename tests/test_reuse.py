@@ -200,7 +200,7 @@ def test_distances_beyond_the_range_or_with_rays_lost_on_the_way_are_traced():
     torch.testing.assert_close(found.position, expected.position, atol=0, rtol=0)
 
 
-def test_over_a_range_of_distances_lost_rays_change_nothing():
+def test_over_a_range_of_distances_failed_rays_change_nothing():
     """Where the stop clips, every object distance has pupil points of its own."""
     lens, distances = double_gauss(), number([1.2e4, 2e4, 4e4])
     clipped = lens.replace(lens.stop, apertures=(Aperture("circular", (0.0, 6.0)),))

@@ -257,7 +257,7 @@ def with_lost_rays():
 
 @pytest.mark.parametrize("direction", ["one", pytest.param("each", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["zernike", "grid"])
-def test_first_and_second_derivatives_by_every_number_with_lost_rays(kind, direction):
+def test_first_and_second_derivatives_by_every_number_with_failed_rays(kind, direction):
     """First derivatives along one random direction of all numbers, or by each of them; second ones along one."""
     face = dataclasses.replace(ALL[kind], curvature=vector(-0.03)[0], semi_diameter=4.0)
     sag_terms, rays = noll(z2=0.02, z3=-0.01, z5=0.008, z7=0.006), with_lost_rays()

@@ -94,12 +94,12 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
         steep = steep.replace(k, curvature=torch.tensor(c, dtype=torch.float64))
     lost = []
 
-    def told(problem, x, **bounds):
+    def recorded(problem, x, **bounds):
         there = opened(problem, x, **bounds)
         lost.append([problem.state(one, False).lost for one in (x, there)])
         return there
 
-    monkeypatch.setattr("raytrace.optimization.search.opened", told)
+    monkeypatch.setattr("raytrace.optimization.search.opened", recorded)
     found = [rt.search(steep, hold="efl=50", starts=1, bounds=f"curvature:-{c}..{c}", **HOW).merit for c in (0.1, 0.06)]
     assert lost[0][0] > 0
     assert lost[0][1] == 0
@@ -147,7 +147,7 @@ def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
     assert found.lens is found.lenses[0]
 
 
-def test_each_minimum_is_told_once_and_is_one():
+def test_each_minimum_is_reported_once_and_is_one():
     how = {
         **HOW,
         "hold": "efl=50",
@@ -208,11 +208,11 @@ def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
 
 def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
     rows = rt.Row("MNEG", (1, 6), target=2.0, weight=1), rt.Row("MXCG", (1, 6), target=9.0, weight=1), rt.Row("EFFL")
-    told = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
+    numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
     others = [("MXCG", (1, 6), 9.0), ("EFFL", (0, 0), 0.0)]
-    assert told(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
-    assert told(0.5) == [*told(0), ("MNEG", (3, 4), 1.0)]
-    assert told(1) == [("MNEG", (1, 6), 2.0), *others]
+    assert numbers(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
+    assert numbers(0.5) == [*numbers(0), ("MNEG", (3, 4), 1.0)]
+    assert numbers(1) == [("MNEG", (1, 6), 2.0), *others]
 
 
 @pytest.fixture(scope="module")
@@ -413,6 +413,6 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
         (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
     ],
 )
-def test_what_cannot_be_searched_is_told_in_a_line(words, said, plate, command_line, tmp_path):
+def test_what_cannot_be_searched_is_reported_in_a_line(words, said, plate, command_line, tmp_path):
     rt.write_lens(plate, tmp_path / "plate.csv")
     assert said in command_line("search", "plate.csv", *words).error

@@ -164,7 +164,7 @@ def test_the_paraxial_image_is_where_code_v_put_it(text, stored):
     assert float(found.back_focal_distance) == pytest.approx(stored, rel=1e-9)  # an object at 1e12 mm: 1e-8 mm
 
 
-def test_a_stored_distance_that_is_not_the_paraxial_one_is_solved_and_told():
+def test_a_stored_distance_that_is_not_the_paraxial_one_is_solved_and_reported():
     wrong = ACHROMAT.replace("95.95194415183156", "0")
     lens, report = of(wrong)
     assert float(lens.surfaces[-2].thickness) == pytest.approx(95.95194415183156, rel=1e-12)
@@ -519,14 +519,14 @@ def test_commands_are_joined_parted_cut_short_and_commented():
     assert float(lens.surfaces[2].curvature) == 1 / -50
 
 
-def test_of_zoom_positions_the_first_is_read_and_told():
+def test_of_zoom_positions_the_first_is_read_and_reported():
     text = SINGLET.replace("GO", "ZOO 3\nZOO THI S2 47 30 20\nZOO THC S2 100 100 100\nTIT Z2 'two'\nTHI Z1 S1 5\nGO")
     lens, report = of(text)
     assert [float(surface.thickness) for surface in lens.surfaces[1:3]] == [5.0, 47.0]
     assert "3 zoom positions (ZOO): the first is read" in report.warnings[0]
 
 
-def test_a_lens_module_of_what_is_known_is_told():
+def test_a_lens_module_of_what_is_known_is_reported():
     lens, report = of(SINGLET.replace("STO", "STO\nCCY 0; THC 0\nXYZ 4\nXDE 0.0"))
     status = {keyword.name: keyword.status for keyword in report.keywords}
     assert (status["CCY"], status["XYZ"], status["RDM"]) == ("ignored", "unknown", "read")

@@ -19,7 +19,7 @@ DESCRIBED = dict(re.findall(r"^\| `([^`]+)` \| (.+) \|$", (ORACLES / "README.md"
 FUNCTIONS = [name for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))]
 
 
-def test_type_checkers_are_told_that_the_package_has_hints():
+def test_type_checkers_know_that_the_package_has_hints():
     """The file stands in the package as it is installed, and the wheel takes the whole of that folder."""
     assert (Path(rt.__file__).parent / "py.typed").is_file()
     build = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]

@@ -181,9 +181,9 @@ def test_a_glass_that_is_picked_up_follows_every_number_of_it():
     x = np.array([1.65, 50.0])
     here, view = model.lens_at(x), model.views[0]
     for k in (3, 9):
-        told = refractive_index(here.surfaces[k].glass, here.wavelengths)
-        assert torch.equal(told, refractive_index(here.surfaces[1].glass, here.wavelengths))
-        assert float(told[1]) != float(refractive_index(lens.surfaces[k].glass, lens.wavelengths)[1])
+        expected = refractive_index(here.surfaces[k].glass, here.wavelengths)
+        assert torch.equal(expected, refractive_index(here.surfaces[1].glass, here.wavelengths))
+        assert float(expected[1]) != float(refractive_index(lens.surfaces[k].glass, lens.wavelengths)[1])
     state = view.state(Dual(x, np.eye(2)))
     focal = state.gaussian(1).effective_focal_length
     for k, h in enumerate((1e-6, 1e-4)):

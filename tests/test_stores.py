@@ -246,7 +246,7 @@ def test_a_journal_is_appended_to_and_never_rewritten(tmp_path):
 
 
 @pytest.mark.parametrize("name", STRANGE)
-def test_damaged_settings_of_a_run_are_told_with_their_file(name, tmp_path):
+def test_damaged_settings_of_a_run_are_reported_with_their_file(name, tmp_path):
     put(tmp_path / "settings.json", STRANGE[name])
     with pytest.raises(
         ValueError, match=r"settings.json.*remove the folder|holds another run.*another folder"

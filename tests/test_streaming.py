@@ -209,7 +209,7 @@ def test_spot_of_all_wavelengths():
     assert found.rays.tolist() == [4000] * 3
 
 
-def test_largest_distance_of_many_rays_lies_between_what_is_told(monkeypatch):
+def test_largest_distance_of_many_rays_lies_between_the_bounds_reported(monkeypatch):
     monkeypatch.setattr(streaming, "_PILOT", 64)
     system = double_gauss()
     points, weights = pupil.sobol(5000)
@@ -250,10 +250,10 @@ def test_float32_rays_are_summed_in_float64():
 
 
 def test_progress_counts_every_ray():
-    told = []
-    stream_spot(double_gauss(), 3000, wavelengths=COLOURS, max_bytes=SMALL, progress=told.append)
-    assert sum(told) == 3000 * 6
-    assert max(told) <= 512
+    counts = []
+    stream_spot(double_gauss(), 3000, wavelengths=COLOURS, max_bytes=SMALL, progress=counts.append)
+    assert sum(counts) == 3000 * 6
+    assert max(counts) <= 512
 
 
 # ---------------------------------------------------------------- PSFs
@@ -466,8 +466,8 @@ def test_command_gives_the_spot_of_few_rays(command):
     for one, other in zip(few["results"], many["results"], strict=True):
         assert one["field"] == other["field"]
         assert one["centroid"] == pytest.approx(other["centroid"], abs=PICOMETRE)
-        assert one["rms_radius"] == pytest.approx(other["rms_radius"], rel=1e-9)
-        assert one["geometric_radius"] == pytest.approx(other["geometric_radius"], rel=1e-9)
+        assert one["rms_radius_um"] == pytest.approx(other["rms_radius_um"], rel=1e-9)
+        assert one["geometric_radius_um"] == pytest.approx(other["geometric_radius_um"], rel=1e-9)
         assert other["launched"] == 3000
     lines = [
         command(*common, *a)[1].splitlines() for a in (("--sampling", "sobol", "--points", 3000), ("--rays", 3000))

@@ -167,7 +167,7 @@ def test_start_in_the_middle_of_a_lens():
     assert torch.equal(rest.direction, whole.direction)
 
 
-def test_reasons_of_loss_are_told_once_and_add_up():
+def test_reasons_of_loss_are_reported_once_and_add_up():
     system = lens(
         [surface(0.1, 15.0, 1.8, apertures=vignetting_aperture(9.0)), surface(-0.01, 5.0), surface(0.3, 5.0, 1.5)]
     )
@@ -233,7 +233,7 @@ def test_the_lossy_system_loses_rays_in_every_way():
 
 @both_engines
 @pytest.mark.parametrize("number", range(5))
-def test_first_and_second_derivatives_of_every_number_with_lost_rays(number):
+def test_first_and_second_derivatives_of_every_number_with_failed_rays(number):
     """Thickness, curvature, conic, terms and index of each surface, and the rays themselves."""
     flat, structure = torch.utils._pytree.tree_flatten(LOSSY.surfaces[1 + number])
     rays = lossy_rays()

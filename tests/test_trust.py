@@ -219,7 +219,7 @@ def quick(tmp_path, monkeypatch):
     return made
 
 
-def test_an_unsafe_folder_is_left_alone_and_told_of(quick, tmp_path, capsys):
+def test_an_unsafe_folder_is_left_alone_and_reported(quick, tmp_path, capsys):
     tmp_path.chmod(0o777)
     loaded = library.library.__wrapped__()
     assert loaded.parent == quick[0]
@@ -232,7 +232,7 @@ def test_an_unsafe_folder_is_left_alone_and_told_of(quick, tmp_path, capsys):
     )
 
 
-def test_a_folder_that_cannot_be_written_is_told_of(quick, tmp_path, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_written_is_reported(quick, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(library, "cache_folder", lambda: tmp_path / "file" / "cache")
     assert library.library.__wrapped__().parent == quick[0]

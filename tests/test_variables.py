@@ -152,9 +152,9 @@ def test_a_state_is_of_the_prescription_under_any_conditions_and_in_any_precisio
         variables = Variables(lens, "sensor curvature:3")
         variables.load_state_dict(state)
         assert float(variables.sensor) == 0.25
-    told = json.loads(bytes(state["_extra_state"].tolist()).decode())
-    assert told["lens"] == LENS.name
-    assert told["variables"]["sensor"] == [77.405, 1.0]
+    document = json.loads(bytes(state["_extra_state"].tolist()).decode())
+    assert document["lens"] == LENS.name
+    assert document["variables"]["sensor"] == [77.405, 1.0]
 
 
 def test_a_state_of_an_older_version_is_refused_with_the_way_to_load_it():

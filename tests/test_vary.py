@@ -56,7 +56,7 @@ def test_what_is_not_modelled_yet_is_modelled_at_zero(lens):
 
 
 def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
-    """It has the same index, dispersion and partial dispersion, and is told of once for each surface."""
+    """It has the same index, dispersion and partial dispersion, and one warning for each surface says so."""
     with pytest.warns(VariedGlass, match="varies as a model glass, whose index is off by") as said:
         found = freedom(lens, "index abbe_number:3")
     assert len(said) == len(found.variables) - 1 == 6
@@ -152,9 +152,9 @@ def test_without_variables_in_the_file_words_are_asked_for(lens):
 def test_bounds_by_kind_surface_and_configuration(zoom):
     found = freedom(zoom, "thickness:5,6 sensor curvature:3 tilt:4")
     low, high = bounds_of(found.lens, found.variables, "thickness:2..15 thickness_6@2:14..20 sensor:50,60 tilt:-1..1")
-    told = dict(zip(map(name_of, found.variables), zip(low, high, strict=True), strict=True))
+    ranges = dict(zip(map(name_of, found.variables), zip(low, high, strict=True), strict=True))
     inf = np.inf
-    assert told == {
+    assert ranges == {
         "thickness_5": (2, 15),
         "thickness_6@1": (2, 15),
         "thickness_6@2": (14, 20),
@@ -169,8 +169,8 @@ def test_bounds_by_kind_surface_and_configuration(zoom):
     assert high[5] == 0
     with pytest.raises(BadVariables, match="did you mean curvature_3"):
         bounds_of(found.lens, found.variables, "curvatur_3:0,1")
-    told = freedom(zoom, [*["curvature:3", "thickness:5"]])
-    own = [Vary(3, "curvature", bounds=(0.01, 0.05)), told.variables[1]]
+    free = freedom(zoom, [*["curvature:3", "thickness:5"]])
+    own = [Vary(3, "curvature", bounds=(0.01, 0.05)), free.variables[1]]
     low, high = bounds_of(zoom, own, "thickness:1..")
     assert (low.tolist(), high.tolist()) == ([0.01, 1.0], [0.05, inf])
     with pytest.raises(BadVariables, match="15 is not less than 2"):

@@ -368,7 +368,7 @@ def test_report_sorts_every_keyword():
     ],
 )
 @pytest.mark.parametrize("count", ["1", "1 1", ""])
-def test_operands_of_a_single_configuration_are_told_by_name_value_and_line(operand, said, count):
+def test_operands_of_a_single_configuration_are_reported_by_name_value_and_line(operand, said, count):
     text = file(tail=f"MNUM {count}\n{operand}")
     line = text.splitlines().index(operand) + 1
     assert [warning for warning in read(text)[1].warnings if re.search(rf":{line}.*{said}", warning)]
@@ -376,7 +376,7 @@ def test_operands_of_a_single_configuration_are_told_by_name_value_and_line(oper
         read(text, strict=True)
 
 
-def test_operands_that_change_nothing_are_not_told():
+def test_operands_that_change_nothing_are_not_reported():
     quiet = 'MNUM 1\nMOFF 0 1 "" 0\nPRES 0 1 1.0 0 0 0 1 1 1.0 0.0 0\nTEMP 0 1 20 0 0 0 1 1\nTHIC 1 1 4 0 0\nCSUM 5'
     assert not read(file(tail=quiet))[1].warnings
     for active in (1, 2):

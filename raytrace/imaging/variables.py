@@ -38,7 +38,6 @@ from raytrace.optimization.variables import (
     split_words,
     varied,
     with_modelled,
-    with_numbers_of,
 )
 from raytrace.system.identity import digest, identity, other_lens
 from raytrace.system.lens import Lens, media
@@ -215,10 +214,6 @@ class Variable:
     def name(self) -> str:
         return "sensor" if self.kind == "sensor" else f"{self.kind}_{self.surface}"
 
-    @property
-    def address(self) -> tuple[int, str]:
-        return self.surface, "thickness" if self.kind == "sensor" else self.kind
-
 
 @dataclass(frozen=True)
 class Held:
@@ -297,25 +292,23 @@ class Variables(Owned):
             f"hold {hold!r}: none of the variables changes the focal length; vary a thickness or a curvature"
         )
 
-    @staticmethod
-    def _with(lens: Lens, variable: Variable, value: Tensor) -> Lens:
-        return with_numbers_of(lens, {variable.address: value}, {variable.address: variable.path})
-
     def _power(self, lens: Lens, variable: Variable) -> tuple[Tensor, Tensor]:
         """The power at 0 of a variable, and its change to 1; 1/mm."""
         zero = torch.zeros_like(lens.surfaces[-2].thickness)
-        at_zero, at_one = (first_order(self._with(lens, variable, zero + k)).power for k in range(2))
+        at_zero, at_one = (first_order(_with_value(lens, variable, zero + k)).power for k in range(2))
         return at_zero, at_one - at_zero
 
     def forward(self) -> Lens:
         """The lens with the current values of its variables."""
         lens = self._free()
-        return lens if self.held is None else self._with(lens, self.held.by, self._solved(lens))
+        return lens if self.held is None else _with_value(lens, self.held.by, self._solved(lens))
 
     def _free(self) -> Lens:
         """The lens without its solved number."""
-        numbers = {variable.address: self.number(variable) for variable in self.variables}
-        return with_numbers_of(self._modelled, numbers, {one.address: one.path for one in self.variables})
+        lens = self._modelled
+        for variable in self.variables:
+            lens = _with_value(lens, variable, self.number(variable))
+        return lens
 
     def _solved(self, lens: Lens) -> Tensor:
         """The solved number () of the lens with all others."""
@@ -393,6 +386,13 @@ class Variables(Owned):
         value, unit = number_at(lens.surfaces[self.held.by.surface], self.held.by.path), self.held.by.unit
         low, high = self._range()
         return total + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
+
+
+def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:
+    """The lens with another number of a variable."""
+    surfaces = list(lens.surfaces)
+    surfaces[variable.surface] = with_number(surfaces[variable.surface], variable.path, value)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def _alike(one: object, other: object) -> bool:

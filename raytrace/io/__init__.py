@@ -48,8 +48,7 @@ from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.system.lens import Lens, check_media
-from raytrace.system.lens import check as check_lens
+from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, named_value
 
@@ -216,21 +215,7 @@ def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
     return FORMATS[suffix]
 
 
-# -- checking and conversion ------------------------------------------------------------------------------------------
-
-
-def checked(
-    path, catalogs, strict: bool, configuration: int | None, substitute: Substitute, evaluated
-) -> tuple[Lens, ImportReport]:
-    """A lens and its report, as `read_lens_with_report`. Raises LensFileError for a lens that cannot be traced."""
-    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
-    lens, report = read_lens_with_report(path, **options, evaluated=evaluated)
-    try:
-        check_lens(lens)
-    except ValueError as error:
-        raise LensFileError(str(error), Place(str(path))) from error
-    check_media(lens, lens.wavelengths, where=str(path))
-    return lens, report
+# -- conversion -------------------------------------------------------------------------------------------------------
 
 
 @value
@@ -277,30 +262,26 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
     and other data that the file does not bring back.
     """
-    path = Path(path)
+    path, place = Path(path), Place(str(path))
     try:
         check_unit(lens.wavelengths, believed=lens.wavelengths)  # refuses wavelengths that are not above 0
     except ValueError as error:
-        raise LensFileError(str(error), Place(str(path))) from error
+        raise LensFileError(str(error), place) from error
     form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
-    again = _read_again(content, form, path, catalogs)
-    if again is not None and (changed := changes(lens, again)):
+    try:
+        again, _ = form.read(decode(content, place), str(path), catalogs=catalogs)
+        changed = changes(lens, again)
+    except UnknownGlass:  # of a catalog that is unavailable
+        changed = []
+    except LensFileError as error:
+        reason = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
+        message = f"the file would not be read again: {reason}"
+        raise LensFileError(message, place._replace(surface=error.surface)) from error
+    if changed:
         message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
         warnings.warn(message, LensFileWarning, stacklevel=calling_level())
     try:
         write_atomically(path, lambda file: file.write(content))
     except OSError as error:
-        raise LensFileError(error.strerror or str(error), Place(str(path))) from error
-
-
-def _read_again(content: bytes, form: Format, path: Path, catalogs: Sequence[Path]) -> Lens | None:
-    """The lens of a written content; None without its catalogs. Raises LensFileError where it cannot be read."""
-    try:
-        return form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)[0]
-    except UnknownGlass:  # of a catalog that is unavailable
-        return None
-    except LensFileError as error:
-        reason = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
-        message = f"the file would not be read again: {reason}"
-        raise LensFileError(message, Place(str(path), None, error.surface)) from error
+        raise LensFileError(error.strerror or str(error), place) from error

@@ -28,7 +28,7 @@ from raytrace.materials.catalogs import (
     shipped_difference,
     user_catalogs,
 )
-from raytrace.materials.environment import Environment
+from raytrace.materials.environment import Environment, objection
 from raytrace.materials.glass import Glass, constant, mil_glass, model_glass
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import count
@@ -259,6 +259,14 @@ def pose_of(numbers: Mapping[str, float], *, tilts_first: bool = False) -> Pose 
     """The pose of decentres x, … in mm and tilts tilt_x, … in degrees; numbers that are 0 are not modelled."""
     modelled = {name: double(number) for name, number in numbers.items() if number}
     return Pose(**modelled, tilts_first=tilts_first) if modelled else None
+
+
+def environment_at(numbers: Sequence[float], place: Place) -> Environment:
+    """The environment of a temperature in °C and a pressure in atm. Raises LensFileError out of range."""
+    environment = Environment(*map(double, numbers))
+    if wrong := objection(environment):
+        raise LensFileError(wrong.replace("`", ""), place)
+    return environment
 
 
 def clear_aperture(

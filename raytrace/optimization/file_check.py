@@ -5,9 +5,12 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from raytrace.io import ImportReport, Substitute, checked
+from raytrace.io import ImportReport, LensFileError, Substitute, read_lens_with_report
+from raytrace.io.source import Place
 from raytrace.optimization.context import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.system.lens import check as check_lens
+from raytrace.system.lens import check_media
 from raytrace.tracing.geometry import defects
 
 
@@ -25,6 +28,11 @@ def check(
     strict: raise where something was assumed. configuration: which one has to be such that it can be traced.
     substitute: as for `read_lens`. Raises as that, and LensFileError for what cannot be traced.
     """
-    evaluated = (*OPERANDS, *SETTINGS)
-    lens, report = checked(path, catalogs, strict, configuration, substitute, evaluated)
+    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    lens, report = read_lens_with_report(path, **options, evaluated=(*OPERANDS, *SETTINGS))
+    try:
+        check_lens(lens)
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
+    check_media(lens, lens.wavelengths, where=str(path))
     return dataclasses.replace(report, geometry=tuple(map(str, defects(lens))))

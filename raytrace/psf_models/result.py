@@ -11,7 +11,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, axis, cell, number, numbers
+from raytrace.maths.result import Column, Result, axis, flat, number, numbers, text_table
 from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.tracing.spot import where_lit
@@ -126,8 +126,21 @@ class Psf(Result):
 
         return psf_grid(self, **options)
 
+    @property
+    def COLUMNS(self) -> Sequence[Column]:
+        field = FIELD_UNITS[self.lens.fields.kind]
+        return (
+            Column("object_distance", "mm", ">12g", "object"), Column("field_x", field),
+            Column("field_y", field, ">9g", "field"), Column("wavelength", "µm", ">9g", "λ"),
+            *(Column(f"centroid_{a}", "mm", ">12.6f", f"centroid {a}") for a in "xy"),
+            *(Column(f"sigma_{a}_um", "µm", ">9.4f", f"σ {a}") for a in "xy"),
+            *(Column(f"ray_sigma_{a}_um", "µm", ">9.4f", f"rays' σ {a}") for a in "xy"),
+            Column("energy", "", ">8.4f", "energy\nwindow"), Column("error", "", ">9.1e", "error\nest."),
+            Column("rays", "", ">7.0f"),
+        )  # fmt: skip
+
     def columns(self) -> dict[str, Tensor]:
-        """A row for every kernel: mm, widths of the light before pixels."""
+        """A row for every kernel: widths of the light before pixels, of waves also those of their rays."""
         axes = self.energy.dim()
         colours = {} if self.wavelengths_summed else {"wavelength": axis(self.wavelengths, 2, axes)}
         return {
@@ -135,9 +148,11 @@ class Psf(Result):
             **{f"field_{a}": axis(field, 1, axes) for a, field in zip("xy", self.fields, strict=True)},
             **colours,
             **{f"centroid_{a}": t for a, t in zip("xy", self.centroid, strict=True)},
-            **{f"sigma_{a}": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
+            **{f"sigma_{a}_um": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
+            **{f"ray_sigma_{a}_um": t for a, t in zip("xy", _sigmas(self.ray_covariance), strict=True) if self.waves},
             "energy": self.energy,
             "error": self.error,
+            "rays": torch.tensor(self.rays, device=self.energy.device),
         }
 
     def document(self) -> dict:
@@ -183,21 +198,11 @@ class Psf(Result):
         lines += [self.reason] if self.reason else []
         if self.waves:
             lines.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
-        sigmas, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
-        columns = [("centroid x", "mm", 12, self.centroid[0], ".6f"), ("centroid y", "mm", 12, self.centroid[1], ".6f")]
-        columns += [("σ x", "µm", 9, sigmas[0], ".4f"), ("σ y", "µm", 9, sigmas[1], ".4f")]
-        if self.waves:
-            columns += [("rays' σ x", "µm", 9, rays[0], ".4f"), ("rays' σ y", "µm", 9, rays[1], ".4f")]
-        columns += [("energy", "window", 8, self.energy, ".4f"), ("error", "est.", 9, self.error, ".1e")]
-        first = [("object", "mm", 12), ("field", FIELD_UNITS[self.lens.fields.kind], 9), ("λ", "µm", 9)]
-        first = first[: self.energy.dim()]
-        headings = [*first, *(column[:3] for column in columns), ("rays", "", 7)]
-        lines += [" ".join(f"{heading[k]:>{heading[2]}}" for heading in headings) for k in (0, 1)]
-        for at in np.ndindex(self.energy.shape):
-            cells = [f"{float(self.object_distances[at[0]]):g}", name_of_field(self.fields[:, at[1]])]
-            cells += [f"{float(self.wavelengths[w]):g}" for w in at[2:]]
-            cells += [cell(float(values[at]), form) for *_, values, form in columns] + [f"{self.rays}"]
-            lines.append(" ".join(f"{text:>{heading[2]}}" for text, heading in zip(cells, headings, strict=True)))
+        listed = flat(self.columns())
+        fields = torch.stack([*map(torch.as_tensor, (listed.pop("field_x"), listed["field_y"]))], 1)
+        listed["field_y"] = [*map(name_of_field, fields)]
+        listed["object_distance"] = [f"{distance:g}" for distance in listed["object_distance"]]
+        lines += text_table({self.column(name): values for name, values in listed.items()})
         if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
             lines.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
         return "\n".join(lines)
@@ -213,8 +218,8 @@ class Psf(Result):
 
 
 def _sigmas(covariance: Tensor) -> Tensor:
-    """σ_x and σ_y (2, ...); nan where there is no light."""
-    return covariance[::2].clamp_min(0.0).sqrt()
+    """σ_x and σ_y (2, ...) in µm; nan where there is no light."""
+    return 1e3 * covariance[::2].clamp_min(0.0).sqrt()
 
 
 def combined(parts: Sequence, join: Callable[[list[Tensor], int], Tensor]):

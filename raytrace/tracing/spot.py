@@ -4,14 +4,13 @@ Arrivals: where every ray of a spot meets the sensor, from which field, colour a
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
@@ -144,7 +143,7 @@ class Arrivals(Result):
     The table has a row a ray, its status in words; x and y are empty where it is not on the sensor.
     """
 
-    UNITS: ClassVar = {"field_x": "", "field_y": ""}  # of the lens, which is not stored
+    COLUMNS = Column("field_x"), Column("field_y")  # in the unit of the lens, which is not stored
 
     rays: Rays
     status: Tensor

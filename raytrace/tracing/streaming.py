@@ -1,11 +1,7 @@
-"""Streaming: spots of any number of rays within a memory budget, and what PSFs and gradients need for the same.
+"""Streaming: spots, and gradients of sums, over any number of rays within a memory budget.
 
-Rays go through the lens in chunks, and only sums are kept: moments about means, merged so that nothing cancels (Chan,
-Golub and LeVeque 1979), pixels in float64, gradients added chunk by chunk. The points of the pupil are those of
-`raytrace.maths.pupil`, made as they are needed; the size of a chunk changes a result by rounding alone.
-
-
-Gradients of sums over any number of rays within a memory budget; see raytrace/tracing/streaming.py.
+Rays are traced in chunks of which only sums are stored: moments about means, merged without cancellation (Chan, Golub
+and LeVeque 1979), pixels in float64, gradients. The size of a chunk changes a result by rounding alone.
 """
 
 import math
@@ -31,8 +27,8 @@ from raytrace.tracing.trace import sequence_of, trace_surfaces
 MAX_BYTES = 256 * 2**20
 _CHUNK = {"cpu": 2**15}  # rays whose temporaries stay in the caches of a core
 _CHUNK_ELSEWHERE = 2**22  # rays that fill an accelerator
-_FEWEST = 256  # rays of a chunk: fewer would be overhead alone
-_PILOT = 2**16  # first rays, whose centroid is what the largest distance is measured from
+_FEWEST = 256  # rays of a chunk: with fewer, overhead dominates
+_PILOT = 2**16  # first rays: largest distances are measured from their centroid
 _SOBOL_BITS = torch.quasirandom.SobolEngine.MAXBIT
 _SOBOL_POINTS = 2**_SOBOL_BITS
 #: Bytes of temporaries a ray takes at most, in float64 by the eager trace; measured, see docs/streaming.md.
@@ -43,11 +39,11 @@ Progress = Callable[[int], object]
 
 @value
 class Beam:
-    """The rays of one field and wavelength as a function of the pupil point p = (p_x, p_y): affine, unless aimed.
+    """The rays of one field and wavelength as an affine function of the pupil point p = (p_x, p_y).
 
         position = place (1, p_x, p_y),   direction ∝ (slope (1, p_x, p_y), 1)
 
-    place: (3, 3) mm; slope: (2, 3), or None for a plane wave, whose direction: (3,) is the same everywhere.
+    place: (3, 3) mm; slope: (2, 3), or None for a plane wave of one direction: (3,).
     """
 
     place: Tensor
@@ -57,7 +53,7 @@ class Beam:
 
 
 class Shot(NamedTuple):
-    """One kernel to come: what does not depend on the pupil point is computed once. beam: None if rays are aimed."""
+    """The rays of one field (2,) and wavelength () µm, without their pupil points. beam: None if rays are aimed."""
 
     lens: Lens
     field: Tensor
@@ -68,9 +64,9 @@ class Shot(NamedTuple):
 
 @value
 class Moments:
-    """How many points, and of their distances from a reference the mean (2, ...) mm and the sums of products about it.
+    """Number of points, mean distance from a reference (2, ...) mm, and sums of products about it (3, ...) mm².
 
-    scatter: Σ (x - x̄)², Σ (x - x̄)(y - ȳ), Σ (y - ȳ)² (3, ...) mm². All float64.
+    scatter: Σ (x - x̄)², Σ (x - x̄)(y - ȳ), Σ (y - ȳ)². All float64.
     """
 
     count: Tensor
@@ -80,13 +76,12 @@ class Moments:
 
 @value
 class StreamedSpot:
-    """Statistics of a spot whose rays were not kept; entries (...), float64, mm.
+    """Statistics of a spot whose rays are not stored; entries (...), float64, mm; nan where no ray arrives.
 
     centroid: (2, ...); covariance: (3, ...) xx, xy, yy in mm²; mean_square_radius, rms_radius: about the centroid, as
-    in `raytrace.tracing.spot.Spot`; rays: how many arrived; launched: how many set out for each entry.
-    geometric_radius: distance from the centroid of the ray farthest from the centroid of the first 65,536: exact for so
-    many, else not above the largest distance, which is not above geometric_bound; the two differ by twice what the
-    centroid has moved since. All is nan where no ray arrives.
+    in `raytrace.tracing.spot.Spot`; rays: number that arrive; launched: number launched for each entry.
+    geometric_radius: distance from the centroid of the ray farthest from the centroid of the first 65,536 rays: exact
+    for so many, else at most the largest distance, which is at most geometric_bound.
     """
 
     centroid: Tensor
@@ -99,48 +94,40 @@ class StreamedSpot:
     launched: int
 
 
-# ---------------------------------------------------------------- points and rays
-
-
 def pupil_chunks(
     rays: int, size: int, *, sampling: str = "sobol", seed: int = 0, like: Tensor, cut: int | None = None
 ) -> Iterator[Tensor]:
     """The points of `pupil.sobol` or `pupil.random` in chunks (2, ≤ size) of `like`'s dtype and device.
 
-    size: a power of two; cut: a number of rays at which a chunk ends too. Raises ValueError for another sampling.
-    After 2³⁰ Sobol points, which is all there are, those of the next seed follow.
+    size: a power of two; cut: a number of rays at which a chunk also ends. After all 2³⁰ Sobol points, those of the
+    next seed follow. Raises ValueError for another sampling.
     """
     if sampling not in ("sobol", "random"):
         raise ValueError(f"sampling {sampling!r} cannot be continued from any number of points: use sobol or random")
-    if sampling == "random":
-        generator = torch.Generator().manual_seed(seed)
-        for first, last in _ranges(rays, size, cut):
+    generator = torch.Generator().manual_seed(seed)
+    first, block, table, steps = 0, None, None, None
+    while first < rays:
+        last = min((first // size + 1) * size, rays)
+        last = cut if cut is not None and first < cut < last else last
+        if sampling == "random":
             yield pupil.random(last - first, generator=generator, dtype=like.dtype, device=like.device)[0]
-        return
-    for begin in range(0, rays, _SOBOL_POINTS):
-        table, steps = _sobol_table(size, seed + begin // _SOBOL_POINTS, like.device)
-        here = min(rays - begin, _SOBOL_POINTS)
-        for first, last in _ranges(here, size, None if cut is None else cut - begin):
+        else:
+            if block != first // _SOBOL_POINTS:
+                block = first // _SOBOL_POINTS
+                table, steps = _sobol_table(size, seed + block, like.device)
             base = first // size * size
-            bits = table[:, first - base : last - base] ^ _sobol_place(base, steps, table)
-            yield _disc(bits.to(like.dtype).mul_(2.0**-_SOBOL_BITS))
-
-
-def _ranges(count: int, size: int, cut: int | None) -> Iterator[tuple[int, int]]:
-    first = 0
-    while first < count:
-        last = min((first // size + 1) * size, count)
-        if cut is not None and first < cut < last:
-            last = cut
-        yield first, last
+            bits = table[:, first - base : last - base] ^ _sobol_place(base % _SOBOL_POINTS, steps, table)
+            radius, angle = bits.to(like.dtype).mul_(2.0**-_SOBOL_BITS)
+            radius, angle = radius.sqrt_(), angle.mul_(2 * math.pi)
+            yield torch.stack([torch.cos(angle), torch.sin(angle)]).mul_(radius)
         first = last
 
 
 def _sobol_table(size: int, seed: int, device) -> tuple[Tensor, Tensor]:
     """The first `size` (a power of two) scrambled Sobol points as integers (2, size), and the steps between blocks.
 
-    Point i is the shift ⊕ the direction numbers V_m of the bits m of its Gray code i ⊕ (i >> 1). That is linear over
-    the bits of i, each of which so adds Y_m = V_m ⊕ V_{m-1}: a block of 2^k points is the first one ⊕ one number.
+    Point i is the shift ⊕ the direction numbers V_m of the bits m of its Gray code i ⊕ (i >> 1): linear over the bits
+    of i, each of which adds Y_m = V_m ⊕ V_{m-1}. A block of 2^k points is the first one ⊕ one number.
     """
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     numbers = engine.sobolstate.to(torch.int32)
@@ -159,32 +146,23 @@ def _sobol_place(first: int, steps: Tensor, table: Tensor) -> Tensor:
     return place
 
 
-def _disc(uniform: Tensor) -> Tensor:
-    radius, angle = uniform[0].sqrt_(), uniform[1].mul_(2 * math.pi)
-    points = torch.stack([torch.cos(angle), torch.sin(angle)])
-    return points.mul_(radius)
-
-
 def shot(lens: Lens, field: Tensor, wavelength: Tensor, *, ray_aiming: str | None = None) -> Shot:
-    """What all rays of one field (2,) and wavelength () µm share. Three rays tell the beam, in float64."""
-    lens = with_ray_aiming(lens, ray_aiming)
-    if aiming_of(lens) != "off" and not lens.fields.telecentric:
-        return Shot(lens, field, wavelength, media(lens, wavelength), None)
-    exact = to(lens, dtype=torch.float64)
-    corners = field.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    rays = launch(exact, corners, fields=field.double()[:, None], wavelengths=wavelength[None], ray_aiming="off")
-    position, direction, valid = rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0].all()
-    if is_at_infinity(lens):
-        beam = Beam(_affine(position), valid, direction=direction[:, 0])
-    else:
-        beam = Beam(_affine(position), valid, slope=_affine(direction[:2] / direction[2]))
-    beam = to(beam, dtype=lens.surfaces[-2].thickness.dtype)
+    """The shot of one field (2,) and wavelength () µm; three rays in float64 define the beam."""
+    lens, beam = with_ray_aiming(lens, ray_aiming), None
+    if aiming_of(lens) == "off" or lens.fields.telecentric:
+        exact = to(lens, dtype=torch.float64)
+        corners = field.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        rays = launch(exact, corners, fields=field.double()[:, None], wavelengths=wavelength[None], ray_aiming="off")
+        position, direction, valid = rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0].all()
+        plane = is_at_infinity(lens)
+        # f(0, 0), ∂f/∂p_x, ∂f/∂p_y of an affine f at (0, 0), (1, 0) and (0, 1)
+        place, slope = (
+            torch.cat([f[:, :1], f[:, 1:] - f[:, :1]], 1)
+            for f in (position, direction[:2] if plane else direction[:2] / direction[2])
+        )
+        beam = Beam(place, valid, None if plane else slope, direction[:, 0] if plane else None)
+        beam = to(beam, dtype=lens.surfaces[-2].thickness.dtype)
     return Shot(lens, field, wavelength, media(lens, wavelength), beam)
-
-
-def _affine(corners: Tensor) -> Tensor:
-    """f(0, 0), ∂f/∂p_x, ∂f/∂p_y (n, 3) of an affine f (n, 3) at (0, 0), (1, 0) and (0, 1)."""
-    return torch.cat([corners[:, :1], corners[:, 1:] - corners[:, :1]], 1)
 
 
 def start(shot: Shot, pupil: Tensor) -> Rays:
@@ -204,16 +182,16 @@ def start(shot: Shot, pupil: Tensor) -> Rays:
 
 
 def hits(shot: Shot, pupil: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays through pupil points (2, P) meet the image, (2, P) mm, and which of them arrive, (P,)."""
-    begun = start(shot, pupil)
-    arrived = trace_surfaces(sequence_of(shot.lens), begun, indices=shot.indices, wavelength=shot.wavelength)
-    return arrived.position[:2], arrived.valid
+    """Where rays through pupil points (2, P) meet the image, (2, P) mm, and whether they arrive (P,)."""
+    rays = start(shot, pupil)
+    rays = trace_surfaces(sequence_of(shot.lens), rays, indices=shot.indices, wavelength=shot.wavelength)
+    return rays.position[:2], rays.valid
 
 
 def chunk_size(shot: Shot, max_bytes: int, *, kept: int = 0, recorded: bool = False) -> int:
     """Rays of a chunk, a power of two, whose temporaries stay within max_bytes less those `kept` for results.
 
-    recorded: whether a graph for derivatives is. Raises ValueError if the budget is too small to begin.
+    recorded: whether a graph is recorded. Raises ValueError for fewer than 256 rays.
     """
     per_ray = bytes_per_ray(shot, recorded=recorded)
     most = int(max_bytes - kept) // per_ray
@@ -236,17 +214,14 @@ def bytes_per_ray(shot: Shot, *, recorded: bool = False) -> int:
     return total if shot.beam is not None else total + _BYTES_OF_AIMED_SURFACE * (shot.lens.stop + 1)
 
 
-# ---------------------------------------------------------------- moments
-
-
 def moments(points: Tensor, valid: Tensor, reference: Tensor) -> Moments:
-    """Moments of points (2, P) where valid, from a reference (2,) mm: near them, no digits are lost."""
+    """Moments of points (2, P) where valid, from a reference (2,) mm near them."""
     mask = valid.to(points.dtype)
     count = mask.sum(dtype=torch.float64)
     offset = (points - reference[:, None]) * mask
     mean = safe_divide(offset.sum(1, dtype=torch.float64), count)
     offset = (offset - mean.to(points.dtype)[:, None]) * mask
-    # What rounding left of the mean is taken out once more.
+    # A second pass removes the rounding error of the mean.
     rest = safe_divide(offset.sum(1, dtype=torch.float64), count)
     x, y = offset
     scatter = torch.stack([(a * b).sum(dtype=torch.float64) for a, b in ((x, x), (x, y), (y, y))])
@@ -284,12 +259,8 @@ class _Far(NamedTuple):
     def or_of(self, points: Tensor, valid: Tensor) -> "_Far":
         x, y = (points - self.reference[:, None]) * valid.to(points.dtype)
         square, place = torch.addcmul(x * x, y, y).max(0)
-        farther = square > self.square
-        found = points.index_select(1, place[None])[:, 0]
-        return _Far(self.reference, torch.where(farther, found, self.point), torch.where(farther, square, self.square))
-
-
-# ---------------------------------------------------------------- spots
+        farther, point = square > self.square, points.index_select(1, place[None])[:, 0]
+        return _Far(self.reference, torch.where(farther, point, self.point), torch.where(farther, square, self.square))
 
 
 def stream_spot(lens: Lens, rays: int, **conditions) -> StreamedSpot:
@@ -313,50 +284,43 @@ def stream_spots(
     progress: Progress | None = None,
     empty: str = "nan",
 ) -> tuple[StreamedSpot, StreamedSpot]:
-    """Spots (F, W), and those (F,) of all wavelengths together by their weights.
+    """Spots (F, W), and those (F,) of all wavelengths together by their weights. No derivatives.
 
-    fields: (2, F) and wavelengths: (W,) µm as for `launch`; sampling: "sobol" or "random"; rim: so many rays on the rim
-    count for the largest radius alone, as in `pupil.with_rim`; max_bytes: of memory beside what the process has;
-    progress: called with the number of rays traced since the last call; empty: as for `spot_of`. No derivatives.
+    fields: (2, F) and wavelengths: (W,) µm as for `launch`; sampling: "sobol" or "random"; rim: number of rays on the
+    rim that count for the largest radius alone, as in `pupil.with_rim`; max_bytes: of additional memory; progress:
+    called with the number of rays traced since the last call; empty: as for `spot_of`.
     """
     shots, shape, weights = shots_of(lens, rays, fields, wavelengths, wavelength_weights, ray_aiming)
     like = lens.surfaces[-2].thickness
     size = chunk_size(shots[0], max_bytes)
     points = {"sampling": sampling, "seed": seed, "like": like}
-    references = _references(shots, shape, weights, pupil_chunks(min(rays, _PILOT), size, **points))
+    # The centroids of the first rays: of every shot, and of all wavelengths of its field.
+    first, axis = [nothing(like)] * len(shots), like.new_zeros(2)
+    for part in pupil_chunks(min(rays, _PILOT), size, **points):
+        first = [merge(m, moments(*hits(s, part), axis)) for m, s in zip(first, shots, strict=True)]
+    joint = _of_colours(stacked(first, shape), weights).mean
+    references = [(m.mean.to(like.dtype), joint[:, k // shape[1]].to(like.dtype)) for k, m in enumerate(first)]
     sums = [nothing(like)] * len(shots)
     far = [[_Far(r, r, like.new_zeros(())) for r in both] for both in references]
     if rim:
         edge = pupil.with_rim(like.new_zeros(2, 0), like.new_zeros(0), rim)[0]
-        far = [[one.or_of(*hits(s, edge)) for one in both] for s, both in zip(shots, far, strict=True)]
+        far = [[farthest.or_of(*hits(s, edge)) for farthest in both] for s, both in zip(shots, far, strict=True)]
     for part in pupil_chunks(rays, size, **points):
         for k, s in enumerate(shots):
-            found, valid = hits(s, part)
-            sums[k] = merge(sums[k], moments(found, valid, far[k][0].reference))
-            own = far[k][0].or_of(found, valid)
-            far[k] = [own, own if shape[1] == 1 else far[k][1].or_of(found, valid)]
+            landing, valid = hits(s, part)
+            sums[k] = merge(sums[k], moments(landing, valid, far[k][0].reference))
+            alone = far[k][0].or_of(landing, valid)
+            far[k] = [alone, alone if shape[1] == 1 else far[k][1].or_of(landing, valid)]
             if progress is not None:
                 progress(part.shape[1])
     each = stacked(sums, shape)
-    apart = torch.stack([own.double() - joint.double() for own, joint in references], 1).unflatten(1, shape)
+    apart = torch.stack([alone.double() - joint.double() for alone, joint in references], 1).unflatten(1, shape)
     whole = _of_colours(Moments(each.count, each.mean + apart, each.scatter), weights)
     reached = each.count.to(torch.int64)
     return (
-        _spot(each, [own for own, _ in far], shape, reached, rays, empty),
+        _spot(each, [alone for alone, _ in far], shape, reached, rays, empty),
         _spot(whole, [joint for _, joint in far], shape, reached.sum(-1), rays * shape[1], empty),
     )
-
-
-def _references(
-    shots: Sequence[Shot], shape: tuple[int, int], weights: Tensor, chunks: Iterator[Tensor]
-) -> list[tuple[Tensor, Tensor]]:
-    """Centroids (2,) of the first rays, for every shot its own and that of all wavelengths of its field."""
-    like = shots[0].lens.surfaces[-2].thickness
-    first, axis = [nothing(like)] * len(shots), like.new_zeros(2)
-    for points in chunks:
-        first = [merge(m, moments(*hits(s, points), axis)) for m, s in zip(first, shots, strict=True)]
-    joint = _of_colours(stacked(first, shape), weights).mean
-    return [(m.mean.to(like.dtype), joint[:, k // shape[1]].to(like.dtype)) for k, m in enumerate(first)]
 
 
 def shots_of(
@@ -374,13 +338,13 @@ def shots_of(
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     weights = torch.ones_like(wavelengths) if weights is None else weights
-    found = [shot(lens, f, w, ray_aiming=ray_aiming) for f in fields.unbind(1) for w in wavelengths.unbind(0)]
-    return found, (fields.shape[1], len(wavelengths)), (weights / weights.sum()).double()
+    shots = [shot(lens, f, w, ray_aiming=ray_aiming) for f in fields.unbind(1) for w in wavelengths.unbind(0)]
+    return shots, (fields.shape[1], len(wavelengths)), (weights / weights.sum()).double()
 
 
 def stacked(parts: Sequence[Moments], shape: Sequence[int]) -> Moments:
-    fields = ([getattr(part, name) for part in parts] for name in ("count", "mean", "scatter"))
-    return Moments(*(torch.stack(tensors, -1).unflatten(-1, shape) for tensors in fields))
+    tensors = ([m.count for m in parts], [m.mean for m in parts], [m.scatter for m in parts])
+    return Moments(*(torch.stack(tensor, -1).unflatten(-1, shape) for tensor in tensors))
 
 
 def _of_colours(each: Moments, weights: Tensor) -> Moments:
@@ -403,25 +367,24 @@ def _spot(
     bound = torch.maximum(safe_sqrt(largest) + torch.linalg.vector_norm(moved, dim=0), radius)
     if joint:
         reference, radius, bound = reference[..., 0], radius.amax(-1), bound.amax(-1)
-    found = reference + m.mean, covariance, square, safe_sqrt(square), radius, bound
-    return StreamedSpot(*where_lit(m.count > 0, *found, empty=empty), rays, launched)
+    figures = reference + m.mean, covariance, square, safe_sqrt(square), radius, bound
+    return StreamedSpot(*where_lit(m.count > 0, *figures, empty=empty), rays, launched)
 
 
 def stream_gradient(
     merit: Callable[..., Tensor], leaves: Sequence[Tensor], chunks: Iterator
 ) -> tuple[Tensor, list[Tensor]]:
-    """Σ merit(chunk) and its derivatives in the leaves, one graph at a time: memory is that of one chunk.
+    """Σ merit(chunk), float64, and its derivatives in the leaves, in their dtypes, with one graph at a time.
 
-    merit: from a chunk to a scalar, a new graph from the leaves each time. Sums are float64, derivatives come back in
-    the dtype of their leaves; 0 for a leaf that merit does not depend on.
+    merit: from a chunk to a scalar, a new graph from the leaves each time; leaves it does not depend on have 0.
     """
     total = leaves[0].new_zeros((), dtype=torch.float64)
     sums = [torch.zeros_like(leaf, dtype=torch.float64) for leaf in leaves]
     for chunk in chunks:
         with torch.enable_grad():
-            found = merit(chunk)
-        parts = torch.autograd.grad(found, leaves, allow_unused=True)
-        total = total + found.detach()
+            term = merit(chunk)
+        parts = torch.autograd.grad(term, leaves, allow_unused=True)
+        total = total + term.detach()
         sums = [s if part is None else s + part for s, part in zip(sums, parts, strict=True)]
     return total, [s.to(leaf.dtype) for s, leaf in zip(sums, leaves, strict=True)]
 
@@ -443,14 +406,13 @@ def mean_square_gradient(
 ) -> tuple[Tensor, list[Tensor]]:
     """Mean square spot radius in mm², averaged over fields and wavelengths, and its first derivatives in the leaves.
 
-        R² = (1/n) Σ |q - q̄|²,   dR² = (2/n) Σ (q - q̄)·dq:  q̄ may be held, for Σ (q - q̄) = 0
+        R² = (1/n) Σ |q - q̄|²,   dR² = (2/n) Σ (q - q̄)·dq, for Σ (q - q̄) = 0
 
     lens: made from the leaves by differentiable operations; fields: (2, F), y, or (x, y), and wavelengths: µm, the
-    lens's own by default; weights: (F, W), alike by default. The rays are traced twice: for the centroids, then for the
-    sum. The graph is cut at the numbers of the lens that rays see, so what made the lens is gone through once, not for
-    every chunk.
-    empty: what the mean is if a spot of any weight has no rays: "nan", the derivatives those of the other spots, or
-    "error", which raises EmptySpot.
+    lens's by default; weights: (F, W), equal by default. The rays are traced twice: for the centroids and for the sum.
+    The graph is cut at the numbers of the lens that rays depend on, so that the part before is differentiated once.
+    empty: the mean where a weighted spot has no rays: "nan", with the derivatives of the other spots, or "error",
+    which raises EmptySpot.
     """
     fields = None if fields is None else field_points(fields, like=lens.fields.y)
     wavelengths = None if wavelengths is None else torch.as_tensor(wavelengths).to(lens.wavelengths)
@@ -462,35 +424,27 @@ def mean_square_gradient(
     share = safe_divide(share / share.sum(), light.rays).flatten()
     with torch.enable_grad():
         shots = shots_of(lens, rays, fields, wavelengths, None, ray_aiming)[0]
-    shots, seen, cut = _cut(shots)
+    # Each differentiated tensor becomes one leaf wherever it occurs: the trace skips a surface between equal indices.
+    parts, structure = pytree.tree_flatten(shots)
+    seen = {id(t): t for t in parts if isinstance(t, Tensor) and t.requires_grad}
+    cut = {key: t.detach().requires_grad_() for key, t in seen.items()}
+    shots = pytree.tree_unflatten([cut.get(id(t), t) for t in parts], structure)
     like = lens.surfaces[-2].thickness
     size = chunk_size(shots[0], max_bytes, recorded=True)
     centroids = torch.where(light.rays > 0, light.centroid, 0.0).flatten(1).to(like.dtype)
 
     def merit(part: tuple[int, Tensor]) -> Tensor:
         k, points = part
-        found, valid = hits(shots[k], points)
-        offset = (found - centroids[:, k, None]) * valid.to(found.dtype)
+        landing, valid = hits(shots[k], points)
+        offset = (landing - centroids[:, k, None]) * valid.to(landing.dtype)
         return share[k] * (offset * offset).sum(dtype=torch.float64)
 
-    def parts() -> Iterator[tuple[int, Tensor]]:
+    def chunks() -> Iterator[tuple[int, Tensor]]:
         for points in pupil_chunks(rays, size, sampling=sampling, seed=seed, like=like):
             yield from ((k, points) for k in range(len(shots)))
             if progress is not None:
                 progress(points.shape[1] * len(shots))
 
-    total, slopes = stream_gradient(merit, cut, parts())
-    found = torch.autograd.grad(seen, leaves, slopes, allow_unused=True)
-    return total * whole, [torch.zeros_like(leaf) if g is None else g for leaf, g in zip(leaves, found, strict=True)]
-
-
-def _cut(shots: list[Shot]) -> tuple[list[Shot], list[Tensor], list[Tensor]]:
-    """The shots with every tensor that is differentiated replaced by a new leaf; those tensors, and the leaves.
-
-    A tensor that stands in several places stays one: an index that is the one before tells the trace nothing bends.
-    """
-    found, structure = pytree.tree_flatten(shots)
-    seen = {id(t): t for t in found if isinstance(t, Tensor) and t.requires_grad}
-    cut = {key: t.detach().requires_grad_() for key, t in seen.items()}
-    shots = pytree.tree_unflatten([cut.get(id(t), t) for t in found], structure)
-    return shots, list(seen.values()), list(cut.values())
+    total, slopes = stream_gradient(merit, list(cut.values()), chunks())
+    slopes = torch.autograd.grad(list(seen.values()), leaves, slopes, allow_unused=True)
+    return total * whole, [torch.zeros_like(t) if g is None else g for t, g in zip(leaves, slopes, strict=True)]

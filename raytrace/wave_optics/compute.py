@@ -19,7 +19,7 @@ from raytrace.budget import afford, allowed_bytes, forewarn
 from raytrace.files import write_atomically
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_table
 from raytrace.maths.grid import Grid, centres, grid
-from raytrace.maths.result import Result, number, object_text, rows
+from raytrace.maths.result import Column, Result, flat, number, rows, text_table
 from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
@@ -45,6 +45,12 @@ class ElementPsf(Result):
     axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
     None where it is a pixel of the window.
     """
+
+    COLUMNS = (
+        Column("depth", "mm", ">12g", "object"), Column("wavelength", "µm", ">11g"),
+        Column("energy", "", ">8.4f", "energy\nwindow"), Column("peak", "", ">10.6f", "peak\npixel"),
+        Column("half_energy_radius_um", "µm", ">12.2f", "half-energy\nradius"),
+    )  # fmt: skip
 
     kernel: Tensor
     scene: WaveScene
@@ -101,7 +107,7 @@ class ElementPsf(Result):
             "wavelength": self.wavelengths,
             "energy": self.energy,
             "peak": self.peak,
-            "half_energy_radius": self.half_energy_radius,
+            "half_energy_radius_um": 1e3 * self.half_energy_radius,
         }
 
     def document(self) -> dict:
@@ -130,14 +136,10 @@ class ElementPsf(Result):
         lines += [
             f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
             f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
-            f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
-            f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
         ]
-        for row in rows(self.columns()):
-            depth, wavelength, energy, peak, radius = map(number, row.values())
-            half, place = "–" if radius is None else f"{1e3 * radius:.2f}", object_text(depth or math.inf)
-            lines.append(f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}")
-        return "\n".join(lines)
+        listed = flat(self.columns())
+        listed["depth"] = [f"{depth:g}" for depth in listed["depth"]]
+        return "\n".join([*lines, *text_table({self.column(name): values for name, values in listed.items()})])
 
     def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
         """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""

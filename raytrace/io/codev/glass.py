@@ -5,7 +5,6 @@ NBK7_SCHOTT is the glass of that catalog whose name is the same but for hyphens 
 PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
 """
 
-import dataclasses
 import re
 import warnings
 from collections.abc import Sequence
@@ -158,55 +157,42 @@ def _refuse_estimates(name: str, waves: Sequence[float], error: float, *, place:
 
 
 def _listed(name: str, library: GlassLibrary, *, place: Place, report: Draft) -> Glass:
-    """The glass of a catalog, by NAME_CATALOG or NAME."""
+    """The glass of a catalog, by NAME_CATALOG or NAME. Raises UnknownGlass."""
+
+    def listed(spelling: str, catalogs: Sequence[str | Catalog]) -> Glass:
+        return listed_glass(spelling, catalogs=catalogs, user=library.user, place=place, report=report)
+
     plain, _, catalog = name.rpartition("_")
     for spelled in (name, plain):
         if report.substitutes.of(spelled) is not None:
-            return listed_glass(spelled, catalogs=library.came, user=library.user, place=place, report=report)
+            return listed(spelled, library.came)
     hits = plain_names(plain, came=library.came, user=library.user) if plain else ()
     matches = [hit for hit in hits if same_catalog(hit[1], catalog)]
     is_stated = bool(matches)
     matches = matches or list(plain_names(name, came=library.came, user=library.user))
     if not matches:
-        return _by_alias(plain, catalog, name, library, place=place, report=report)
+        if plain:  # by another spelling of its catalog
+            try:
+                with warnings.catch_warnings(action="ignore"):
+                    glass = find_glass(plain, catalogs=[catalog], user=library.user, where=str(place))
+                if same_catalog(glass.catalog, catalog):
+                    return listed(glass.listed_name, [catalog])
+            except UnknownGlass:
+                pass
+        return listed(name, library.came)
     spelling, home = matches[0]
-    here = {other for other, where in matches[1:] if where == home and other != spelling}
-    if here:
-        listed = ", ".join([spelling, *sorted(here)])
-        raise LensFileError(f"{shown(name)} may be {listed} of {home}; spell it as the catalog does", place)
+    if here := {other for other, where in matches[1:] if where == home and other != spelling}:
+        spellings = ", ".join([spelling, *sorted(here)])
+        raise LensFileError(f"{shown(name)} may be {spellings} of {home}; spell it as the catalog does", place)
     rivals = [f"{other} ({where})" for other, where in matches[1:] if other != spelling]
     if rivals:
         report.warn(f"{name} is taken for {spelling} ({home}), but may be {', '.join(rivals)}", place)
     stated = [next((catalog for catalog in library.came if catalog.name == home), home)] if is_stated or rivals else []
-    return listed_glass(spelling, catalogs=stated, user=library.user, place=place, report=report)
+    return listed(spelling, stated)
 
 
-def _by_alias(plain: str, catalog: str, name: str, library: GlassLibrary, *, place: Place, report: Draft) -> Glass:
-    """A glass by another spelling of its catalog. Raises UnknownGlass."""
-    if plain:
-        try:
-            with warnings.catch_warnings(action="ignore"):
-                glass = find_glass(plain, catalogs=[catalog], user=library.user, where=str(place))
-        except UnknownGlass:
-            glass = None
-        if glass is not None and same_catalog(glass.catalog, catalog):
-            return listed_glass(glass.listed_name, catalogs=[catalog], user=library.user, place=place, report=report)
-    return listed_glass(name, catalogs=library.came, user=library.user, place=place, report=report)
-
-
-def private_glasses(
-    rows: dict[str, Record], wavelengths: Sequence[float], unnamed: Sequence[str], report: Draft
-) -> dict[str, Glass]:
-    """The glasses between PRV and END; wavelengths: those of the lens, µm; unnamed: glasses without a
-    name in the lens."""
-    nameless, glasses = [word.upper() for word in unnamed], {}
-    for name, row in rows.items():
-        glass = _private(row, wavelengths, report)
-        glasses[name] = dataclasses.replace(glass, name="") if name in nameless else glass
-    return glasses
-
-
-def _private(row: Record, wavelengths: Sequence[float], report: Draft) -> Glass:
+def private_glass(row: Record, wavelengths: Sequence[float], report: Draft) -> Glass:
+    """A glass between PRV and END; wavelengths: those of the lens, µm."""
     name, words, place = row.keyword, row.words, row.place
     waves = [micrometres(word, place) for word in row.text.split()]
     if not words:
@@ -291,21 +277,17 @@ def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: P
         return ""
     if glass.formula == "mirror":
         return "REFL"
-    if glass.formula == "model":
-        return _by_digits(glass, place)
     if glass.formula == "constant" or (not glass.catalog and glass.formula in FORMULA_WORDS.values()):
         return f"'{_private_name(glass, private, place)}'"
-    return _catalog_name(glass, user, place)
-
-
-def _by_digits(glass: Glass, place: Place) -> str:
+    if glass.formula != "model":
+        return _catalog_name(glass, user, place)
     nd, vd, dpgf = exact_list(glass.coefficients, "model glass", place)
     if float(dpgf):
         raise LensFileError(f"a model glass with ΔPgF = {dpgf}, which a .seq file has no place for", place)
-    named = bool(is_code(glass.name) or _CODE.fullmatch(glass.name))
-    figures = _figures(glass.name, place) if named else None
-    if figures is not None and exact_list(figures.coefficients, "model glass", place) == [nd, vd, dpgf]:
-        return glass.name
+    if is_code(glass.name) or _CODE.fullmatch(glass.name):
+        figures = _figures(glass.name, place).coefficients
+        if exact_list(figures, "model glass", place) == [nd, vd, dpgf]:
+            return glass.name
     if glass.name:
         message = f"a model glass named {glass.name!r}; a .seq file identifies model glasses by index and Abbe number"
         raise LensFileError(f"{message}: leave out the name", place)

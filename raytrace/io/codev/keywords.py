@@ -5,10 +5,10 @@ next, `!` begins a comment, texts are in ' or ". A command has three letters, in
 object: a surface (SO, SI, Sk), a field (Fk), a wavelength (Wk), a zoom position (Zk).
 """
 
+import itertools
 import re
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import NamedTuple
 
 from raytrace.io.source import (
     IGNORED,
@@ -146,25 +146,17 @@ def commands(text: str, file: str) -> Iterator[Record]:
             _, *words = line.split(None, 2)
             yield Record(COMMENT, tuple(words), words[-1] if len(words) > 1 else "", place, False)
             continue
-        held, start = _uncommented(line, place), start if waiting else line_number
-        if held.rstrip().endswith("&"):
-            waiting += held.rstrip()[:-1]
+        pieces = list(itertools.takewhile(lambda piece: piece != "!", _PIECE.findall(line)))
+        if mark := next((piece for piece in pieces if piece in "'\""), None):
+            raise LensFileError(f"a text that begins with {mark} does not end on its line", place)
+        content, start = "".join(pieces), start if waiting else line_number
+        if content.rstrip().endswith("&"):
+            waiting += content.rstrip()[:-1]
             continue
-        yield from _parted(waiting + held, Place(file, start))
+        yield from _parted(waiting + content, Place(file, start))
         waiting = ""
     if waiting:
         raise LensFileError("the last line ends in &, which continues it: file cut off?", Place(file, start))
-
-
-def _uncommented(line: str, place: Place) -> str:
-    held = ""
-    for piece in _PIECE.findall(line):
-        if piece == "!":
-            break
-        if piece in "'\"":
-            raise LensFileError(f"a text that begins with {piece} does not end on its line", place)
-        held += piece
-    return held
 
 
 def _parted(line: str, place: Place) -> Iterator[Record]:
@@ -196,21 +188,15 @@ def unquoted(word: str) -> str:
 # -- commands to blocks -----------------------------------------------------------------------------------------------
 
 
-class Sections(NamedTuple):
-    """A file sorted: the system, one block per surface, private glasses by name, comments of this package."""
-
-    system: Block
-    surfaces: list[Block]
-    private: dict[str, Record]
-    comments: list[Record]
-
-
 class Stream:
-    """The commands so far; they are read in their order, as CODE V does."""
+    """A file sorted, its commands read in their order as CODE V does: the system and the surfaces.
+
+    private: private glasses by name; comments: those of this package.
+    """
 
     def __init__(self, file: str, report: Draft):
-        self.file, self.report = file, report
-        self.system, self.surfaces = Block(Place(file)), []
+        self.report, self.system = report, Block(Place(file))
+        self.surfaces: list[Block] = []
         self.private: dict[str, Record] = {}
         self.comments: list[Record] = []
         self.pointer: Block | None = None
@@ -231,22 +217,21 @@ class Stream:
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
             raise LensFileError("variables of macros (^) are not followed; export the lens as numbers", record.place)
         elif zoom := next((match for word in record.words[:2] if (match := _ZOOM.fullmatch(word))), None):
-            self._take_zoomed(record, zoom)
+            if int(zoom[1]) == 1 and record.keyword in SYSTEM_READ | SURFACE_READ:
+                words = tuple(word for word in record.words if word != zoom[0])
+                self._take_command(record._replace(words=words))
+            else:
+                self.report.met(record.keyword[:40], IGNORED, record.place, "of another zoom position, or left out")
         else:
             self._take_command(record)
 
-    def _take_zoomed(self, record: Record, zoom: re.Match) -> None:
-        words = tuple(word for word in record.words if word != zoom[0])
-        if int(zoom[1]) == 1 and record.keyword in SYSTEM_READ | SURFACE_READ:
-            self._take_command(record._replace(words=words))
-        else:
-            self.report.met(record.keyword[:40], IGNORED, record.place, "of another zoom position, or left out")
-
     def _take_command(self, record: Record) -> None:
         word = record.keyword
-        if word in REFUSED and not _has_no_effect(record):
-            place = self._place(record)
-            raise UnsupportedSurface(f"{word} ({REFUSED[word]}) is not modelled", place)
+        if word in REFUSED:
+            numbers = [plain(number) for number in record.words if is_number(number)]
+            is_off = [switch.upper() for switch in record.words] in (["N"], ["NO"])
+            if not is_off and (any(numbers) or not numbers):
+                raise UnsupportedSurface(f"{word} ({REFUSED[word]}) is not modelled", self._place(record))
         if word in _HANDLED or _SURFACE.fullmatch(word):
             self.report.met("S" if _SURFACE.fullmatch(word) else word, READ, self._place(record))
             _HANDLED.get(word, Stream._surface)(self, record)
@@ -269,28 +254,23 @@ class Stream:
         name, count = record.keyword[1:], len(self.surfaces)
         number = 0 if name == "O" else int(name) if name.isdigit() else None
         number = count - 1 if name == "I" and self.has_image else number
-        if number is None or number == count:
-            self._append(record, "image" if name == "I" else "object" if name == "O" else "surface")
-        elif number < count:
+        if number is not None and number > count:
+            raise LensFileError(f"S{number} where S{count} should follow; lines lost or reordered?", record.place)
+        if number is not None and number < count:
             self.pointer = self.surfaces[number]
         else:
-            raise LensFileError(f"S{number} where S{count} should follow; lines lost or reordered?", record.place)
-        self._first_numbers(record._replace(place=self._place(record)))
-
-    def _append(self, record: Record, role: str) -> None:
-        count = len(self.surfaces)
-        refuse_surplus(self.surfaces, record.place)
-        if self.has_image:
-            raise LensFileError("a surface after SI, the image", record.place)
-        if (count == 0) != (role == "object"):
-            raise LensFileError(f"{record.keyword} as surface {count}; a lens begins with SO, the object", record.place)
-        self.has_image = role == "image"
-        self.pointer = Block(record.place._replace(surface=count))
-        self.surfaces.append(self.pointer)
-
-    def _first_numbers(self, record: Record) -> None:
-        """Radius or curvature, thickness, glass, and refract or reflect: as commands of their own."""
-        words, place = record.words, record.place
+            refuse_surplus(self.surfaces, record.place)
+            if self.has_image:
+                raise LensFileError("a surface after SI, the image", record.place)
+            if (count == 0) != (name == "O"):
+                message = f"{record.keyword} as surface {count}; a lens begins with SO, the object"
+                raise LensFileError(message, record.place)
+            self.has_image = name == "I"
+            self.pointer = Block(record.place._replace(surface=count))
+            self.surfaces.append(self.pointer)
+        # radius or curvature, thickness, glass, and refract or reflect: as commands of their own
+        words, record = record.words, record._replace(place=self._place(record))
+        place = record.place
         if len(words) == 1 or len(words) > 4:
             message = f"{record.keyword} with {len(words)} words, expected radius, thickness and glass"
             raise LensFileError(message, place)
@@ -307,26 +287,24 @@ class Stream:
         """A command of the surface it names, else of the current one."""
         block, words = self.pointer, record.words
         if words and _SURFACE.fullmatch(words[0]):
-            block, words = self._named(words[0], record.place), words[1:]
+            name = words[0][1:].upper()
+            number = 0 if name == "O" else len(self.surfaces) - 1 if name == "I" and self.has_image else -1
+            number = int(name) if name.isdigit() else number
+            if not 0 <= number < len(self.surfaces):
+                message = f"{shown(words[0])} is no surface so far; there are {len(self.surfaces)}"
+                raise LensFileError(message, record.place)
+            block, words = self.surfaces[number], words[1:]
         if block is None:
             raise LensFileError(f"{record.keyword} before the first surface (SO)", record.place)
         record = record._replace(words=words, place=record.place._replace(surface=block.place.surface))
         word = record.keyword
         if word in ("CUY", "RDY", "THI") and words and not is_number(words[0]):
-            return self.report.met(word, IGNORED, record.place, "solve: the stored value is read")
+            self.report.met(word, IGNORED, record.place, "solve: the stored value is read")
+            return
         self.report.met(word, READ, record.place)
         slot = "CUY" if word == "RDY" else "TYPE" if word in ("SPH", "CON", "ASP") else word
         slot = "APERTURE" if word in APERTURE_WORDS else "POSE" if word in POSE_TYPES else slot
         block.records.setdefault(slot, []).append(record)
-        return None
-
-    def _named(self, word: str, place: Place) -> Block:
-        name = word[1:].upper()
-        number = 0 if name == "O" else len(self.surfaces) - 1 if name == "I" and self.has_image else -1
-        number = int(name) if name.isdigit() else number
-        if not 0 <= number < len(self.surfaces):
-            raise LensFileError(f"{shown(word)} is no surface so far; there are {len(self.surfaces)}", place)
-        return self.surfaces[number]
 
     # -- commands that act at once
 
@@ -364,15 +342,7 @@ _HANDLED = {
 }
 
 
-def _has_no_effect(record: Record) -> bool:
-    """Whether a decentre or a like number is 0, or a feature that is not modelled is switched off."""
-    if [word.upper() for word in record.words] in (["N"], ["NO"]):
-        return True
-    numbers = [word for word in record.words if is_number(word)]
-    return bool(numbers) and not any(map(plain, numbers))
-
-
-def sections(text: str, file: str, report: Draft) -> Sections:
+def sections(text: str, file: str, report: Draft) -> Stream:
     """The commands of a text sorted, each of them reported."""
     stream = Stream(file, report)
     for record in commands(text, file):
@@ -383,4 +353,4 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         raise LensFileError("no surface (SO, S, SI); is it a sequence of CODE V (.seq)?", Place(file))
     if not stream.has_image:
         raise LensFileError(f"{len(stream.surfaces)} surfaces and no SI, the image: file cut off?", Place(file))
-    return Sections(stream.system, stream.surfaces, stream.private, stream.comments)
+    return stream

@@ -41,7 +41,7 @@ from raytrace.io.codev.keywords import (
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
-    Sections,
+    Stream,
     sections,
     unquoted,
 )
@@ -93,7 +93,9 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     if reference is None and len(waves) > 1:
         message = f"no REF: the reference of the {len(waves)} wavelengths is not specified; add REF 1 to {len(waves)}"
         raise LensFileError(message, source.place)
-    private = codev_glass.private_glasses(parts.private, waves, _comment_words(parts, "UNNAMED"), report)
+    private = {name: codev_glass.private_glass(row, waves, report) for name, row in parts.private.items()}
+    for name in {word.upper() for word in _comment_words(parts, "UNNAMED")} & private.keys():
+        private[name] = dataclasses.replace(private[name], name="")
     glasses = [record.words[0] for block in parts.surfaces for record in block.all("GLA") if record.words]
     came = codev_glass.came_with(file, glasses, catalogs, report)
     library = codev_glass.GlassLibrary(private, came, catalogs, waves)
@@ -278,12 +280,12 @@ def _vignetting(system: Block, count: int, report: Draft) -> list[list[float]]:
 # -- comments of this package, and commands that are left out ---------------------------------------------------------
 
 
-def _comment_words(parts: Sections, keyword: str) -> list[str]:
+def _comment_words(parts: Stream, keyword: str) -> list[str]:
     texts = (" ".join(record.words[1:]) for record in parts.comments if record.keyword == keyword)
     return [word for text in texts for word in words(text)]
 
 
-def _aiming(parts: Sections, report: Draft) -> str:
+def _aiming(parts: Stream, report: Draft) -> str:
     """CODE V aims reference rays at the stop; EPD is the diameter of the real beam on the axis."""
     comments = [record for record in parts.comments if record.keyword == "AIMING"]
     if not comments:

@@ -69,9 +69,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     fields = lens.fields
     if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
-        raise LensFileError(
-            "a temperature or pressure, which a .seq file does not hold here; write a table (.csv)", place
-        )
+        message = "a temperature or pressure, which a .seq file does not hold here"
+        raise LensFileError(f"{message}; write a table (.csv)", place)
     if fields.telecentric:
         raise LensFileError("a telecentric object space, which a .seq file does not hold here", place)
     waves = [codev_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
@@ -82,14 +81,14 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         f"TITLE {_quoted(lens.name, 'the title', place)}" if lens.name else "",
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
-        _listed("WL", waves),
+        _wrapped(["WL", *waves]),
         f"REF {lens.primary_wavelength}",
-        _listed("WTW", _weights(lens.wavelength_weights, "weight of a wavelength", place)),
-        _listed(x, exact_list(fields.x, "field", place)),
-        _listed(y, exact_list(fields.y, "field", place)),
-        _listed("WTF", _weights(fields.weight, "weight of a field", place)),
+        _wrapped(["WTW", *_weights(lens.wavelength_weights, "weight of a wavelength", place)]),
+        _wrapped([x, *exact_list(fields.x, "field", place)]),
+        _wrapped([y, *exact_list(fields.y, "field", place)]),
+        _wrapped(["WTF", *_weights(fields.weight, "weight of a field", place)]),
         *_vignetting(lens, place),
-        *map(_wrapped, codev_glass.private_lines(private, waves, place)),
+        *(_wrapped(line.split(" ")) for line in codev_glass.private_lines(private, waves, place)),
     ]
 
 
@@ -119,14 +118,10 @@ def _quoted(text: str, quantity: str, place: Place) -> str:
     return f"{mark}{line}{mark}"
 
 
-def _listed(keyword: str, words: Sequence[str]) -> str:
-    return _wrapped(f"{keyword} {' '.join(words)}")
-
-
-def _wrapped(line: str) -> str:
+def _wrapped(words: Sequence[str]) -> str:
     """A command over as many lines as it needs, all but the last ending in &."""
     lines = [""]
-    for part in line.split(" "):
+    for part in words:
         if lines[-1] and len(lines[-1]) + len(part) > _LINE:
             lines.append("")
         lines[-1] += f" {part}"
@@ -152,7 +147,7 @@ def _vignetting(lens: Lens, place: Place) -> list[str]:
     lines = []
     for axis, decentres, compressions in (("X", DX, CX), ("Y", DY, CY)):
         pairs = [_cut(float(d), float(c)) for d, c in zip(decentres, compressions, strict=True)]
-        lines += [_listed(f"V{side}{axis}", [pair[k] for pair in pairs]) for k, side in enumerate("UL")]
+        lines += [_wrapped([f"V{side}{axis}", *(pair[k] for pair in pairs)]) for k, side in enumerate("UL")]
     return lines
 
 
@@ -162,16 +157,13 @@ def _cut(decentre: float, compression: float) -> tuple[str, str]:
     high, low = map(Fraction, short)
     if float((low - high) / 2) == decentre and float((low + high) / 2) == compression:
         return short
-    high, low = Fraction(compression) - Fraction(decentre), Fraction(compression) + Fraction(decentre)
-    return _decimal(high), _decimal(low)
-
-
-def _decimal(number: Fraction) -> str:
-    """All digits of a fraction whose denominator is a power of two."""
-    power = number.denominator.bit_length() - 1
-    digits = str(abs(number.numerator) * 5**power).rjust(power + 1, "0")
-    sign = "-" if number < 0 else ""
-    return f"{sign}{digits[: len(digits) - power]}.{digits[len(digits) - power :] or 0}"
+    texts = []
+    for number in (Fraction(compression) - Fraction(decentre), Fraction(compression) + Fraction(decentre)):
+        power = number.denominator.bit_length() - 1  # of two
+        digits = str(abs(number.numerator) * 5**power).rjust(power + 1, "0")
+        point = len(digits) - power
+        texts.append(f"{'-' if number < 0 else ''}{digits[:point]}.{digits[point:] or 0}")
+    return texts[0], texts[1]
 
 
 # -- surfaces ---------------------------------------------------------------------------------------------------------
@@ -284,10 +276,8 @@ def _phase(phase: RadialPhase, wavelength: float, place: Place) -> list[str]:
 def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
     lines = []
     if sum(not aperture.obscures for aperture in apertures) > 1:
-        message = (
-            "several clear apertures on one surface, of which a .seq file has one; put the others on dummy surfaces"
-        )
-        raise LensFileError(message, place)
+        message = "several clear apertures on one surface, of which a .seq file has one"
+        raise LensFileError(f"{message}; put the others on dummy surfaces", place)
     for k, aperture in enumerate(apertures, 1):
         if aperture.shape not in APERTURES:
             raise LensFileError(f"a {aperture.shape} as aperture, which a .seq file does not hold", place)

@@ -28,11 +28,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.io.assembly import catalogs_needed
+from raytrace.io.assembly import catalogs_needed, environment_at
 from raytrace.io.source import (
     LensFileError,
     Place,
-    double,
     exact,
     exact_list,
     integer,
@@ -43,7 +42,7 @@ from raytrace.io.source import (
     word,
 )
 from raytrace.io.table.text import Table
-from raytrace.materials.environment import REFERENCE, Environment, objection
+from raytrace.materials.environment import REFERENCE, Environment
 from raytrace.materials.glass import LINES
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Lens
 
@@ -101,15 +100,12 @@ def environment(table: Table) -> Environment | None:
 
 def environment_of(cells: Mapping[str, str], place: Place) -> Environment:
     """Of texts for the temperature and the pressure; a missing one is that of catalogs."""
-    numbers = [double(normal) for normal in REFERENCE]
+    numbers = list(REFERENCE)
     for k, (key, unit) in enumerate(ENVIRONMENT.items()):
         if key in cells:
             bare = cells[key].strip()
-            numbers[k] = double(number(bare.removesuffix(unit).rstrip("° ") if bare != unit else bare, key, place))
-    air = Environment(*numbers)
-    if wrong := objection(air):
-        raise LensFileError(wrong.replace("`", ""), place)
-    return air
+            numbers[k] = number(bare.removesuffix(unit).rstrip("° ") if bare != unit else bare, key, place)
+    return environment_at(numbers, place)
 
 
 def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> tuple[str, float]:

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.io.assembly import environment_at
 from raytrace.io.source import (
     IGNORED,
     READ,
@@ -33,6 +34,7 @@ from raytrace.io.source import (
     LensFileError,
     Place,
     Record,
+    by_word,
     double,
     exact,
     is_infinite,
@@ -43,7 +45,7 @@ from raytrace.io.source import (
 from raytrace.io.zemax.surfaces import FIELD_LISTS, Sections, aperture_keywords, glass_source, is_blank
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass
-from raytrace.materials.environment import REFERENCE, Environment, objection
+from raytrace.materials.environment import REFERENCE, Environment
 from raytrace.materials.glass import Glass
 from raytrace.system import configurations
 from raytrace.system.configurations import Operand, Path, ScaledPath, differences, part, same, taken, with_part
@@ -131,9 +133,8 @@ ROWS = {
 KEPT = ("MOFF", "CWGT")
 
 #: Operands that are known and left out, with the reason.
-_LEFT_OUT = {
-    word: reason
-    for reason, words in {
+_LEFT_OUT = by_word(
+    {
         "coatings refract no rays": "COTN",
         "global coordinate reference: changes no ray": "GCRS GCPR",
         "polarisation": "GPEX GPEY GPIU GPJX GPJY GPPX GPPY GQPO",
@@ -141,15 +142,15 @@ _LEFT_OUT = {
         "shift of the pupil for the program's own ray aiming": "PSHX PSHY PSHZ PSCX PSCY PUCN",
         "coefficient of thermal expansion": "TCEX",
         "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MCHI",
-    }.items()
-    for word in words.split()
-}
+    }
+)
 
-#: Operands that are known and not modelled: a configuration in which they differ is refused.
-_REFUSED = (
-    *("IGNR", "IGNM", "SATP", "FLTP", "AFOC", "APDF", "APDT", "APTP", "UDAF", "CAOR", "CBOR", "CROR", "CRSR", "SRTS"),
-    *("CSP1", "CSP2", "PSP1", "PSP2", "PSP3", "TSP1", "TSP2", "TSP3"),
-    *("NCOM", "NCOT", "NGLS", "NPAR", "NPOS", "NPRO"),
+#: Operands that are known, with the reason why a configuration in which they differ is refused.
+_REFUSED = by_word(
+    {
+        "it is not modelled": "IGNR IGNM SATP FLTP AFOC APDF APDT APTP UDAF CAOR CBOR CROR CRSR SRTS CSP1 CSP2 PSP1 "
+        "PSP2 PSP3 TSP1 TSP2 TSP3 NCOM NCOT NGLS NPAR NPOS NPRO"
+    }
 )
 
 
@@ -175,10 +176,6 @@ class Cell(NamedTuple):
     @property
     def key(self) -> tuple[str, int, int]:
         return self.name, self.number, self.parameter
-
-    def __str__(self) -> str:
-        value = f"{plain(self.value):g}" if is_number(self.value) else self.value or '""'
-        return f"{self.name} {self.number} = {value}"
 
 
 _CELL = re.compile(r'\s*(-?\d{1,6})\s+(-?\d{1,6})\s+("[^"]*"|\S+)(.*)', re.ASCII)
@@ -233,9 +230,9 @@ def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cel
     operands = []
     for group in groups:
         by_number = {cell.configuration: cell for cell in group}
-        missing = [k for k in range(1, count + 1) if k not in by_number]
+        missing = [str(k) for k in range(1, count + 1) if k not in by_number]
         if missing and group[0].name not in KEPT:
-            listed = ", ".join(map(str, missing[:8]))
+            listed = ", ".join(missing[:8])
             message = f"{group[0].name} {group[0].number} has no value for configuration {listed}; the first is taken"
             report.warn(message, group[0].record.place)
         operands.append(tuple(by_number.get(k, group[0]) for k in range(1, count + 1)))
@@ -253,29 +250,30 @@ def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cel
 
 def applied(sections: Sections, cell: Cell, value: str) -> Sections:
     """The records with an operand of ROWS at a value. Raises LensFileError for a surface (field …) not present."""
-    row, last = ROWS[cell.name], len(sections.surfaces) - 1
+    row, surfaces, last = ROWS[cell.name], list(sections.surfaces), len(sections.surfaces) - 1
     if row.keyword == "STOP":
-        return _with_stop(sections, cell, value)
-    surfaces = list(sections.surfaces)
-    if cell.covered is not None:
-        for k in cell.covered:
-            _refuse_outside(cell, k, last)
-            old = surfaces[k].last("ENVD")
-            words = list(old.words if old else (OF_LENS, OF_LENS))
-            words[row.position] = value
-            new = Record("ENVD", tuple(words), " ".join(words), cell.record.place._replace(surface=k), True)
-            surfaces[k] = _with_record(surfaces[k], old, new)
+        number = int(plain(value)) if is_number(value) else -1
+        if not 0 < number < last:
+            raise LensFileError(f"STPS is {shown(value)}; expected a surface from 1 to {last - 1}", cell.record.place)
+        surfaces = [_with_record(block, old, None) if (old := block.last("STOP")) else block for block in surfaces]
+        stop = Record("STOP", (), "", cell.record.place._replace(surface=number), True)
+        surfaces[number] = _with_record(surfaces[number], None, stop)
         return sections._replace(surfaces=surfaces)
-    if row.of != "surface":
+    if row.of != "surface" and cell.covered is None:
         return sections._replace(system=_put(sections.system, cell, value))
-    _refuse_outside(cell, cell.number, last)
-    surfaces[cell.number] = _put(surfaces[cell.number], cell, value)
-    return sections._replace(surfaces=_followed(surfaces, sections.surfaces))
-
-
-def _refuse_outside(cell: Cell, number: int, last: int) -> None:
-    if not 0 <= number <= last:
-        raise LensFileError(f"{cell.name} of surface {number}; expected one from 0 to {last}", cell.record.place)
+    for k in (cell.number,) if cell.covered is None else cell.covered:
+        if not 0 <= k <= last:
+            raise LensFileError(f"{cell.name} of surface {k}; expected one from 0 to {last}", cell.record.place)
+    if cell.covered is None:
+        surfaces[cell.number] = _put(surfaces[cell.number], cell, value)
+        return sections._replace(surfaces=_followed(surfaces, sections.surfaces))
+    for k in cell.covered:
+        old = surfaces[k].last("ENVD")
+        words = list(old.words if old else (OF_LENS, OF_LENS))
+        words[row.position] = value
+        new = Record("ENVD", tuple(words), " ".join(words), cell.record.place._replace(surface=k), True)
+        surfaces[k] = _with_record(surfaces[k], old, new)
+    return sections._replace(surfaces=surfaces)
 
 
 def word_of(sections: Sections, cell: Cell) -> str | None:
@@ -340,69 +338,21 @@ def _numbered(block: Block, keyword: str, number: str) -> Record | None:
 
 def _with_record(block: Block, old: Record | None, new: Record | None) -> Block:
     """A block with one record in place of another; `old` None: added; `new` None: removed."""
-    changed = Block(block.place)
-    changed.records = dict(block.records)
-    keyword = (new or old).keyword
+    changed, keyword = Block(block.place), (new or old).keyword
     listed = [new if record is old else record for record in block.records.get(keyword, ())]
-    listed += [new] if old is None else []
-    listed = [record for record in listed if record is not None]
-    if listed:
-        changed.records[keyword] = listed
-    else:
-        changed.records.pop(keyword, None)
+    listed = [record for record in (*listed, *([new] if old is None else [])) if record is not None]
+    changed.records = {**block.records, keyword: listed}
+    if not listed:
+        del changed.records[keyword]
     return changed
-
-
-def _with_stop(sections: Sections, cell: Cell, value: str) -> Sections:
-    number, last = int(plain(value)) if is_number(value) else -1, len(sections.surfaces) - 2
-    if not 0 < number <= last:
-        raise LensFileError(f"STPS is {shown(value)}; expected a surface from 1 to {last}", cell.record.place)
-    surfaces = [_with_record(block, old, None) if (old := block.last("STOP")) else block for block in sections.surfaces]
-    stop = Record("STOP", (), "", cell.record.place._replace(surface=number), True)
-    surfaces[number] = _with_record(surfaces[number], None, stop)
-    return sections._replace(surfaces=surfaces)
 
 
 # -- pickups and solves of the surfaces -------------------------------------------------------------------------------
 
 
-class Pickup(NamedTuple):
-    """A number of a surface that is factor · (that of another) + offset; the file stores it as a word of `record`."""
-
-    record: Record
-    position: int
-    source: int
-    factor: float
-    offset: float
-
-    def value(self, block: Block, number: str) -> float | None:
-        """The number by a block of the source; number: of the PARM."""
-        keyword = self.record.keyword
-        record = _numbered(block, keyword, number) if keyword == "PARM" else block.last(keyword)
-        if not record or self.position >= len(record.words) or not is_number(record.words[self.position]):
-            return None
-        return self.factor * plain(record.words[self.position]) + self.offset
-
-
-def _pickups(block: Block) -> list[tuple[Pickup, str]]:
-    """The pickups of a surface, each with the number of its PARM.
-
-    PPAR j surface factor offset: parameter j; PZUP surface factor offset: thickness; CURV c 4 surface factor. That of
-    a glass is GLAS name 2 surface.
-    """
-    pickups = []
-    for record in block.all("PPAR", "PZUP", "CURV"):
-        first = {"PPAR": 1, "PZUP": 0, "CURV": 2}[record.keyword]
-        numbers = [plain(word) for word in record.words[first : first + 3] if is_number(word)]
-        if len(numbers) < 2 or (record.keyword == "CURV" and (record.words[1] != "4" or any(numbers[2:]))):
-            continue
-        number = record.words[0]
-        keyword = {"PPAR": "PARM", "PZUP": "DISZ", "CURV": "CURV"}[record.keyword]
-        held = _numbered(block, "PARM", number) if keyword == "PARM" else block.last(keyword)
-        if held and numbers[0] == int(numbers[0]):
-            source, factor, *offset = int(numbers[0]), *numbers[1:]
-            pickups.append((Pickup(held, int(keyword == "PARM"), source, factor, sum(offset)), number))
-    return pickups
+#: Pickups of numbers: by the keyword of the rule, that of the number, its word, and the first word of the rule.
+#: PPAR j surface factor offset: parameter j; PZUP surface factor offset: thickness; CURV c 4 surface factor.
+_PICKUPS = {"PPAR": ("PARM", 1, 1), "PZUP": ("DISZ", 0, 0), "CURV": ("CURV", 0, 2)}
 
 
 def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
@@ -410,18 +360,30 @@ def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
 
     A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
     """
+
+    def holder(block: Block, keyword: str, number: str) -> Record | None:
+        return _numbered(block, keyword, number) if keyword == "PARM" else block.last(keyword)
+
     for k, block in enumerate(surfaces):
-        for pickup, number in _pickups(before[k]):
-            if not 0 <= pickup.source < k or surfaces[pickup.source] is before[pickup.source]:
+        for rule in before[k].all(*_PICKUPS):
+            keyword, position, first = _PICKUPS[rule.keyword]
+            numbers = [plain(word) for word in rule.words[first : first + 3] if is_number(word)]
+            if len(numbers) < 2 or (keyword == "CURV" and (rule.words[1] != "4" or any(numbers[2:]))):
                 continue
-            old, new = (pickup.value(blocks[pickup.source], number) for blocks in (before, surfaces))
-            stored = pickup.record.words[pickup.position] if pickup.position < len(pickup.record.words) else ""
-            if old is None or new is None or old == new or not is_number(stored):
+            source, factor, offset = int(numbers[0]), numbers[1], sum(numbers[2:])
+            if source != numbers[0] or not 0 <= source < k or surfaces[source] is before[source]:
                 continue
-            if abs(plain(stored) - old) <= 1e-9 * abs(old) + 1e-300:
-                words = list(pickup.record.words)
-                words[pickup.position] = repr(new)
-                block = _with_record(block, pickup.record, pickup.record._replace(words=tuple(words)))
+            blocks = before[k], before[source], surfaces[source]
+            records = [holder(each, keyword, rule.words[0]) for each in blocks]
+            texts = [record.words[position] if record and position < len(record.words) else "" for record in records]
+            if not all(map(is_number, texts)):
+                continue
+            stored, *sources = map(plain, texts)
+            old, new = (factor * number + offset for number in sources)
+            if old != new and abs(stored - old) <= 1e-9 * abs(old) + 1e-300:
+                words = list(records[0].words)
+                words[position] = repr(new)
+                block = _with_record(block, records[0], records[0]._replace(words=tuple(words)))
         surfaces[k] = _with_picked_glass(block, surfaces, before)
     return surfaces
 
@@ -475,19 +437,20 @@ def read(sections: Sections, lens: Lens, rebuild: Rebuild, report: Draft, config
     agreeing = [k for k in range(1, count + 1) if all(_agrees(placed, lens, k) is not False for placed in operands)]
     active = stated if is_stated else agreeing[0] if agreeing else 1
     if count > 1:
-        _report_active(head, count, active, operands, bool(stated or len(agreeing) == 1), configuration, report)
+        sure = stated or len(agreeing) == 1
+        which = f"configuration {active} of {count}" if sure else f"one of {count} configurations (taken for {active})"
+        varied = ", ".join(sorted({placed.operand.name for placed in operands})[:8]) or "nothing"
+        message = f"multi-configuration file: {which} read, as stored in its surfaces; they differ in {varied}"
+        if configuration is not None:
+            report.note(message.replace(" read,", ","))
+            report.note(f"configuration {configuration} of {count} read, as requested")
+        elif active == 1 and sure:
+            report.note(message)
+        else:
+            report.warn(message, head.place)
     for placed in operands:
         _report_operand(placed, lens, active, count, report)
     _report_solved(sections, operands, active, report)
-    lens = _with_operands(lens, operands, count, active)
-    try:
-        return lens if configuration is None else lens.configuration(configuration)
-    except ValueError as error:
-        raise LensFileError(str(error), head.place) from error
-
-
-def _with_operands(lens: Lens, operands: Sequence[PlacedOperand], count: int, active: int) -> Lens:
-    """The lens with its operands, all their places modelled; an unused one keeps the count where no other does."""
     for placed in operands:
         for place in placed.operand.paths if placed.operand.numbers is not None else ():
             if part(lens, place.path) is None:
@@ -496,25 +459,32 @@ def _with_operands(lens: Lens, operands: Sequence[PlacedOperand], count: int, ac
     listed = [taken(p.operand, lens, active - 1) if _agrees(p, lens, active) else p.operand for p in operands]
     listed = tuple(o for o in listed if o.name != "MOFF" or o.numbers is not None or any(map(any, o.words)))
     if count > 1 and not listed:
-        listed = (Operand("MOFF", words=(("",),) * count),)
-    return dataclasses.replace(lens, operands=listed, current_configuration=active)
+        listed = (Operand("MOFF", words=(("",),) * count),)  # keeps the count
+    lens = dataclasses.replace(lens, operands=listed, current_configuration=active)
+    try:
+        return lens if configuration is None else lens.configuration(configuration)
+    except ValueError as error:
+        raise LensFileError(str(error), head.place) from error
 
 
 def _placed_operand(cells: tuple[Cell, ...], sections: Sections, lens: Lens, rebuild: Rebuild) -> PlacedOperand:
     """The operand of these cells with its places in the lens, or the reason why it is not followed."""
     first, values = cells[0], tuple(cell.value for cell in cells)
-    named = {"name": first.name, "number": first.number, "parameter": first.parameter}
-    words = tuple((value,) for value in values)
+    texts = tuple((value,) for value in values)
+
+    def placed(like: Lens = lens, **fields) -> PlacedOperand:
+        return PlacedOperand(Operand(first.name, first.number, first.parameter, **fields), cells, like)
+
     numbers = double([plain(value) for value in values]) if all(map(is_number, values)) else None
-    unplaced = Operand(**named, numbers=numbers, words=words if numbers is None else ())
+    unplaced = placed(words=texts) if numbers is None else placed(numbers=numbers)
     if first.name in KEPT:
-        return PlacedOperand(unplaced, cells, lens)
+        return unplaced
     if first.name in _REFUSED:
-        return PlacedOperand(Operand(**named, words=words, refusal="it is not modelled"), cells, lens)
+        return placed(words=texts, refusal=_REFUSED[first.name])
     try:
         lenses = {value: rebuild(applied(sections, cell, value)) for cell, value in zip(cells, values, strict=True)}
     except (LensFileError, UnknownGlass) as error:
-        return PlacedOperand(Operand(**named, words=words, refusal=str(error)), cells, lens)
+        return placed(words=texts, refusal=str(error))
     row, probes = ROWS[first.name], []
     if not row.path:
         try:
@@ -524,23 +494,21 @@ def _placed_operand(cells: tuple[Cell, ...], sections: Sections, lens: Lens, reb
     start = ("surfaces", first.number) if row.of == "surface" else ()
     paths = [(*start, *row.path.split("."))] if row.path else []
     readings = probes or [lens, *lenses.values()]
-    paths += [path for other in readings[1:] for path in differences(readings[0], other) if path not in paths]
+    paths += [path for other in readings[1:] for path in differences(readings[0], other)]
     paths = list(dict.fromkeys(paths))
     if not paths:
-        return PlacedOperand(unplaced, cells, lens)
+        return unplaced
     held = [[part(lenses[value], path) for path in paths] for value in values]
     if scaled_paths := _linear_paths(paths, probes, held):
         numbers = torch.stack([double(0.0) if parts[0] is None else parts[0] for parts in held])
-        return PlacedOperand(Operand(**named, paths=scaled_paths, numbers=numbers), cells, probes[0])
+        return placed(probes[0], paths=scaled_paths, numbers=numbers)
     for *owner, end in paths:
         if part(lens, (*owner, end)) is None and not (isinstance(end, str) and part(lens, tuple(owner)) is not None):
-            refusal = "the lens as stored has no such part, an aperture for example"
-            return PlacedOperand(Operand(**named, words=words, refusal=refusal), cells, lens)
+            return placed(words=texts, refusal="the lens as stored has no such part, an aperture for example")
     scaled_paths = tuple(map(ScaledPath, paths))
     if all(isinstance(parts[0], Glass) and all(same(parts[0], other) for other in parts) for parts in held):
-        media = tuple(parts[0] for parts in held)
-        return PlacedOperand(Operand(**named, paths=scaled_paths, media=media), cells, lens)
-    return PlacedOperand(Operand(**named, paths=scaled_paths, words=tuple(map(tuple, held))), cells, lens)
+        return placed(paths=scaled_paths, media=tuple(parts[0] for parts in held))
+    return placed(paths=scaled_paths, words=tuple(map(tuple, held)))
 
 
 def _linear_paths(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[ScaledPath, ...]:
@@ -587,36 +555,15 @@ def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | Non
 # -- reporting --------------------------------------------------------------------------------------------------------
 
 
-def _report_active(
-    head: Record,
-    count: int,
-    active: int,
-    operands: Sequence[PlacedOperand],
-    sure: bool,
-    requested: int | None,
-    report: Draft,
-) -> None:
-    """Report the configuration that the surfaces of the file hold: that which was active when it was saved."""
-    which = f"configuration {active} of {count}" if sure else f"one of {count} configurations (taken for {active})"
-    varied = ", ".join(sorted({placed.operand.name for placed in operands})[:8]) or "nothing"
-    message = f"multi-configuration file: {which} read, as stored in its surfaces; they differ in {varied}"
-    if requested is not None:
-        report.note(message.replace(" read,", ","))
-        report.note(f"configuration {requested} of {count} read, as requested")
-    elif active == 1 and sure:
-        report.note(message)
-    else:
-        report.warn(message, head.place)
-
-
 def _report_operand(placed: PlacedOperand, lens: Lens, active: int, count: int, report: Draft) -> None:
     """Warn of an operand that is not followed, and of one that contradicts the surfaces."""
     cell, operand = placed.cells[active - 1], placed.operand
-    place, label = cell.record.place, f"multi-configuration operand {cell}"
+    text = f"{plain(cell.value):g}" if is_number(cell.value) else cell.value or '""'
+    place, label = cell.record.place, f"multi-configuration operand {cell.name} {cell.number} = {text}"
     if cell.name in ENVIRONMENT_OPERANDS and not operand.paths:
         normal, unit, quantity = {"PRES": (1, "atm", "pressure"), "TEMP": (20, "°C", "temperature")}[cell.name]
         if is_number(cell.value) and plain(cell.value) != normal:
-            message = f"{cell.name} {plain(cell.value):g} {unit} ({quantity} of configuration {cell.configuration})"
+            message = f"{cell.name} {text} {unit} ({quantity} of configuration {cell.configuration})"
             report.warn(f"{message}: not followed; indices are those at {normal} {unit}", place)
     elif operand.refusal:
         if count == 1 or any(other.value != cell.value for other in placed.cells):
@@ -649,15 +596,13 @@ def _report_solved(sections: Sections, operands: Sequence[PlacedOperand], active
     for block in sections.surfaces:
         curvature = block.last("CURV")
         if curvature and len(curvature.words) > 1 and curvature.words[1] not in ("0", "1", "4"):
-            solved.append(("CURV", block.place.surface))
+            solved.append(("CRVT", block.place.surface))
         if block.last("MAZH"):
-            solved.append(("DISZ", block.place.surface))
-    operand_keywords = {"CRVT": "CURV", "THIC": "DISZ"}
-    set_by_operands = {(operand_keywords.get(p.operand.name), p.operand.number) for p in operands}
-    left = [
-        f"{keyword} of surface {surface}" for keyword, surface in solved if (keyword, surface) not in set_by_operands
-    ]
-    varying = (p.operand.values() for p in operands if refracts(p.operand))
+            solved.append(("THIC", block.place.surface))
+    listed = [placed.operand for placed in operands]
+    set_by_operands = {(operand.name, operand.number) for operand in listed}
+    left = [f"{ROWS[name].keyword} of surface {k}" for name, k in solved if (name, k) not in set_by_operands]
+    varying = (operand.values() for operand in listed if refracts(operand))
     if left and any(value != values[0] for values in varying for value in values):
         message = f"solved for configuration {active}, and unchanged in the others: {', '.join(left)}"
         report.warn(message, sections.system.last("MNUM").place)
@@ -671,30 +616,22 @@ def environment(system: Block) -> Environment | None:
     record = system.last("ENVD")
     if record is None or not record.integer(2, "whether indices follow the environment", 0):
         return None
-    return _checked(record.number(0, "temperature"), record.number(1, "pressure"), record.place)
-
-
-def _checked(temperature: float, pressure: float, place: Place) -> Environment:
-    air = Environment(double(temperature), double(pressure))
-    if wrong := objection(air):
-        raise LensFileError(wrong.replace("`", ""), place)
-    return air
+    return environment_at((record.number(0, "temperature"), record.number(1, "pressure")), record.place)
 
 
 def in_environments(
     surfaces: Sequence[Surface], blocks: Sequence[Block], around: Environment | None
 ) -> tuple[Surface, ...]:
     """The surfaces with their own environments, which `applied` writes as ENVD into their blocks."""
-    if around is None:
-        return tuple(surfaces)
     changed = list(surfaces)
-    for k, block in enumerate(blocks):
+    for k, block in enumerate(blocks if around is not None else ()):
         if record := block.last("ENVD"):
-            values = []
-            for position, name in enumerate(ENVIRONMENT_OPERANDS.values()):
-                of_lens = float((around.temperature, around.pressure)[position])
-                values.append(of_lens if record.words[position] == OF_LENS else record.number(position, name))
-            changed[k] = dataclasses.replace(changed[k], environment=_checked(*values, record.place))
+            of_lens = float(around.temperature), float(around.pressure)
+            values = [
+                of_lens[position] if record.words[position] == OF_LENS else record.number(position, name)
+                for position, name in enumerate(ENVIRONMENT_OPERANDS.values())
+            ]
+            changed[k] = dataclasses.replace(changed[k], environment=environment_at(values, record.place))
     return tuple(changed)
 
 

@@ -147,6 +147,13 @@ class TypedSurface(NamedTuple):
     def solve(self, quantity: str, kind: str, numbers: Iterable[float] = (), source: int = 0) -> Solve:
         return Solve(self.number, quantity, kind, tuple(numbers), source=source)
 
+    def coded(self, quantity: str, keyword: str, kinds: dict[int, str]) -> Solve:
+        """The rule of a code, and the surface that it refers to."""
+        code = self.code(keyword)
+        refers = code in kinds and kinds[code] != "substitute"
+        source = self.block.last(keyword).integer(2, "surface", 0) if refers else 0
+        return self.solve(quantity, kinds.get(code, f"code {code}"), source=source)
+
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
         """scale times a quantity of a surface, the same one unless another is named, plus an offset."""
         pickup = {"source": source, "scale": scale, "offset": offset, "quantity_of_source": other}
@@ -161,32 +168,29 @@ class TypedSurface(NamedTuple):
 
 def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft) -> Iterator[Vary | Solve]:
     """In the order of evaluation: parameters, curvature, thickness; then conic, extra data, glass, semi-diameter."""
+    block = typed.block
     for j, record in typed.numbered("PPAR"):
         yield from _parameter_pickup(typed, j, record, surfaces)
-    yield from _curvature_rules(typed, report)
+    if (code := typed.code("CURV")) and typed.has("curvature", block.last("CURV"), report):
+        yield _curvature_rule(typed, code)
     yield from _thickness_rules(typed)
-    if (record := typed.block.last("VCON")) and typed.has("conic", record, report):
+    if (record := block.last("VCON")) and typed.has("conic", record, report):
         yield Vary(typed.number, "conic")
-    for keyword, (j, record) in (
-        *(("PARM", pair) for pair in typed.numbered("VPAR")),
-        *(("XDAT", pair) for pair in typed.numbered("XDAT") if pair[1].integer(2, "code", 0)),
-    ):
-        if keyword == "XDAT" and record.integer(2, "code") != _VARIABLE:
-            yield typed.solve(f"XDAT {j}", f"code {record.integer(2, 'code')}", _solve_numbers(record, 3))
-            continue
-        named, _ = typed.names(keyword, j)
-        if named:
-            yield Vary(typed.number, named[0].name)
-            yield from _followers(typed, named)
-        else:
-            yield typed.solve(f"{keyword} {j}", "variable")
-    yield from _glass_rules(typed)
-    code = typed.code("DIAM")
-    if code in _SEMI_DIAMETER_RULES:
-        source = typed.block.last("DIAM").integer(2, "surface", 0)
-        yield typed.solve("semi_diameter", _SEMI_DIAMETER_RULES[code], source=source)
-    elif code not in (0, _FIXED):
-        yield typed.solve("semi_diameter", f"code {code}")
+    for j, _ in typed.numbered("VPAR"):
+        yield from _parameter_variable(typed, "PARM", j)
+    for j, record in typed.numbered("XDAT"):
+        if (code := record.integer(2, "code", 0)) == _VARIABLE:
+            yield from _parameter_variable(typed, "XDAT", j)
+        elif code:
+            yield typed.solve(f"XDAT {j}", f"code {code}", _solve_numbers(record, 3))
+    if (code := typed.code("GLAS")) == _MODEL:
+        for k, name in _GLASS_NUMBERS.items():
+            if block.last("GLAS").number(k, "status", 0.0) == _VARIABLE:
+                yield Vary(typed.number, name)
+    elif code:
+        yield typed.coded("glass", "GLAS", _GLASS_RULES)
+    if typed.code("DIAM") not in (0, _FIXED):
+        yield typed.coded("semi_diameter", "DIAM", _SEMI_DIAMETER_RULES)
 
 
 def _solve_numbers(record: Record, first: int) -> list[float]:
@@ -215,20 +219,15 @@ def _source(numbers: list[float], before: int) -> int | None:
     return int(numbers[0]) if is_surface else None
 
 
-def _curvature_rules(typed: TypedSurface, report: Draft) -> Iterator[Vary | Solve]:
-    record, code = typed.block.last("CURV"), typed.code("CURV")
-    if not record or not code or not typed.has("curvature", record, report):
-        return
+def _curvature_rule(typed: TypedSurface, code: int) -> Vary | Solve:
     if code == _VARIABLE:
-        yield Vary(typed.number, "curvature")
-        return
-    numbers = _solve_numbers(record, 2)
+        return Vary(typed.number, "curvature")
+    numbers = _solve_numbers(typed.block.last("CURV"), 2)
     source = _source(numbers, typed.number)
     if code == _CURVATURE_PICKUP and source is not None and not any(numbers[2:]):
-        yield typed.pickup("curvature", source, numbers[1] if len(numbers) > 1 else 1.0)
-        return
+        return typed.pickup("curvature", source, numbers[1] if len(numbers) > 1 else 1.0)
     row = CURVATURE_SOLVES.get(code, SolveRow(f"code {code}"))
-    yield typed.solve("curvature", row.kind, _scaled(numbers, row, typed.millimetres))
+    return typed.solve("curvature", row.kind, _scaled(numbers, row, typed.millimetres))
 
 
 def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
@@ -271,26 +270,17 @@ def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Seq
     yield from _followers(typed, named)
 
 
-def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> Iterator[Solve]:
+def _parameter_variable(typed: TypedSurface, keyword: str, j: int) -> list[Vary | Solve]:
+    named, _ = typed.names(keyword, j)
+    if not named:
+        return [typed.solve(f"{keyword} {j}", "variable")]
+    return [Vary(typed.number, named[0].name), *_followers(typed, named)]
+
+
+def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> list[Solve]:
     """The further numbers of the lens that a number of the file gives, as pickups of the first."""
-    first = named[0]
-    for other in named[1:]:
-        yield typed.pickup(other.name, typed.number, other.factor / first.factor, other=first.name)
-
-
-def _glass_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
-    record, code = typed.block.last("GLAS"), typed.code("GLAS")
-    if not record or not code:
-        return
-    if code == _MODEL:
-        for k, name in _GLASS_NUMBERS.items():
-            if record.number(k, "status", 0.0) == _VARIABLE:
-                yield Vary(typed.number, name)
-    elif code in _GLASS_RULES:
-        source = record.integer(2, "surface", 0) if _GLASS_RULES[code] == "pickup" else 0
-        yield typed.solve("glass", _GLASS_RULES[code], source=source)
-    else:
-        yield typed.solve("glass", f"code {code}")
+    first, *others = named
+    return [typed.pickup(n.name, typed.number, n.factor / first.factor, other=first.name) for n in others]
 
 
 # -- the optimisation data of a file, read ----------------------------------------------------------------------------
@@ -323,7 +313,11 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
     kept = tuple(solve for solve in solves if not _is_followed(solve))
     for solve in kept:
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
-    merit, tolerances = merit_rows(tail, report), _tolerances(tail, report)
+    merit, lines = merit_rows(tail, report), [record for record in tail if record.keyword in _TOLERANCES]
+    for record in lines:
+        report.met(record.keyword, READ, record.place)
+    states_none = all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in lines)
+    tolerances = [] if states_none else [f"{record.keyword} {record.text.strip()}".rstrip() for record in lines]
     margin = sections.system.last("SDMA")
     percent, length = (
         measured(margin, k, "margin of semi-diameters", millimetres, 0.0) if margin else 0.0 for k in (0, 2)
@@ -333,7 +327,7 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
         tuple(solve for solve in solves if _is_followed(solve)),
         merit,
         unit=millimetres if merit or tolerances or configured else 1.0,
-        tolerances=tolerances,
+        tolerances=tuple(tolerances),
         semi_diameters=tuple(
             k for k, typed in enumerate(surfaces) if typed.surface.semi_diameter and typed.code("DIAM") == _FIXED
         ),
@@ -363,31 +357,28 @@ def _path_of(surface: Surface, quantity: str) -> LensPath | None:
 
 def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and solves and pickups of them."""
+
+    def modelled(typed: TypedSurface, name: str) -> Surface:
+        if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
+            data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
+            for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
+                named, like = typed.names(keyword, j)
+                if name in [number.name for number in named]:
+                    return like
+        return typed.surface
+
     moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
     for solve in data.solves:
-        if solve.operand is not None or solve.quantity == "glass":
-            continue
         source = (solve.source, solve.quantity_of_source or solve.quantity)
-        if solve.kind != "pickup" or source in moving:
+        if solve.operand is None and solve.quantity != "glass" and (solve.kind != "pickup" or source in moving):
             moving.add((solve.surface, solve.quantity))
     changed = list(lens.surfaces)
     for number, name in sorted(moving):
-        like = _like(surfaces[number], name)
+        like = modelled(surfaces[number], name)
         path = _path_of(like, name)
         if path is not None and part(changed[number], path) is None:
             changed[number] = with_part(changed[number], path, double(0.0), like=like)
     return dataclasses.replace(lens, surfaces=tuple(changed))
-
-
-def _like(typed: TypedSurface, name: str) -> Surface:
-    """A surface in which a quantity is modelled."""
-    if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
-        data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
-        for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
-            named, like = typed.names(keyword, j)
-            if name in [number.name for number in named]:
-                return like
-    return typed.surface
 
 
 def _configuration_rules(sections: Sections, lens: Lens) -> Iterator[Vary | Solve]:
@@ -413,29 +404,23 @@ def _configuration_rules(sections: Sections, lens: Lens) -> Iterator[Vary | Solv
         status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
         if operand is None or not status or not 1 <= cell.configuration <= len(lens.operands[operand]):
             continue
-        lens_places = lens.operands[operand].paths[:1]
-        name = _quantity_at(lens, lens_places[0].path) if lens_places else ""
+        number, name = cell.number, ""
+        for path, *_ in lens.operands[operand].paths[:1]:
+            if len(path) > 2 and path[0] == "surfaces":  # the quantity of that surface
+                surface = lens.surfaces[path[1]]
+                names = (n for n in ("thickness", *parameter_paths(surface)) if _path_of(surface, n) == path[2:])
+                number, name = path[1], next(names, "")
         where = {"configuration": cell.configuration, "operand": operand}
-        if status == _VARIABLE and name:
-            yield Vary(lens_places[0].path[1], name, **where)
-        elif status == _VARIABLE:
-            yield Solve(cell.number, cell.name, "variable", **where)
-        else:
-            numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
-            source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
-            is_row = row == int(row) and 0 < row <= len(of_rows) and of_rows[int(row) - 1] is not None
-            kind = _CONFIGURATION_RULES.get(status, f"status {status}")
-            followed = (float(of_rows[int(row) - 1]),) if is_row else ()
-            pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
-            yield Solve(cell.number, name or cell.name, kind, **pickup, **where)
-
-
-def _quantity_at(lens: Lens, path: tuple) -> str:
-    """The quantity of a surface by its path in the lens; "" of any other path."""
-    if len(path) < 3 or path[0] != "surfaces":
-        return ""
-    surface = lens.surfaces[path[1]]
-    return next((name for name in ("thickness", *parameter_paths(surface)) if _path_of(surface, name) == path[2:]), "")
+        if status == _VARIABLE:
+            yield Vary(number, name, **where) if name else Solve(cell.number, cell.name, "variable", **where)
+            continue
+        numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
+        source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
+        is_row = row == int(row) and 0 < row <= len(of_rows) and of_rows[int(row) - 1] is not None
+        kind = _CONFIGURATION_RULES.get(status, f"status {status}")
+        followed = (float(of_rows[int(row) - 1]),) if is_row else ()
+        pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
+        yield Solve(cell.number, name or cell.name, kind, **pickup, **where)
 
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------
@@ -484,16 +469,6 @@ def _is_row(record: Record) -> bool:
     """Whether a line with an unknown name has the form of a row."""
     first = record.words[:9]
     return bool(_OPERAND.fullmatch(record.keyword)) and len(first) > 7 and all(map(is_number, first))
-
-
-def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
-    """The lines of tolerances unchanged; none where the file states that there are none."""
-    tolerances = [record for record in lines if record.keyword in _TOLERANCES]
-    for record in tolerances:
-        report.met(record.keyword, READ, record.place)
-    if all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in tolerances):
-        return ()
-    return tuple(f"{record.keyword} {record.text.strip()}".rstrip() for record in tolerances)
 
 
 def read_merit(path: str | PathLike) -> tuple[Row, ...]:
@@ -594,21 +569,20 @@ def _code_of(kind: str, codes: dict[int, str]) -> int:
 
 def changed(lines: Lines, keyword: str, words: dict[int, str]) -> Lines:
     """The lines of a surface with other words, counted from the keyword, in those of a keyword."""
-
-    def change(line: str) -> str:
+    changed_lines = []
+    for line in lines:
         old = line.split()
-        if old[0] != keyword:
-            return line
-        old += ["0"] * (max(words) + 1 - len(old))
-        return "  " + " ".join(words.get(k, word) for k, word in enumerate(old))
-
-    return [change(line) for line in lines]
+        if old[0] == keyword:
+            old += ["0"] * (max(words) + 1 - len(old))
+            line = "  " + " ".join(words.get(k, word) for k, word in enumerate(old))
+        changed_lines.append(line)
+    return changed_lines
 
 
 def _behind(lines: Lines, start: str, line: str) -> Lines:
     """The lines with one inserted behind the one of that start, or at the end."""
-    at = next((k for k, other in enumerate(lines) if f"{other} ".startswith(f"  {start} ")), len(lines) - 1)
-    return [*lines[: at + 1], f"  {line}", *lines[at + 1 :]]
+    at = next((k for k, other in enumerate(lines, 1) if f"{other} ".startswith(f"  {start} ")), len(lines))
+    return [*lines[:at], f"  {line}", *lines[at:]]
 
 
 def _thickness_line(rule: Vary | Solve, place: Place) -> str:
@@ -671,10 +645,10 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
 
 def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
     """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
-    row = types().get(type_of(surface) or "")
+    row, by_name = types().get(type_of(surface) or ""), {}
     if row is None:
-        return {}
-    numbers, by_name = row.numbers(surface)._replace(size=surface.semi_diameter), {}
+        return by_name
+    numbers = row.numbers(surface)._replace(size=surface.semi_diameter)
     data = 0 if numbers.terms is None else len(numbers.terms)
     for keyword, j in (*(("PARM", j) for j in row.parameters), *(("XDAT", FIRST_TERM + k) for k in range(data))):
         for named in row.names(surface, numbers, keyword, j)[0]:
