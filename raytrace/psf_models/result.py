@@ -65,7 +65,7 @@ class Kernels:
     @property
     def dark(self) -> Tensor:
         """Which kernels no traced ray reaches, (D, F, W): their moments are 0, without meaning."""
-        return _is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
+        return _is_dark(self, *self.ray_moments, of_waves=self.ray_centroid is not None)
 
 
 @value
@@ -168,15 +168,14 @@ class Psf(Result):
 
     def _entry(self, place: tuple[int, ...]) -> dict:
         at = (slice(None), *place)
+        xx_xy_yy = {"covariance": self.covariance[at], "ray_covariance": self.ray_covariance[at]}
         return {
             "object_distance": number(self.object_distances[place[0]]),
             "field": numbers(self.fields[:, place[1]]),
             **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
-            **{key: numbers(getattr(self, key)[at]) for key in ("centroid", "ray_centroid")},
-            **{  # [[xx, xy], [xy, yy]]
-                key: [numbers(getattr(self, key)[at][:2]), numbers(getattr(self, key)[at][1:])]
-                for key in ("covariance", "ray_covariance")
-            },
+            "centroid": numbers(self.centroid[at]),
+            "ray_centroid": numbers(self.ray_centroid[at]),
+            **{key: [numbers(moments[:2]), numbers(moments[1:])] for key, moments in xx_xy_yy.items()},
             "energy": number(self.energy[place]),
             "error": number(self.error[place]),
             "residual": None if self.residual is None else number(self.residual[place]),
@@ -240,13 +239,11 @@ def centroid_and_covariance(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor
 
 
 def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) and covariance (3, ...) of all light of K distributions (2, ..., K), (3, ..., K).
-
-    energy: (..., K), theirs.
+    """Centroid (2, ...) and covariance (3, ...) of the light of K distributions, (2, ..., K) and (3, ..., K).
 
         m = Σ_k s_k m_k,   C = Σ_k s_k (C_k + (m_k - m)(m_k - m)ᵀ),   s_k = E_k / Σ E
 
-    Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
+    Nothing large is subtracted (Chan, Golub and LeVeque, Stanford STAN-CS-79-773, 1979, eq. 2.1).
     """
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
     mean, apart = centroid_and_covariance(*centroid, share)
@@ -255,7 +252,7 @@ def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tenso
 
 def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
     """Sum over wavelengths by their weights, with the moments of the sum of the distributions; None keeps each."""
-    window_moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
+    moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
     waves = kernels.ray_centroid is not None
     kernel, energy, residual, arrived = kernels.kernel, kernels.energy, kernels.residual, kernels.arrived
     if weights is not None:
@@ -264,44 +261,28 @@ def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
         residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
         rays = mixture(torch.where(kernels.dark, 0.0, share), *rays)
         # The light inside a window counts by its energy there.
-        window_moments = mixture(share * energy, *window_moments) if waves else rays
+        moments = mixture(share * energy, *moments) if waves else rays
         energy = kernel.sum((-2, -1))
     centre = kernels.grid.centre if kernels.grid.centre.dim() == 1 else kernels.grid.centre[..., 0]
-    return Psf(
-        kernel=kernel,
-        grid=dataclasses.replace(kernels.grid, centre=centre),
-        energy=energy,
-        error=torch.full_like(energy.detach(), torch.nan),
-        centroid=window_moments[0],
-        covariance=window_moments[1],
-        ray_centroid=rays[0],
-        ray_covariance=rays[1],
-        residual=residual,
-        arrived=arrived,
-        model=model,
-        waves=waves,
-        rays=kernels.rays,
-    )
+    grid, error = dataclasses.replace(kernels.grid, centre=centre), torch.full_like(energy.detach(), torch.nan)
+    light = {"residual": residual, "arrived": arrived, "model": model, "waves": waves, "rays": kernels.rays}
+    return Psf(kernel, grid, energy, error, *moments, *rays, **light)
 
 
 def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
     """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
-    rays = psfs.ray_centroid, psfs.ray_covariance
-    dark = _is_dark(psfs.kernel, *rays, psfs.rays, of_waves=psfs.waves)
+    moments = {"centroid": psfs.centroid, "covariance": psfs.covariance}
+    moments |= {"ray_centroid": psfs.ray_centroid, "ray_covariance": psfs.ray_covariance}
+    dark = _is_dark(psfs, psfs.ray_centroid, psfs.ray_covariance, of_waves=psfs.waves)
     if empty == "error" and bool(dark.any()):
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
-        raise EmptyPsf(
-            f"no ray reaches the sensor in {int(dark.sum())} of {dark.numel()} PSFs, those of index {places}"
-        )
-    names = "centroid", "covariance", "ray_centroid", "ray_covariance"
-    lit = where_lit(~dark, *(getattr(psfs, name) for name in names), empty=empty)
-    return dataclasses.replace(psfs, **dict(zip(names, lit, strict=True)))
+        dark_of_all = f"{int(dark.sum())} of {dark.numel()}"
+        raise EmptyPsf(f"no ray reaches the sensor in {dark_of_all} PSFs, those of index {places}")
+    lit = where_lit(~dark, *moments.values(), empty=empty)
+    return dataclasses.replace(psfs, **dict(zip(moments, lit, strict=True)))
 
 
-def _is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
-    """Which kernels (..., rows, columns) no ray reaches: their light and the moments of their rays are all exactly 0.
-
-    Light outside the window has a centroid. of_waves: whose reference, the chief ray, has one in any case.
-    """
-    empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
-    return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)
+def _is_dark(light: Kernels | Psf, centroid: Tensor, covariance: Tensor, *, of_waves: bool) -> Tensor:
+    """Which kernels no ray reaches: light and moments of rays are exactly 0, but the reference of waves, a centroid."""
+    empty = (light.kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
+    return empty & (of_waves | (centroid == 0).all(0)) & (light.rays > 0)
