@@ -50,10 +50,10 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     """Kernels of the Fourier model about the paraxial chief ray.
 
     zernike: Noll coefficients from 1 on, (J,) or (J, D, F, W) with axes of length 1 to broadcast, mm RMS of path.
-    order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error. centroid and
-    covariance are those of the light inside the window, since the second moment of a hard-edged diffraction pattern
-    does not exist; ray_centroid and ray_covariance are those of the geometric limit. Raises ValueError where the window
-    or the blur would need too many pupil points, Bent as the paraxial model.
+    order: from -2 on; each one adds pupil points and pixel nodes. centroid and covariance are those of the light inside
+    the window: the second moment of a hard-edged diffraction pattern does not exist; ray_centroid and ray_covariance
+    those of the geometric limit. Raises ValueError where the window or the blur would need too many pupil points, Bent
+    as the paraxial model.
     """
     need_one_focus(scene.lens, "the Fourier PSF model", "take model=wave, which traces the wavefront")
     # In single precision a phase of hundreds of radians has three digits.

@@ -45,12 +45,12 @@ class Light:
 def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """Gaussians with the centroid and covariance of `order` Gauss rings of 4·(order - 1) arms, 8 at least.
 
-    Only rays that the scene's symmetry does not give are traced: `order` rays of one meridian if every field is on the
-    axis of a rotationally symmetric lens, half the pupil if every field lies in the y-z plane of a lens symmetric about
-    it. σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give
-    9e-8. Where rays are lost, rings follow the clear part of every arm, see `trace_light`. The energy is the
-    transmitted fraction of the light through the whole entrance pupil, of which vignetting factors leave the share (1 -
-    VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
+    Only rays that the scene's symmetry does not give are traced: `order` rays of one meridian on the axis of a
+    rotationally symmetric lens, half the pupil for fields in the y-z plane of a lens symmetric in x. σ of the double
+    Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give 9e-8. Where rays fail,
+    rings follow the clear part of every arm, see `trace_light`. The energy is the transmitted fraction of the light
+    through the whole entrance pupil, of which vignetting factors leave the share (1 - VCX)(1 - VCY); 0 with gradient 0
+    where no ray arrives.
     """
     light, shape, gaussians = _kernels(scene, grid, order)
     return dataclasses.replace(gaussians, residual=residual(light, grid, shape, order, symmetry(scene)))
@@ -74,9 +74,9 @@ def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kerne
 def trace_light(scene: Scene, order: int, fold: str) -> Light:
     """The rays of an order, of the part of the pupil that symmetry needs.
 
-    If any ray is lost, of these or of those at the rim that are added for a lens with apertures, or an obstruction lies
-    in the pupil, 2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ
-    then err by 2e-4 at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
+    If any ray fails, of these or of those at the rim of a lens with apertures, or an obstruction lies in the pupil,
+    2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ then err by 2e-4
+    at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
     """
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     count = 0

@@ -73,12 +73,10 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
 
 def by_field(scene: Scene, grid: Grid, compute: Callable[[Scene, Grid], Kernels]) -> Kernels:
     """Kernels field by field, in double precision: in single precision the OPD itself is known to 1/400 wave only."""
-    fields = []
+    fields, centre = [], grid.centre
     for f in range(scene.shape[1]):
-        centre = grid.centre
-        if centre.dim() > 1 and centre.shape[2] > 1:
-            centre = centre[:, :, f : f + 1]
-        window = to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)
+        at = centre[:, :, f : f + 1] if centre.dim() > 1 and centre.shape[2] > 1 else centre
+        window = to(dataclasses.replace(grid, centre=at), dtype=torch.float64)
         fields.append(compute(one_field(scene, f), window))
     merged = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
     return dataclasses.replace(to(merged, dtype=grid.pitch.dtype), grid=grid)

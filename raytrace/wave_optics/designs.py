@@ -53,7 +53,7 @@ def aim(
     wavelength: float | Tensor = 0.55,
     exact: bool = False,
 ) -> Aim:
-    """The Aim of these numbers, by default f/7.1 at 1 m. Raises ValueError for one that is not positive and finite."""
+    """The Aim of these numbers, by default f/7.1 at 1 m. Raises ValueError for numbers not positive and finite."""
     numbers = {"radius": radius, "sensor": sensor, "focus": focus, "wavelength": wavelength}
     for name, number in numbers.items():
         if not number > 0 or (name != "focus" and not number < math.inf):

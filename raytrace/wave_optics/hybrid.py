@@ -236,7 +236,7 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
         spread = torch.where(front.usable, torch.linalg.vector_norm(front.landing + shift, dim=0), 0.0).amax(-1)
         alone = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         # `waves` samples 2πn a/λ of phase for each mm between a ray and a point, a the spread of directions.
-        steps = sum(phase(e, beam, probe.wavelength) for e in elements for phase in (_phase_of_steps, _phase_of_turns))
+        steps = sum(_phase_of_steps(element, beam, probe.wavelength) for element in elements)
         steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / (1e-3 * probe.wavelength))
         return float((spread + steps - alone).max())
 
@@ -252,7 +252,7 @@ def _slopes(elements: tuple[Element, ...], stop: Tensor, wavelengths: Tensor) ->
 
 
 def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) in radians along a radius that represents the steps of flat pixels, rings and wrapped heights."""
+    """Phase (W,) in radians along a radius that represents the steps of an element, and its periods round the pupil."""
     profile, none = element.profile, torch.zeros_like(wavelengths)
     excess = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths
     if is_flat(element):
@@ -261,20 +261,13 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
         slope = torch.stack([*steps, heights.new_zeros(())]).max() / profile.pitch
         least = torch.where(slope > 0, _PER_PIXEL * beam / profile.pitch, 0.0)
         return torch.maximum(excess * slope * beam, least + none)
-    if element.period is None:
-        return none
-    return _PER_ZONE * excess * beam * torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
-
-
-def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) that extends the margin of `rings_and_arms` to polynomials of more than one period round the pupil."""
-    coefficients, none = getattr(element.profile, "coefficients", None), torch.zeros_like(wavelengths)
-    if not isinstance(element.profile, Zernike) or not bool((coefficients != 0).any()):
-        return none
-    turns = max(abs(noll(int(j) + 1)[1]) for j in torch.nonzero(coefficients))
-    slope = torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
-    phase = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths * slope * beam
-    return max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
+    phase = excess * torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max() * beam
+    total = none if element.period is None else _PER_ZONE * phase
+    if isinstance(profile, Zernike) and bool((profile.coefficients != 0).any()):
+        # Extends the margin of `rings_and_arms` to polynomials of more than one period round the pupil.
+        turns = max(abs(noll(int(j) + 1)[1]) for j in torch.nonzero(profile.coefficients))
+        total = total + max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
+    return total
 
 
 def _disc(radius: Tensor) -> Tensor:

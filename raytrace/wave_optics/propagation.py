@@ -146,9 +146,8 @@ def to_radii(scene: WaveScene, rho: Tensor, nodes: int) -> tuple[Tensor, Tensor]
 
 def radial_kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
     """Energy in the pixels (D, W, rows, columns), 1 = all through the aperture."""
-    U = phasors(scene, sums.r, sums.sphere)
     # A real matrix on the columns Re U, Im U of all depths.
-    parts = torch.view_as_real(U).permute(1, 2, 0, 3).flatten(2)
+    parts = torch.view_as_real(phasors(scene, sums.r, sums.sphere)).permute(1, 2, 0, 3).flatten(2)
     parts = (sums.bessel @ parts).unflatten(-1, (-1, 2))
     intensity = (parts**2).sum(-1).permute(2, 0, 1)
     return unfold(scene.grid, intensity @ sums.to_pixels.T)
