@@ -1,7 +1,7 @@
-"""Budget: memory is predicted where a sampling is decided, and what would take too much is refused before it begins.
+"""Budget: memory is predicted where a sampling is chosen, and computations that need too much are refused.
 
-A limit is set for a block by `within`; without one it is half of what the machine, or the control group that the
-process runs in, has free.
+The limit is set for a block by `within`, by default half of the free memory of the machine or of the control group of
+the process.
 """
 
 import contextlib
@@ -15,29 +15,29 @@ from pathlib import Path
 
 from raytrace.words import calling_level
 
-_SMALL = 2**24  # bytes that nobody is asked about
+_SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
-_PIECE = 2**27  # bytes that a piece of what is cut into pieces takes
-_KEPT = 2**30  # bytes: blocks up to this size, and free memory up to twice as much, stay with the process
+_PIECE = 2**27  # bytes of a chunk
+_KEPT = 2**30  # bytes: blocks up to this size, and freed memory up to twice as much, are not returned
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
-#: Predicted peak of a trace without a graph, beside its result: measured, with OPD and moments (tests/test_budget.py).
+#: Peak of a trace without a graph, without its result: measured, with OPD and moments (tests/test_budget.py).
 RAY_BYTES = 400
 
 _limit: contextvars.ContextVar[float | None] = contextvars.ContextVar("limit", default=None)
 
 
 class OverBudget(ValueError):
-    """More memory would be needed than there is; the message says for what, and what helps."""
+    """More memory is needed than available; the message has the cause and a remedy."""
 
 
 class TakesLong(UserWarning):
-    """What follows is predicted to take more than half a minute; the message says what, how long, and what helps."""
+    """A computation is predicted to take more than half a minute; the message has its time and a remedy."""
 
 
 @contextlib.contextmanager
 def within(max_bytes: float | None) -> Iterator[None]:
-    """Within the block, refuse what is predicted to take more memory; None: more than half of what is free then."""
+    """Within the block, refuse computations that need more memory; None: more than half of the free memory."""
     token = _limit.set(max_bytes)
     try:
         yield
@@ -46,9 +46,9 @@ def within(max_bytes: float | None) -> Iterator[None]:
 
 
 def afford(needed: float, what: str, *, helps: str) -> None:
-    """Raise OverBudget if `needed` bytes are more than may be taken.
+    """Raise OverBudget if `needed` bytes exceed the limit.
 
-    what: the thing with its size and cause, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: what to change.
+    what: the cause and its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy.
     """
     if needed <= _SMALL:
         return
@@ -61,45 +61,45 @@ def afford(needed: float, what: str, *, helps: str) -> None:
 
 
 def forewarn(seconds: float, what: str, *, helps: str) -> None:
-    """Warn TakesLong where something is predicted to take long, to a factor of three; arguments as for `afford`."""
+    """Warn TakesLong of a long predicted time, right to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:
         length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
         warnings.warn(f"{what}: about {length}; for less, {helps}", TakesLong, stacklevel=calling_level())
 
 
 def allowed_bytes() -> float:
-    """How much may be taken: what `within` says, else half of what is free."""
+    """The limit: that of `within`, else half of the free memory."""
     limit = _limit.get()
     return 0.5 * free_bytes() if limit is None else limit
 
 
 def piece(each: float) -> int:
-    """How many things of so many bytes each are worked on at a time, at least one."""
+    """Number of entries of `each` bytes in a chunk, at least one."""
     limit = _limit.get()
     return max(1, int((_PIECE if limit is None else min(_PIECE, 0.25 * limit)) // max(each, 1.0)))
 
 
 def free_bytes() -> float:
-    """Memory that the process may still take: of the machine, or of its control groups where that is less."""
+    """Free memory of the machine, or of the control groups of the process where that is less."""
     return min([_available(), *map(_left, _groups())])
 
 
 def keep_freed_memory() -> bool:
-    """Let large blocks that are freed stay with the process, where the C library can; whether it can.
+    """Keep large freed blocks in the process; returns whether the C library can.
 
-    glibc gives every block above 32 MB at most back to the system, which hands it out again page by page, each cleared:
-    a tenth to a sixth of the processor time of large traces and of training. It is a choice for the whole process, so
-    that the command makes it and the library does not.
+    glibc returns every block above 32 MB to the system, which provides it again page by page, each cleared: 10 to 17 %
+    of the processor time of large traces and of training. It affects the whole process: the command does it, the
+    library does not.
     """
     try:
-        tell = ctypes.CDLL(None).mallopt
+        set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return False
-    return bool(tell(_MMAP_THRESHOLD, _KEPT) and tell(_TRIM_THRESHOLD, 2 * _KEPT - 1))
+    return bool(set_option(_MMAP_THRESHOLD, _KEPT) and set_option(_TRIM_THRESHOLD, 2 * _KEPT - 1))
 
 
 def in_words(size: float) -> str:
-    """A number of bytes for people, as 1.5 GB."""
+    """A number of bytes as text, as 1.5 GB."""
     if not math.isfinite(size):
         return "more bytes than there are"
     for unit, worth in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
@@ -122,22 +122,22 @@ def _available() -> float:
 
 
 def _groups() -> list[Path]:
-    """Folders of the control groups that count this process's memory, of either version, up to the root."""
+    """Folders of the control groups of this process's memory, of either version, up to the root."""
     try:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
         return []
-    found = []
+    groups = []
     for _, controllers, path in (line.split(":", 2) for line in lines):
         if controllers in ("", "memory"):
             base = Path("/sys/fs/cgroup", controllers)
             inner = base / path.strip("/")
-            found += [inner, *(above for above in inner.parents if above.is_relative_to(base))]
-    return found
+            groups += [inner, *(above for above in inner.parents if above.is_relative_to(base))]
+    return groups
 
 
 def _left(group: Path) -> float:
-    """What a control group leaves, pages of files that can be dropped counted in; inf where it has no limit."""
+    """Free memory of a control group, with pages of files that can be dropped; inf without a limit."""
     for most, used, dropped in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),

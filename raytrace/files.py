@@ -61,14 +61,11 @@ def encoding(content: bytes) -> str:
 def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
     """Replace a file as a whole or not at all: `write` fills a temporary file, which is then renamed.
 
-    The temporary file, in the same folder, has no name until it is complete, where the system allows that: a process
-    killed before leaves no file. Other abandoned temporary files are removed by the next write of the same file. A link
-    is written through. Raises OSError naming `path` where it cannot be written, or is no regular file; other errors of
-    `write` pass through.
+    The temporary file, in the same folder, has no name until complete, where the system allows that: a killed process
+    leaves no file. Other abandoned temporary files of the target are removed. A link is written through. Raises OSError
+    naming `path` where it cannot be written, or is no regular file; other errors of `write` pass through.
     """
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        raise OSError(errno.EINVAL, "is not a regular file; give the name of a file to write", str(path))
+    target = _regular(path)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
     try:
         _remove_abandoned(target)
@@ -79,7 +76,11 @@ def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None])
             file.flush()
             os.fsync(file.fileno())
             if not isinstance(file.name, str | os.PathLike):
-                _give_name(file, temporary)
+                folder = os.open(target.parent, os.O_RDONLY)  # with it `link` follows the link that an open file is
+                try:
+                    os.link(f"{_OPEN_FILES}/{file.fileno()}", temporary, src_dir_fd=folder, follow_symlinks=True)
+                finally:
+                    os.close(folder)
             os.replace(temporary, target)
     except BaseException as error:
         with suppress(OSError):
@@ -97,15 +98,6 @@ def _unnamed(folder: Path) -> BinaryIO | None:
         return os.fdopen(os.open(folder, os.O_WRONLY | os.O_TMPFILE | os.O_CLOEXEC, 0o666), "wb")
     except OSError:
         return None
-
-
-def _give_name(file: BinaryIO, path: Path) -> None:
-    """Name a file that has none."""
-    folder = os.open(path.parent, os.O_RDONLY)  # with it `link` follows the symbolic link that an open file is
-    try:
-        os.link(f"{_OPEN_FILES}/{file.fileno()}", path, src_dir_fd=folder, follow_symlinks=True)
-    finally:
-        os.close(folder)
 
 
 def _remove_abandoned(target: Path) -> None:
@@ -152,9 +144,15 @@ def check_output(path: str | os.PathLike, suffixes: Sequence[str] = ()) -> None:
         raise ValueError(f"{path}: expected a name that ends in {', '.join(filter(None, suffixes))}")
     if target.is_dir():
         raise OSError(errno.EISDIR, "is a folder; give the name of a file to write", str(path))
+    _check_folder(_regular(path).parent, path)
+
+
+def _regular(path: str | os.PathLike) -> Path:
+    """The file that a path or link leads to. Raises OSError for one that is not regular."""
+    target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "is not a regular file; give the name of a file to write", str(path))
-    _check_folder(target.parent, path)
+    return target
 
 
 def check_output_folder(path: str | os.PathLike) -> None:

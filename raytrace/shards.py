@@ -1,9 +1,9 @@
-"""Shards: processes begun by torchrun that compute one thing together, and end together.
+"""Shards: processes started by torchrun that compute one result together, and end together.
 
     torchrun --nproc-per-node 2 -m raytrace psf LENS …
 
-Every process takes its `Share`, and `total` sums what they found, so that all of them have it; within `agreeing` they
-also take the same decisions and fail together. What runs in one process needs none of this, and pays for none of it.
+Every process takes its `Share`; `total` sums the parts, in all of them; within `agreeing` they also take the same
+decisions and fail together. A single process needs none of this, at no cost.
 """
 
 import contextlib
@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, distributed
 
 _NUMBERS = 8  # agreed on at once, at most
-_PATIENCE = 600.0  # s that processes wait for each other to begin
-_COURTESY = 10.0  # s that one with an error waits for the first process to say it
+_PATIENCE = 600.0  # s that processes wait for each other to start
+_COURTESY = 10.0  # s that a process with an error waits for the first process to report it
 
 
 class ProcessLost(ConnectionError):
@@ -28,12 +28,12 @@ class ProcessLost(ConnectionError):
 
 
 class FailedElsewhere(ValueError):
-    """Another process of the job refused its share; the message is its own."""
+    """Another process of the job refused its share; the message is that of its error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """What one process takes: of samples `rank`, `rank + processes`, …; of a row the part number `rank`."""
+    """The share of one process: samples `rank`, `rank + processes`, …, or part number `rank` of a row."""
 
     rank: int = 0
     processes: int = 1
@@ -42,7 +42,7 @@ class Share:
         return list(samples[self.rank :: self.processes])
 
     def part(self, count: int) -> slice:
-        """Neighbours among `count` things: all parts together are all of them, of equal size but for one."""
+        """Contiguous part of `count` entries; the sizes of parts differ by at most one."""
         return slice(count * self.rank // self.processes, count * (self.rank + 1) // self.processes)
 
 
@@ -53,14 +53,11 @@ def share() -> Share:
     return Share()
 
 
-# -- what processes tell each other ------------------------------------------------------------------------------------
+# -- communication between processes -----------------------------------------------------------------------------------
 
 
 def total(part: Tensor) -> Tensor:
-    """The sum of a tensor over all processes, in all of them the same to the last bit; without gradient.
-
-    Raises ProcessLost where one of them has ended.
-    """
+    """The sum of a tensor over all processes, bit-identical in all of them; without gradient. Raises ProcessLost."""
     if share().processes == 1:
         return part
     part = part.detach().clone(memory_format=torch.contiguous_format)
@@ -69,7 +66,7 @@ def total(part: Tensor) -> Tensor:
 
 
 def gathered(part: Tensor) -> Tensor:
-    """(processes, ...) from the tensor (...) of each of them, of one shape in all; without gradient."""
+    """(processes, ...) from the tensor (...) of each process, of one shape in all; without gradient."""
     mine = share()
     rows = part.new_zeros(mine.processes, *part.shape)
     rows[mine.rank] = part.detach()
@@ -78,10 +75,10 @@ def gathered(part: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def agreeing() -> Iterator[Callable[[Tensor], Tensor]]:
-    """Each process computes a part of one thing, with the same decisions; and an error in one is raised by all.
+    """Each process computes a part of one result, with the same decisions; an error in one is raised by all.
 
-    Yields what they decide by: of numbers () or (K,), K < 8, each the largest that a process has, without gradient.
-    Every process has to call it equally often in the block. Errors of others arrive there, or when it ends.
+    Yields a function from numbers () or (K,), K < 8, to the maximum of each over all processes, without gradient, which
+    every process calls equally often in the block. Errors of others are raised there, or at its end.
     """
     if share().processes == 1:
         yield lambda numbers: numbers
@@ -97,7 +94,7 @@ def agreeing() -> Iterator[Callable[[Tensor], Tensor]]:
 
 
 def _agree(numbers: Tensor, error: Exception | None = None) -> Tensor:
-    """The largest of each number; where a process comes with an error instead, raises it as FailedElsewhere."""
+    """The maximum of each number over processes; an error of another process is raised as FailedElsewhere."""
     mine = share()
     message = torch.zeros(_NUMBERS, dtype=torch.float64)  # on the CPU, where all processes can meet
     message[0] = 0 if error is None else mine.rank + 1
@@ -105,16 +102,12 @@ def _agree(numbers: Tensor, error: Exception | None = None) -> Tensor:
     _reduce(message, "MAX")
     failed = int(message[0])
     if failed:
-        text = [_said(error)]
+        expected = isinstance(error, ValueError | LookupError | OSError)
+        text = [f"{error}" if expected else f"{type(error).__name__}: {error}"]
         distributed.broadcast_object_list(text, src=failed - 1, device=torch.device("cpu"))
         if error is None:
             raise FailedElsewhere(text[0])
     return message[1 : 1 + numbers.numel()].reshape(numbers.shape).to(numbers)
-
-
-def _said(error: Exception | None) -> str:
-    expected = isinstance(error, ValueError | LookupError | OSError)
-    return f"{error}" if expected else f"{type(error).__name__}: {error}"
 
 
 def _reduce(numbers: Tensor, operation: str) -> None:
@@ -127,12 +120,12 @@ def _reduce(numbers: Tensor, operation: str) -> None:
     raise ProcessLost("another process of this job has ended before its share was done")
 
 
-# -- beginning and ending ----------------------------------------------------------------------------------------------
+# -- start and end -----------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """So many threads of torch for a while."""
+    """Within the block, this number of threads of torch."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -143,10 +136,10 @@ def torch_threads(count: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def processes() -> Iterator[Share]:
-    """The processes of torchrun for a while; only the first one speaks. Without torchrun, this one.
+    """Within the block, the processes of torchrun, of which only the first prints. Without torchrun, this process.
 
-    Tensors on the CPU travel by gloo, those on a GPU by NCCL; each process has a GPU of its own where there are enough.
-    An error ends all processes. It is raised by one, the first wherever it lives to do so; others leave by SystemExit.
+    Tensors on the CPU are sent by gloo, those on a GPU by NCCL; each process has its own GPU where there are enough. An
+    error ends all processes: one raises it, if possible the first; the others raise SystemExit.
     """
     if not (distributed.is_available() and distributed.is_torchelastic_launched()):
         yield Share()
@@ -154,10 +147,14 @@ def processes() -> Iterator[Share]:
     with _ended_by_signals():
         store = _begin()
         try:
-            with _silent_unless_first():
+            with contextlib.ExitStack() as stack:
+                if share().rank:
+                    nowhere = stack.enter_context(open(os.devnull, "w"))
+                    stack.enter_context(contextlib.redirect_stdout(nowhere))
+                    stack.enter_context(contextlib.redirect_stderr(nowhere))
                 yield share()
         except BaseException as error:
-            if not _is_to_speak(error, store):
+            if not _reports(error, store):
                 raise SystemExit(1) from None
             raise
         finally:
@@ -165,9 +162,9 @@ def processes() -> Iterator[Share]:
 
 
 def _begin() -> "distributed.Store":
-    """Meet the others and begin the process group; the store outlives any of the processes, for torchrun keeps it."""
-    # Its functions take the group of the moment for a default argument, and an optimiser imports it at the first step:
-    # then the group would outlive its end, and its threads, killed by the interpreter's, would abort the process.
+    """Start the process group once all processes are there; the store, kept by torchrun, outlives them."""
+    # Its functions take the current group as a default argument, and an optimiser imports it at the first step: then
+    # the group would outlive its end, and its threads, killed at the exit of the interpreter, would abort the process.
     importlib.import_module("torch.distributed.nn.functional")
     store, rank, count = next(iter(distributed.rendezvous("env://")))
     store = distributed.PrefixStore("raytrace", store)
@@ -202,20 +199,10 @@ def _ended_by_signals() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextlib.contextmanager
-def _silent_unless_first() -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        if share().rank:
-            nowhere = stack.enter_context(open(os.devnull, "w"))
-            stack.enter_context(contextlib.redirect_stdout(nowhere))
-            stack.enter_context(contextlib.redirect_stderr(nowhere))
-        yield
-
-
-def _is_to_speak(error: BaseException, store: "distributed.Store") -> bool:
-    """Whether this process is the one that says what went wrong: the first if it fails as well, else any one."""
+def _reports(error: BaseException, store: "distributed.Store") -> bool:
+    """Whether this process reports the error: the first if it fails as well, else any single one."""
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # on the way out already
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     with contextlib.suppress(RuntimeError):  # torchrun itself is gone, and the store with it
         if share().rank == 0:
             store.set("first failed", "")
@@ -228,7 +215,7 @@ def _is_to_speak(error: BaseException, store: "distributed.Store") -> bool:
 
 
 def _wait(condition: Callable[[], bool], seconds: float) -> bool:
-    """Whether a condition comes true in so many seconds; signals arrive meanwhile."""
+    """Whether a condition becomes true within a time in which signals are received."""
     until = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > until:

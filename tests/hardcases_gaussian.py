@@ -50,9 +50,9 @@ def check_gauss_pixel(case: dict) -> float:
             worst = max(worst, check_pixel_gradients(pixel.item(), gradients, leaves, expected, place))
         energy = Decimal(case["expected"]["window_energy"])
         gate = TAIL_SCORE if energy < Decimal(TAIL) and not is_wide(case) else PIXEL_SCORE
-        found = relative(pixels.sum().item(), energy) / ROUNDING
-        assert found <= gate, f"window energy: {found:.3g} u"
-        worst = max(worst, found / gate)
+        result = relative(pixels.sum().item(), energy) / ROUNDING
+        assert result <= gate, f"window energy: {result:.3g} u"
+        worst = max(worst, result / gate)
     return worst
 
 
@@ -77,21 +77,21 @@ def check_pixel(pixel: torch.Tensor, expected: dict, place: str, *, rotated: boo
     gate = ROUNDING * (TAIL_SCORE if value < Decimal(TAIL) else PIXEL_SCORE)
     if rotated and value < Decimal(ROTATED_TAIL):
         gate = ROTATED_TAIL_RELATIVE
-    found = relative(pixel.item(), value)
-    assert found <= gate, f"pixel {place}: {found / ROUNDING:.3g} u"
-    return found / gate
+    result = relative(pixel.item(), value)
+    assert result <= gate, f"pixel {place}: {result / ROUNDING:.3g} u"
+    return result / gate
 
 
 def check_pixel_gradients(pixel: float, gradients, leaves, expected: dict, place: str) -> float:
     """A derivative may err by its own gate and by what moves the pixel by its rounding (divided by the input)."""
     if "grad_mx_my_sxx_syy" not in expected:
         return 0.0
-    found = [*gradients[0].tolist(), gradients[1][0].item(), gradients[1][-1].item()]
+    result = [*gradients[0].tolist(), gradients[1][0].item(), gradients[1][-1].item()]
     inputs = [*leaves[0].tolist(), leaves[1][0].item(), leaves[1][-1].item()]
     sigmas = [math.sqrt(leaves[1][i].item()) for i in (0, -1)]
     worst = 0.0
     for got, wanted, number, scale in zip(
-        found, expected["grad_mx_my_sxx_syy"], inputs, [*sigmas, *inputs[2:]], strict=True
+        result, expected["grad_mx_my_sxx_syy"], inputs, [*sigmas, *inputs[2:]], strict=True
     ):
         assert math.isfinite(got), place
         gate = TAIL_SCORE if pixel < TAIL else 2 * PIXEL_SCORE
@@ -123,14 +123,14 @@ def check_spot(case: dict) -> float:
         error = float(abs(Decimal(got) - Decimal(wanted)))
         assert error <= 4 * ROUNDING * size, f"centroid {got} for {wanted}"
     if expected["rms"] is not None:
-        found = relative(spot.rms_radius.item(), Decimal(expected["rms"]))
-        assert found <= SPOT_RELATIVE, f"RMS: {found:.3g}"
-        worst = found / SPOT_RELATIVE
+        result = relative(spot.rms_radius.item(), Decimal(expected["rms"]))
+        assert result <= SPOT_RELATIVE, f"RMS: {result:.3g}"
+        worst = result / SPOT_RELATIVE
     mean_square = Decimal(expected["mean_square_radius"])
     if Decimal("1e-300") < mean_square < Decimal("1e300"):
-        found = relative(spot.mean_square_radius.item(), mean_square)
-        assert found <= 2 * SPOT_RELATIVE, f"mean square: {found:.3g}"
-        worst = max(worst, found / (2 * SPOT_RELATIVE))
+        result = relative(spot.mean_square_radius.item(), mean_square)
+        assert result <= 2 * SPOT_RELATIVE, f"mean square: {result:.3g}"
+        worst = max(worst, result / (2 * SPOT_RELATIVE))
     for name in ("mean_square", "rms"):
         reference = expected.get(f"grad_{name}_x")
         got = gradients[name][0]

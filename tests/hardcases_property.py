@@ -38,8 +38,8 @@ def outcome(case: dict, rays: list[int] | None = None) -> tuple[torch.Tensor, li
     values = torch.stack([result[output] for output in OUTPUTS])
     gradients = {}
     for row, output in zip(values, OUTPUTS, strict=True):
-        found = torch.autograd.grad(row.sum(), list(scene.parameters.values()), retain_graph=True, allow_unused=True)
-        for name, gradient in zip(scene.parameters, found, strict=True):
+        computed = torch.autograd.grad(row.sum(), list(scene.parameters.values()), retain_graph=True, allow_unused=True)
+        for name, gradient in zip(scene.parameters, computed, strict=True):
             gradients[output, name] = torch.zeros(values.shape[1:]) if gradient is None else gradient
     return values.detach(), result["status"], gradients
 
@@ -88,11 +88,11 @@ def traced(scene: Scene, position: torch.Tensor, direction: torch.Tensor) -> Ray
     return trace_surfaces(scene.surfaces, rays, indices=scene.indices)
 
 
-def assert_equal_rays(found: Rays, expected: Rays):
-    assert torch.equal(found.position, expected.position)
-    assert torch.equal(found.direction, expected.direction)
-    assert torch.equal(found.opl, expected.opl)
-    assert torch.equal(found.valid, expected.valid)
+def assert_equal_rays(computed: Rays, expected: Rays):
+    assert torch.equal(computed.position, expected.position)
+    assert torch.equal(computed.direction, expected.direction)
+    assert torch.equal(computed.opl, expected.opl)
+    assert torch.equal(computed.valid, expected.valid)
 
 
 def turning_rays_by_90_degrees_turns_results(case):
@@ -100,15 +100,15 @@ def turning_rays_by_90_degrees_turns_results(case):
     position, direction = raw(case, scene)
     plain = traced(scene, position, direction)
 
-    found = traced(scene, turned(position), turned(direction))
+    computed = traced(scene, turned(position), turned(direction))
     expected = Rays(turned(plain.position), turned(plain.direction), plain.valid, plain.opl)
     if engine() == "eager":
-        assert_equal_rays(found, expected)
+        assert_equal_rays(computed, expected)
         return
     # The compiled trace fuses y² into x² + y² and rounds once: not the same in x and y.
-    assert torch.equal(found.valid, expected.valid)
+    assert torch.equal(computed.valid, expected.valid)
     for name in ("position", "direction", "opl"):
-        assert_close(getattr(found, name), getattr(expected, name), rtol=1e-14, atol=1e-14)
+        assert_close(getattr(computed, name), getattr(expected, name), rtol=1e-14, atol=1e-14)
 
 
 def light_goes_back_the_way_it_came(case):
@@ -126,14 +126,14 @@ def light_goes_back_the_way_it_came(case):
             surface["a"] = [-a for a in surface["a"]]
     back = Scene(reversed_case, torch.float64, shared=True)
     flip = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None]
-    found = traced(back, last.position * flip, -last.direction * flip)
-    assert bool(found.valid.all())
-    offset = position * flip - found.position
-    across = torch.linalg.cross(offset, found.direction, dim=0)
+    computed = traced(back, last.position * flip, -last.direction * flip)
+    assert bool(computed.valid.all())
+    offset = position * flip - computed.position
+    across = torch.linalg.cross(offset, computed.direction, dim=0)
     size = sum(abs(surface["thickness"]) for surface in case["surfaces"]) + position.abs().max()
     # A few hundred roundings of the length of the system: two passes through every surface.
     assert across.abs().max() <= 300 * 2.0**-53 * size
-    assert (found.direction + direction * flip).abs().max() <= 300 * 2.0**-53
+    assert (computed.direction + direction * flip).abs().max() <= 300 * 2.0**-53
 
 
 def lengths_times_a_power_of_two_scale_exactly(case):
@@ -147,11 +147,11 @@ def lengths_times_a_power_of_two_scale_exactly(case):
             surface["a"] = [a / SCALE ** (2 * j + 3) for j, a in enumerate(surface["a"])]
     scene, big = Scene(case, torch.float64, shared=True), Scene(scaled, torch.float64, shared=True)
     position, direction = raw(case, scene)
-    plain, found = traced(scene, position, direction), traced(big, SCALE * position, direction)
+    plain, computed = traced(scene, position, direction), traced(big, SCALE * position, direction)
     assert bool(plain.valid.any())
-    assert torch.equal(found.position, SCALE * plain.position)
-    assert torch.equal(found.direction, plain.direction)
-    assert torch.equal(found.opl, SCALE * plain.opl)
+    assert torch.equal(computed.position, SCALE * plain.position)
+    assert torch.equal(computed.direction, plain.direction)
+    assert torch.equal(computed.opl, SCALE * plain.opl)
 
 
 def no_rays_give_no_rays(case):
@@ -161,8 +161,8 @@ def no_rays_give_no_rays(case):
     assert rays.valid.shape == rays.opl.shape == (0,)
     total = rays.position.sum() + rays.direction.sum() + rays.opl.sum()
     numbers = [p for name, p in scene.parameters.items() if name[0] in "sn"]
-    found = torch.autograd.grad(total, numbers, allow_unused=True)
-    assert all(gradient is None or (gradient == 0).all() for gradient in found)
+    computed = torch.autograd.grad(total, numbers, allow_unused=True)
+    assert all(gradient is None or (gradient == 0).all() for gradient in computed)
 
 
 def memory_layout_does_not_matter(case):
@@ -202,17 +202,18 @@ def bad_rays_are_flagged_and_change_nothing(case):
     bad_position, bad_direction = (torch.tensor(rows, dtype=torch.float64).T for rows in zip(*BAD_RAYS, strict=True))
     position = torch.cat([position, bad_position], dim=1).requires_grad_()
     direction = torch.cat([direction, bad_direction], dim=1).requires_grad_()
-    found = traced(joined, position, direction)
-    assert not found.valid[count:].any()
-    for values in (found.position, found.direction, found.opl):
+    computed = traced(joined, position, direction)
+    assert not computed.valid[count:].any()
+    for values in (computed.position, computed.direction, computed.opl):
         assert torch.isfinite(values).all()
     assert_equal_rays(
-        Rays(found.position[:, :count], found.direction[:, :count], found.valid[:count], found.opl[:count]), plain
+        Rays(computed.position[:, :count], computed.direction[:, :count], computed.valid[:count], computed.opl[:count]),
+        plain,
     )
     names = [name for name in joined.parameters if name[0] in "sn"]
     alone = torch.autograd.grad(objective(plain), [scene.parameters[name] for name in names], allow_unused=True)
     inputs = [*(joined.parameters[name] for name in names), position, direction]
-    gradients = torch.autograd.grad(objective(found), inputs, allow_unused=True)
+    gradients = torch.autograd.grad(objective(computed), inputs, allow_unused=True)
     for name, before, after in zip(names, alone, gradients, strict=False):
         assert (before is None) == (after is None), name
         if after is not None:
@@ -237,14 +238,14 @@ def directions_of_any_length_are_normalised(case):
     for factor in (2.0**-900, 2.0**900):
         assert_equal_rays(traced(scene, position, factor * direction), plain)
     for factor in (3.0, 1e-200, 1e200):
-        found = traced(scene, position, factor * direction)
+        computed = traced(scene, position, factor * direction)
         for i, expected in enumerate(case["expected"]):
             if expected["status"] == "ok" and expected.get("cond"):
-                assert bool(found.valid[i])
+                assert bool(computed.valid[i])
                 # cond is what the outputs change by per relative change of every input.
                 cond = [max(expected["cond"][output] for output in outputs) for outputs in (OUTPUTS[:3], OUTPUTS[3:6])]
-                moved = (found.position - plain.position)[:, i].abs().max()
-                turned = (found.direction - plain.direction)[:, i].abs().max()
+                moved = (computed.position - plain.position)[:, i].abs().max()
+                turned = (computed.direction - plain.direction)[:, i].abs().max()
                 assert moved <= 30 * 2.0**-53 * cond[0], f"ray {i}, {factor:g}"
                 assert turned <= 30 * 2.0**-53 * cond[1], f"ray {i}, {factor:g}"
 

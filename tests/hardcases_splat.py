@@ -27,6 +27,6 @@ def check_splat(case: dict) -> None:
     (slope,) = torch.autograd.grad((image * value).sum(), points)
     assert torch.isfinite(slope).all()
     scale = float(value.max()) / data["pixel_pitch"]
-    for found, sides in zip(slope[0].tolist(), expected.get("dloss_dx", []), strict=False):
+    for result, sides in zip(slope[0].tolist(), expected.get("dloss_dx", []), strict=False):
         low, high = sorted((float(sides["left"]), float(sides["right"])))
-        assert low - EXACT * scale <= found <= high + EXACT * scale
+        assert low - EXACT * scale <= result <= high + EXACT * scale

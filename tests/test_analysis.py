@@ -436,7 +436,7 @@ def test_a_column_in_per_cent_is_named_so_and_is_what_the_text_prints():
     assert f"largest {largest:.6f} %" in str(grid)
     assert grid.to_frame()["distortion_percent"].abs().max() == pytest.approx(abs(largest), rel=1e-12)
     assert rt.rms_over_field(lens, samples=2).units()["polychromatic"] == "waves"
-    assert rt.rms_over_field(lens, samples=2, spot=True).to_frame().attrs["units"]["rms"] == "mm"
+    assert rt.rms_over_field(lens, samples=2, spot=True).to_frame().attrs["units"]["rms_um"] == "µm"
     assert {rt.seidel(lens, kind="waves").units()[name] for name in ("W040", "W131")} == {"waves"}
-    assert rt.spot(lens, rings=2).to_frame().attrs["units"]["rms_radius"] == "mm"
+    assert rt.spot(lens, rings=2).to_frame().attrs["units"]["rms_radius_um"] == "µm"
     assert rt.lateral_colour(lens, wavelengths=[0.5, 0.6]).document()["units"]["shift"] == "mm"

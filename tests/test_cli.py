@@ -796,8 +796,8 @@ def test_rms_is_the_radius_about_the_centroid(run):
     (found,) = run("spot", "double_gauss", "--field", 10, "--rings", 8, "--json").document["results"]
     assert found["field"] == [0, 10]
     np.testing.assert_allclose(found["centroid"], centroid, rtol=0, atol=NANOMETRE)
-    assert found["rms_radius"] == pytest.approx(rms, rel=1e-6)
-    assert found["geometric_radius"] > found["rms_radius"]
+    assert found["rms_radius_um"] == pytest.approx(1e3 * rms, rel=1e-6)
+    assert found["geometric_radius_um"] > found["rms_radius_um"]
     assert found["vignetted"] == 0
 
 
@@ -807,12 +807,12 @@ def test_spot_counts_vignetted_rays(run):
     assert 0 < results[0]["vignetted"] < results[0]["launched"]
     assert results[0]["rays"] + results[0]["vignetted"] == results[0]["launched"]
     free = run("spot", "double_gauss", "--field", 0, "--json").document["results"]
-    assert results[0]["rms_radius"] < free[0]["rms_radius"]
+    assert results[0]["rms_radius_um"] < free[0]["rms_radius_um"]
     Path("closed.zmx").write_text(TEXT.replace("DIAM 10.229 1 0 0 1", "OBSC 0 60 0\n  DIAM 10.229 1 0 0 1"))
     (closed,) = run("spot", "closed.zmx", "--field", 0, "--json").document["results"]
     assert closed["rays"] == 0
-    assert closed["rms_radius"] is None
-    assert closed["geometric_radius"] is None
+    assert closed["rms_radius_um"] is None
+    assert closed["geometric_radius_um"] is None
     assert closed["centroid"] == [None, None]
     assert "no ray reaches the image" in run("focus", "closed.zmx").error
 
@@ -827,7 +827,7 @@ def test_a_spot_without_rays_is_a_dash_and_a_warning_says_where_they_end(run, ra
     assert found.err.count("warning") == 1
     assert "field 80 degrees, 0.486133, 0.587562, 0.656273 µm: all 648 rays lost: missed surface 2" in found.err
     *_, lost = run("spot", "cooke_triplet", "--field", 0, 80, *rays, "--json").document["results"]
-    assert [lost["rays"], lost["rms_radius"], lost["geometric_radius"]] == [0, None, None]
+    assert [lost["rays"], lost["rms_radius_um"], lost["geometric_radius_um"]] == [0, None, None]
 
 
 def test_focus_tells_of_a_field_that_is_lost(run):
@@ -852,7 +852,7 @@ def test_samplings_agree(run, sampling):
     arguments = ("spot", "double_gauss", "--field", 10, "--sensor-distance", 57.3, "--sampling", sampling, "--json")
     result = run(*arguments).document["results"]
     exact = run(*arguments[:-3], "--json").document["results"]
-    assert result[0]["rms_radius"] == pytest.approx(exact[0]["rms_radius"], rel=0.1)
+    assert result[0]["rms_radius_um"] == pytest.approx(exact[0]["rms_radius_um"], rel=0.1)
     assert run(*arguments).document["results"] == result
 
 
@@ -862,16 +862,16 @@ def test_samplings_agree(run, sampling):
 def test_focus_at_25_m(run):
     document = run("focus", DOUBLE_GAUSS, "--object-distance", 25000, "--json").document
     assert list(document) == ["object_distance", "sensor_before", "sensor_paraxial", "sensor_rms", "sensor_after",
-                              "rms_before", "rms_after", "is_real"]  # fmt: skip
+                              "rms_before_um", "rms_after_um", "is_real"]  # fmt: skip
     assert document["object_distance"] == 25000
     assert document["sensor_before"] == 58.5
     assert document["sensor_paraxial"] == pytest.approx(IMAGE_OF_25_M, abs=1e-9)
     assert document["sensor_rms"] == document["sensor_after"] == pytest.approx(57.66201, abs=5e-6)
-    assert document["rms_after"] == pytest.approx(7.075e-3, abs=5e-7)
+    assert document["rms_after_um"] == pytest.approx(7.075, abs=5e-4)
     at_paraxial = run("focus", DOUBLE_GAUSS, "--object-distance", 25000, "--criterion", "paraxial", "--json").document
     assert at_paraxial["sensor_after"] == document["sensor_paraxial"]
     assert at_paraxial["sensor_rms"] == document["sensor_rms"]
-    assert at_paraxial["rms_after"] == pytest.approx(27.16e-3, abs=5e-6)
+    assert at_paraxial["rms_after_um"] == pytest.approx(27.16, abs=5e-3)
 
 
 def test_focus_at_25_m_ray_by_ray(run):
@@ -881,7 +881,7 @@ def test_focus_at_25_m_ray_by_ray(run):
     nodes, weights = np.polynomial.legendre.leggauss(12)
     height = 33.33 / 2 * np.sqrt((nodes + 1) / 2)
     depth = lens["entrance_pupil_position"]
-    for sensor, expected in (("sensor_before", "rms_before"), ("sensor_after", "rms_after")):
+    for sensor, expected in (("sensor_before", "rms_before_um"), ("sensor_after", "rms_after_um")):
         surfaces = surfaces_of(lens)
         surfaces[10]["T"] = document[sensor]
         hits = []
@@ -891,7 +891,7 @@ def test_focus_at_25_m_ray_by_ray(run):
             at_vertex = (0.0, y - depth * direction[1] / direction[2], 0.0)
             hits.append(list(reference(surfaces, at_vertex, direction))[-1][1][1])
         rms = math.sqrt((weights / 2) @ np.square(hits))
-        assert document[expected] == pytest.approx(rms, rel=1e-7)
+        assert document[expected] == pytest.approx(1e3 * rms, rel=1e-7)
 
 
 def test_focus_with_weights_equals_brute_force(run):
@@ -907,7 +907,7 @@ def test_focus_with_weights_equals_brute_force(run):
             for entry in run("spot", "double_gauss", *condition, *common).document["results"]:
                 weight = dw * weights["field"][fields.index(entry["field"][1])]
                 weight *= weights["wavelength"][wavelengths.index(entry["wavelength"])]
-                total, share = total + weight * entry["rms_radius"] ** 2, share + weight
+                total, share = total + weight * (1e-3 * entry["rms_radius_um"]) ** 2, share + weight
         return total / share
 
     low, middle, high = merit(57.0), merit(58.0), merit(59.0)
@@ -915,8 +915,8 @@ def test_focus_with_weights_equals_brute_force(run):
     options_of_weights = [word for name, values in weights.items() for word in (f"--{name}-weights", *values)]
     found = run("focus", "double_gauss", "--object-distance", *distances, *options_of_weights, *common).document
     assert found["sensor_rms"] == pytest.approx(vertex, abs=NANOMETRE)
-    assert found["rms_after"] == pytest.approx(math.sqrt(merit(found["sensor_after"])), rel=1e-9)
-    assert found["rms_before"] == pytest.approx(math.sqrt(merit(58.5)), rel=1e-9)
+    assert found["rms_after_um"] == pytest.approx(1e3 * math.sqrt(merit(found["sensor_after"])), rel=1e-9)
+    assert found["rms_before_um"] == pytest.approx(1e3 * math.sqrt(merit(58.5)), rel=1e-9)
     assert found["object_distance"] == [10000, 25000, None]
     np.testing.assert_allclose(found["sensor_paraxial"][:1], run(
         "info", "double_gauss", "--wavelength", 0.486, "--object-distance", 10000, "--json"
@@ -936,7 +936,7 @@ def test_mean_criterion_is_least_in_its_own_measure(run):
     """Less mean distance from the centroid means more RMS: the two best foci differ, slightly."""
     document = run("focus", "double_gauss", "--object-distance", 25000, "--criterion", "mean", "--json").document
     assert 1e-3 < abs(document["sensor_after"] - document["sensor_rms"]) < 0.1
-    assert document["rms_after"] > 7.075e-3
+    assert document["rms_after_um"] > 7.075
 
 
 @pytest.mark.parametrize(

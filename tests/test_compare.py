@@ -90,7 +90,7 @@ def test_widths_are_those_of_rays_on_the_common_sensor():
             assert float(found.sigma[m, d]) == pytest.approx(width, rel=2e-3)
         assert float(found.sigma[2, d]) == pytest.approx(float(ideal.covariance[0, d, 0]) ** 0.5, rel=1e-12)
         row = frame[(frame.model == "wave") & (frame.object_distance == distance)]
-        assert row.sigma.item() == float(found.sigma[4, d])
+        assert row.sigma_um.item() == 1e3 * float(found.sigma[4, d])
     assert len(frame) == 10
 
 

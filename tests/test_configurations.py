@@ -213,7 +213,7 @@ def test_configurations_are_made_from_plain_numbers(tmp_path):
     for wrong, said in (
         ({"glass": {1: [1.5]}}, "'glass' does not differ"),
         ({"thickness": {99: [1.0]}}, "surface 99"),
-        ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "as many"),
+        ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "lists of values of one length"),
     ):
         with pytest.raises(ValueError, match=said):
             lens.with_configurations(**wrong)

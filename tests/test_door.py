@@ -195,7 +195,7 @@ def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
 
     slope = (merit(curvature.detach() + step) - merit(curvature.detach() - step)) / (2 * step)
     assert float(curvature.grad) == pytest.approx(slope, rel=1e-5)
-    assert found.to_frame().rms_radius.tolist() == found.rms_radius.flatten().tolist()
+    assert found.to_frame().rms_radius_um.tolist() == (1e3 * found.rms_radius).flatten().tolist()
     assert len(found.plot(tmp_path / "spot.png").axes) == 2
     assert (tmp_path / "spot.png").stat().st_size > 0
     found.save(tmp_path / "rays.csv")
@@ -423,7 +423,7 @@ ANALYSES = (
     ),
     ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
-    ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms", "all, weighted"),
+    ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms_um", "all, weighted"),
     ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "diffraction_limit", "1/mm"),
     (
         "mtf",

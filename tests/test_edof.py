@@ -71,8 +71,8 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
     many = PICTURES.repeat(3, 1, 1)
     for G in (depth_invariant_wiener(H, S, SMALL.noise), wiener(H[1], 0.01)):
         expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
-        found = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
-        torch.testing.assert_close(torch.stack(found), expected, rtol=0.01, atol=0)
+        result = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
+        torch.testing.assert_close(torch.stack(result), expected, rtol=0.01, atol=0)
     own = quality(elements, SMALL, train=PICTURES, test=PICTURES)
     predicted = psnr(errors(H, S, SMALL.noise).mean(1))
     np.testing.assert_allclose(own.by_depth["blind"], predicted.numpy(), atol=0.1)
@@ -244,15 +244,15 @@ def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):
 
 
 def test_mirrored():
-    found = mirrored(np.array([[1, 2], [3, 4]]))
-    assert found.tolist() == [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]]
+    result = mirrored(np.array([[1, 2], [3, 4]]))
+    assert result.tolist() == [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]]
 
 
 def test_the_table_says_what_it_knows():
     content = Content("leaves", PICTURES[:6], PICTURES[6:])
-    found = table_of([content], elements_of(["singlet", "fresnel"], SMALL, S, learned={}), SMALL)
-    assert list(found["leaves"]) == ["fresnel", "singlet"]
-    rows = {record["row"]: record for record in records(found)}
+    result = table_of([content], elements_of(["singlet", "fresnel"], SMALL, S, learned={}), SMALL)
+    assert list(result["leaves"]) == ["fresnel", "singlet"]
+    rows = {record["row"]: record for record in records(result)}
     assert rows["fresnel"]["gain_blind"] == 0
     assert rows["fresnel"]["published"] == 17.95
     assert rows["singlet"]["gain_blind"] == pytest.approx(rows["singlet"]["blind"] - rows["fresnel"]["blind"])
@@ -263,10 +263,10 @@ def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
     tried = []
     real = edof_table.expected_error
     monkeypatch.setattr(edof_table, "expected_error", lambda *given: tried.append(0) or real(*given))
-    found = elements_of(["cubic-refractive", "learned", "cubic"], SMALL, S, learned={})
-    assert list(found) == ["cubic", "cubic-refractive"]
+    result = elements_of(["cubic-refractive", "learned", "cubic"], SMALL, S, learned={})
+    assert list(result) == ["cubic", "cubic-refractive"]
     assert len(tried) == len(STRENGTHS)
-    plates = [elements[1].profile.coefficients * (index(elements[1].glass, 0.55) - 1) for elements in found.values()]
+    plates = [elements[1].profile.coefficients * (index(elements[1].glass, 0.55) - 1) for elements in result.values()]
     torch.testing.assert_close(*plates)
 
 
@@ -284,7 +284,7 @@ def test_the_order_that_was_published(tmp_path):
     with torch.no_grad():
         learned = {"learned": camera.variables()}
     names = ["fresnel", "multifocal", "cubic", "hybrid", "achromat", "learned"]
-    found = table_of([content], elements_of(names, config, spectrum_, learned=learned), config)["leaves"]
-    blind = {name: found[name].mean["blind"] for name in names}
+    result = table_of([content], elements_of(names, config, spectrum_, learned=learned), config)["leaves"]
+    blind = {name: result[name].mean["blind"] for name in names}
     assert blind["fresnel"] < blind["multifocal"] < blind["cubic"] < min(blind["hybrid"], blind["achromat"])
     assert max(blind["hybrid"], blind["achromat"]) + 2 < blind["learned"]

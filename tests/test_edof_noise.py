@@ -59,19 +59,19 @@ def test_an_octant_is_the_closed_form_of_the_kernels(name):
     expected = expected_error(H, S, SMALL.noise)
     slope = torch.autograd.grad(expected, free)[0]
     for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 1e-5)):
-        found = ClosedForm(elements, SMALL, S, dtype=dtype)(elements)
-        torch.testing.assert_close(found, expected, rtol=tolerance, atol=0)
-        own = torch.autograd.grad(found, free)[0]
+        result = ClosedForm(elements, SMALL, S, dtype=dtype)(elements)
+        torch.testing.assert_close(result, expected, rtol=tolerance, atol=0)
+        own = torch.autograd.grad(result, free)[0]
         assert float((own - slope).norm()) < 100 * tolerance * float(slope.norm())
 
 
 def test_frequencies_of_the_octant_are_those_of_the_kernels():
     own = scene(baseline("fresnel", aim()), SMALL)
     how = plan(own)
-    found = Octant(own, how, 128).transfer(own)
+    result = Octant(own, how, 128).transfer(own)
     H = transfer(psf(own, plan=how), 128).real
     a, b = torch.triu_indices(65, 65)
-    torch.testing.assert_close(found, H[..., a, b], rtol=0, atol=1e-7)
+    torch.testing.assert_close(result, H[..., a, b], rtol=0, atol=1e-7)
 
 
 def test_pictures_that_are_not_their_mirror_images_have_no_octant():
@@ -95,19 +95,19 @@ def test_errors_of_pictures_are_those_of_pictures_restored():
     bank = Bank.of("leaves", PICTURES[:5], PICTURES[5:])
     elements = baseline("singlet", aim())
     H = transfer(psf(scene(elements, SMALL)), 128)
-    found = errors_of(H, SMALL, bank)
+    result = errors_of(H, SMALL, bank)
     generator = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(3, 2, 128, 128, generator=generator, dtype=torch.float64)
     G = depth_invariant_wiener(H, bank.spectrum, SMALL.noise)
     left = [(restored(H_z, G, PICTURES[5:], noise)[1] - PICTURES[5:, None]).square().mean((-2, -1)) for H_z in H]
-    torch.testing.assert_close(found["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
+    torch.testing.assert_close(result["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
     table = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])
     for name in ("wiener", "blind"):
-        assert float(pooled_psnr(found[name])) == pytest.approx(table.mean[name], abs=1e-9)
-        assert float(mean_psnr(found[name])) == pytest.approx(table.of_pictures[name], abs=1e-9)
-        single = [float(pooled_psnr(own[None])) for own in found[name]]
-        assert float(mean_psnr(found[name])) == pytest.approx(sum(single) / len(single), abs=1e-9)
-        assert float(mean_psnr(found[name])) > float(pooled_psnr(found[name]))  # -log is convex
+        assert float(pooled_psnr(result[name])) == pytest.approx(table.mean[name], abs=1e-9)
+        assert float(mean_psnr(result[name])) == pytest.approx(table.of_pictures[name], abs=1e-9)
+        single = [float(pooled_psnr(own[None])) for own in result[name]]
+        assert float(mean_psnr(result[name])) == pytest.approx(sum(single) / len(single), abs=1e-9)
+        assert float(mean_psnr(result[name])) > float(pooled_psnr(result[name]))  # -log is convex
 
 
 def test_intervals_hold_the_mean_of_many_pictures():
@@ -115,11 +115,11 @@ def test_intervals_hold_the_mean_of_many_pictures():
     generator = torch.Generator().manual_seed(0)
     base = torch.ones(100, 1, 1, dtype=torch.float64)
     own = base * (1 + 0.05 * torch.randn(100, 1, 1, generator=generator, dtype=torch.float64))
-    found = gain(own, base, drawn(range(100)))
+    result = gain(own, base, drawn(range(100)))
     half = 1.96 * 10 / math.log(10) * float(own.std()) / 10 / float(own.mean())
-    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
-    assert found.low < found.value < found.high
-    assert found.value == pytest.approx(float(-psnr(base.mean()) + psnr(own.mean())))
+    assert (result.high - result.low) / 2 == pytest.approx(half, rel=0.1)
+    assert result.low < result.value < result.high
+    assert result.value == pytest.approx(float(-psnr(base.mean()) + psnr(own.mean())))
     same = gain(base, base, drawn(range(100)))
     assert (same.value, same.low, same.high) == (0, 0, 0)
 
@@ -152,9 +152,9 @@ def test_a_class_is_a_folder():
 
 
 def test_every_noise_and_row_once_before_any_a_second_time():
-    found = list(units(["fresnel", "learned", "learned-16"], [0.01, 0.02], 2))
-    assert len(found) == 8
-    assert {unit.start for unit in found[:4]} == {0}
+    result = list(units(["fresnel", "learned", "learned-16"], [0.01, 0.02], 2))
+    assert len(result) == 8
+    assert {unit.start for unit in result[:4]} == {0}
     settings = Unit("learned", 0.02, 3).settings(17)
     assert (settings.seed, settings.starts, settings.steps, settings.noise) == (3, 1, 17, (0.02, 0.02))
     assert Unit("learned-smooth", 0.02, 3).settings(300).steps == 60
@@ -162,8 +162,10 @@ def test_every_noise_and_row_once_before_any_a_second_time():
 
 def test_cubic_plates_have_the_strength_of_their_noise():
     strengths = {0.001: 20.0, 0.01: 10.0, 0.02: 10.0}
-    found = [(row, noises) for row, _, noises in baselines(["fresnel", "cubic-refractive"], list(strengths), strengths)]
-    assert found == [
+    result = [
+        (row, noises) for row, _, noises in baselines(["fresnel", "cubic-refractive"], list(strengths), strengths)
+    ]
+    assert result == [
         ("fresnel", [0.001, 0.01, 0.02]),
         ("cubic-refractive", [0.01, 0.02]),
         ("cubic-refractive", [0.001]),
@@ -183,18 +185,18 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
 
         return kept.find(name, SMALL, H)
 
-    found = [{name: errors_by(name) for name in names} for _ in range(2)][-1]
+    result = [{name: errors_by(name) for name in names} for _ in range(2)][-1]
     assert made == list(names)
     learned = {
-        Unit("learned", 0.01, i): (names[name], found[name]) for i, name in enumerate(("singlet", "cubic-refractive"))
+        Unit("learned", 0.01, i): (names[name], result[name]) for i, name in enumerate(("singlet", "cubic-refractive"))
     }
     rows = {
         (one.filter, one.row): one
-        for one in scores({("fresnel", 0.01): found["fresnel"]}, learned, [bank], Settings(noise=(0.01,)))
+        for one in scores({("fresnel", 0.01): result["fresnel"]}, learned, [bank], Settings(noise=(0.01,)))
     }
     for filter in ("wiener", "blind"):
         own, base = rows[filter, "learned"], rows[filter, "fresnel"]
-        errors = found["cubic-refractive"]["leaves"][filter]
+        errors = result["cubic-refractive"]["leaves"][filter]
         assert own.gains.pooled_psnr == pytest.approx(float(pooled_psnr(errors)))
         assert own.gains.mean_psnr == pytest.approx(float(mean_psnr(errors)))
         assert own.gains.pooled.value == own.starts[0]
@@ -241,8 +243,8 @@ def test_files_are_judged_by_all_that_bends_light(monkeypatch, tmp_path):
         dataclasses.replace(one, profile=Zernike(one.numbers)),
     ]
     for element in (*others, *others):
-        found = judge_files({"one": element}, Settings(noise=(0.01, 0.02)), kept)
-        assert list(found) == [("one", 0.01), ("one", 0.02)]
+        result = judge_files({"one": element}, Settings(noise=(0.01, 0.02)), kept)
+        assert list(result) == [("one", 0.01), ("one", 0.02)]
     assert len(made) == len(others)
 
 
@@ -271,8 +273,8 @@ def test_the_figure_over_noise_draws_files_by_their_names():
 
 @pytest.mark.slow
 def test_strengths_fall_with_the_noise():
-    found = best_strengths([0.001, 0.02], spectrum(periodic(dead_leaves(4, size=128, smallest=2.5), 256)))
-    assert found[0.001] >= found[0.02]
+    result = best_strengths([0.001, 0.02], spectrum(periodic(dead_leaves(4, size=128, smallest=2.5), 256)))
+    assert result[0.001] >= result[0.02]
 
 
 @pytest.mark.slow

@@ -50,13 +50,13 @@ def test_learned_elements_are_judged_as_the_page_has_them(name, tmp_path):
     leaves = dead_leaves(40, size=256, smallest=LEAVES["sharp leaves"])
     bank = Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
     element = read_element(DOCS / "elements" / name, aperture=5.0)
-    found = errors_of(Kept(tmp_path, [bank]).transfer((element,)), WaveCameraConfig(), bank)
+    result = errors_of(Kept(tmp_path, [bank]).transfer((element,)), WaveCameraConfig(), bank)
     with (DOCS / "noise.csv").open(newline="") as file:
         wanted = {
             row["filter"]: (float(row["psnr"]), float(row["mean_psnr"]))
             for row in csv.DictReader(file)
             if (row["content"], row["row"], row["noise"]) == ("sharp leaves", name.split("-0.01")[0], "0.01")
         }
-    assert set(wanted) == set(found)
-    for name, errors in found.items():
+    assert set(wanted) == set(result)
+    for name, errors in result.items():
         assert (float(pooled_psnr(errors)), float(mean_psnr(errors))) == pytest.approx(wanted[name], abs=0.01)

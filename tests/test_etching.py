@@ -30,8 +30,8 @@ def test_what_a_process_can_make_is_matched_exactly():
     process = Process(waves=2, levels=8)
     step = float(process.period(thick())) / 8
     numbers = torch.randint(0, 8, (50,), generator=torch.Generator().manual_seed(1))
-    found, near = matched(rings(numbers * step), process, COLOURS)
-    shift = torch.round(found.numbers / step).long() - numbers
+    result, near = matched(rings(numbers * step), process, COLOURS)
+    shift = torch.round(result.numbers / step).long() - numbers
     assert near == pytest.approx(1, abs=1e-6)
     assert len(shift.unique()) == 1
 

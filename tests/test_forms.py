@@ -93,7 +93,7 @@ def test_field_points_may_lie_off_the_axis_of_y(command):
     assert code == 0, err
     found = json.loads(out)["results"]
     assert [one["field"] for one in found] == [[0, 7], [0, -7], [-7, 0], [-3, 4], [4, -3], [0, -0.001]]
-    radii = [one["rms_radius"] for one in found]
+    radii = [one["rms_radius_um"] for one in found]
     assert radii[1] == pytest.approx(radii[0], rel=1e-12)  # a lens of revolution
     assert radii[2] == pytest.approx(radii[0], rel=1e-9)
     assert radii[3] == pytest.approx(radii[4], rel=1e-9)
@@ -130,7 +130,8 @@ def test_the_ray_table_of_a_spot_holds_its_spot(command):
         centre = [np.average(rows[name], weights=rows.weight) for name in "xy"]
         assert centre == pytest.approx(found["centroid"], abs=1e-12)
         square = (rows.x - centre[0]) ** 2 + (rows.y - centre[1]) ** 2
-        assert math.sqrt(np.average(square, weights=rows.weight)) == pytest.approx(found["rms_radius"], rel=1e-9)
+        radius = 1e3 * math.sqrt(np.average(square, weights=rows.weight))
+        assert radius == pytest.approx(found["rms_radius_um"], rel=1e-9)
     for words in (("-o", "rays.npz"), ("--rays", "100", "-o", "rays.csv")):
         assert command("spot", "double_gauss", *words)[0] == 1
     assert [path.name for path in Path().iterdir()] == ["rays.csv"]

@@ -185,9 +185,9 @@ def test_the_command_says_what_the_verb_does(command):
     assert [*document] == ["analysis", "merit", "unit", "skipped", "results"]
     assert document["results"][0] == {
         **{"row": 3, "configuration": 1, "operand": "TRAC", "target": 0.0, "lost": False},
-        **{name: document["results"][0][name] for name in ("arguments", "weight", "value", "contribution")},
+        **{name: document["results"][0][name] for name in ("arguments", "weight", "value", "contribution_percent")},
     }
-    assert sum(one["contribution"] for one in document["results"]) == pytest.approx(1)
+    assert sum(one["contribution_percent"] for one in document["results"]) == pytest.approx(100)
 
 
 def test_boundaries_are_rows_of_the_command(command):

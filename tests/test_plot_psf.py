@@ -29,14 +29,14 @@ def seen(name: str, model: str, **options):
     """A lens's kernels at infinity with their light, and the fields."""
     lens = read_lens(LENSES / f"{name}.zmx")
     fields, distances = options.pop("fields", own_fields(lens)), options.pop("object_distances", number([math.inf]))
-    found = psf(lens, model, fields=fields, object_distances=distances, center="chief", **options)
-    return found, close_up(found), fields
+    result = psf(lens, model, fields=fields, object_distances=distances, center="chief", **options)
+    return result, close_up(result), fields
 
 
 @pytest.mark.parametrize(("name", "model"), [("phone", "wave"), ("hubble", "wave"), ("telephoto", "gaussian")])
 def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
     """The phone's kernel is one pixel of 5 µm: seen closely it is 50 samples wide, of the same energy and centroid."""
-    found, light, _ = seen(name, model, fields=number([[0.0], [0.05]]))
+    result, light, _ = seen(name, model, fields=number([[0.0], [0.05]]))
     samples, half = light.light[0, 0], float(light.half[0, 0])
     place = (torch.arange(len(samples), dtype=torch.float64) - 0.5 * (len(samples) - 1)) * (2 * half / len(samples))
     energy = float(samples.sum())
@@ -44,25 +44,27 @@ def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
     sigma = float(((samples.sum(0) * place**2).sum() / energy).sqrt())
     assert half / 8 < sigma < half / 1.5
     at = float((samples.sum(1) * place).sum() / energy + light.centre[1, 0, 0])
-    assert at == pytest.approx(float(found.ray_centroid[1, 0, 0]), abs=0.02 * sigma)
-    assert energy == pytest.approx(float(found.energy[0, 0]), abs=0.05)
+    assert at == pytest.approx(float(result.ray_centroid[1, 0, 0]), abs=0.02 * sigma)
+    assert energy == pytest.approx(float(result.energy[0, 0]), abs=0.05)
 
 
 def test_ray_traced_light_fills_its_disc_evenly():
     """Far out of focus a uniform disc of 2 σ: no pattern of rays, no window that cuts it."""
-    found, light, _ = seen("singlet", "drt", fields=number([[0.0], [0.0]]), object_distances=number([2000.0]))
+    result, light, _ = seen("singlet", "drt", fields=number([[0.0], [0.0]]), object_distances=number([2000.0]))
     samples = light.light[0, 0]
     assert float(samples.sum()) == pytest.approx(1, abs=1e-3)
-    assert 2 * float(found.covariance[0, 0, 0].sqrt()) < float(light.half) < 4 * float(found.covariance[0, 0, 0].sqrt())
+    assert (
+        2 * float(result.covariance[0, 0, 0].sqrt()) < float(light.half) < 4 * float(result.covariance[0, 0, 0].sqrt())
+    )
 
 
 def test_windows_are_alike_unless_the_light_is_not():
-    *_, (found, light, _) = [seen("telephoto", "gaussian")]
+    *_, (result, light, _) = [seen("telephoto", "gaussian")]
     assert len(set(light.half.flatten().tolist())) == 1
     distances = number([math.inf, 2000.0])
     _, light, _ = seen("telephoto", "gaussian", object_distances=distances)
     assert float(light.half[1, 0]) > 4 * float(light.half[0, 0])
-    axes = psf_grid(dataclasses.replace(found, framed=True)).axes
+    axes = psf_grid(dataclasses.replace(result, framed=True)).axes
     assert {tuple(np.round(panel.get_xlim(), 9)) for panel in axes if panel.images} == {(-0.0525, 0.0525)}
 
 
@@ -73,8 +75,8 @@ def phone():
 
 @pytest.mark.parametrize("log", [False, True])
 def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
-    found, light, _ = phone
-    figure = psf_grid(found, close_up=light, log=log)
+    result, light, _ = phone
+    figure = psf_grid(result, close_up=light, log=log)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 2
     for f, panel in enumerate(panels):
@@ -87,14 +89,14 @@ def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
         upright = sorted(line[0, 0] for line in edges.get_segments() if line[0, 0] == line[1, 0])
         assert np.diff(upright) == pytest.approx(0.005)
         # The chief ray is the centre of a pixel, half a pixel from its edges.
-        chief = float((found.grid.centre - light.centre)[0, 0, f])
+        chief = float((result.grid.centre - light.centre)[0, 0, f])
         assert min(abs(np.array(upright) - chief)) == pytest.approx(0.0025)
     assert outside(figure) == []
 
 
 def test_kernels_of_each_wavelength_are_rows_fields_outermost():
-    found, light, _ = seen("telephoto", "gaussian", per_wavelength=True, object_distances=number([math.inf, 1e5]))
-    figure = psf_grid(found, close_up=light)
+    result, light, _ = seen("telephoto", "gaussian", per_wavelength=True, object_distances=number([math.inf, 1e5]))
+    figure = psf_grid(result, close_up=light)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 18
     for row in range(9):
@@ -108,9 +110,9 @@ def test_kernels_of_each_wavelength_are_rows_fields_outermost():
 def test_every_word_is_on_the_page(count, distances):
     lens = read_lens(LENSES / "telephoto.zmx")
     fields = torch.stack([torch.zeros(count, dtype=torch.float64), torch.linspace(0, 3, count, dtype=torch.float64)])
-    found = psf(lens, "gaussian", fields=fields, object_distances=number(distances), center="chief")
+    result = psf(lens, "gaussian", fields=fields, object_distances=number(distances), center="chief")
     name = "A lens with a name that is much longer than its figure is wide, f = 99.9 mm, F/4"
-    figure = psf_grid(dataclasses.replace(found, lens=dataclasses.replace(lens, name=name), framed=True))
+    figure = psf_grid(dataclasses.replace(result, lens=dataclasses.replace(lens, name=name), framed=True))
     assert outside(figure) == []
     assert "".join(figure.get_suptitle().split()) == "".join(f"{name}: gaussian PSF".split())
 
@@ -126,10 +128,10 @@ def test_lines_are_as_wide_as_the_page():
 
 def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
     lens = analysis.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
-    found = analysis.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
-    assert all(one.kernel.shape[-2:] == (11, 11) for one in found.psfs)
-    assert all(float(one.grid.pitch) == 0.002 for one in found.psfs)
-    figure = found.plot(log=True)
+    result = analysis.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
+    assert all(one.kernel.shape[-2:] == (11, 11) for one in result.psfs)
+    assert all(float(one.grid.pitch) == 0.002 for one in result.psfs)
+    figure = result.plot(log=True)
     panels = [panel for panel in figure.axes if panel.images]
     assert panels[0].get_xlim() == pytest.approx((-0.011, 0.011))
     assert "11 × 11 pixels of 2 µm" in figure.get_supxlabel()

@@ -52,7 +52,7 @@ def rms(values: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("model", CHEAP)
 def test_shapes_and_what_the_result_says_of_itself(model):
-    found = psf(
+    result = psf(
         made_for(model, double_gauss()),
         model,
         fields=field(0.0, 2.0),
@@ -61,16 +61,16 @@ def test_shapes_and_what_the_result_says_of_itself(model):
         center="chief",
         tol=0.1,
     )
-    assert found.kernel.shape == (3, 2, 7, 9)
-    assert found.energy.shape == found.error.shape == (3, 2)
-    assert found.centroid.shape == (2, 3, 2)
-    assert found.covariance.shape == (3, 3, 2)
-    assert found.grid.centre.shape == (2, 3, 2)
-    assert (found.model, found.normalised) == (model, "energy")
-    assert bool(torch.isfinite(found.kernel).all() and torch.isfinite(found.error).all())
-    assert bool((found.error <= 0.1).all() and (found.error >= 0).all())
-    torch.testing.assert_close(found.kernel.sum((-2, -1)), found.energy)
-    assert found.rays > 0 if model in TRACED else found.rays == 0
+    assert result.kernel.shape == (3, 2, 7, 9)
+    assert result.energy.shape == result.error.shape == (3, 2)
+    assert result.centroid.shape == (2, 3, 2)
+    assert result.covariance.shape == (3, 3, 2)
+    assert result.grid.centre.shape == (2, 3, 2)
+    assert (result.model, result.normalised) == (model, "energy")
+    assert bool(torch.isfinite(result.kernel).all() and torch.isfinite(result.error).all())
+    assert bool((result.error <= 0.1).all() and (result.error >= 0).all())
+    torch.testing.assert_close(result.kernel.sum((-2, -1)), result.energy)
+    assert result.rays > 0 if model in TRACED else result.rays == 0
 
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian", "drt"])
@@ -104,14 +104,14 @@ def test_plain_numbers_are_as_good_as_tensors():
 @pytest.mark.parametrize("per_wavelength", [False, True])
 def test_a_psf_is_a_table_a_document_and_words(per_wavelength):
     options = {"fields": [0, (1, 2)], "object_distances": [25e3, math.inf], "wavelengths": [0.5, 0.6]}
-    found = psf(double_gauss(), Gaussian(order=3), center="chief", per_wavelength=per_wavelength, **options)
-    frame, entries = found.to_frame(), found.document()["results"]
-    assert len(frame) == len(entries) == found.energy.numel() == (8 if per_wavelength else 4)
-    for row, entry, line in zip(frame.itertuples(), entries, str(found).splitlines()[3:], strict=True):
+    result = psf(double_gauss(), Gaussian(order=3), center="chief", per_wavelength=per_wavelength, **options)
+    frame, entries = result.to_frame(), result.document()["results"]
+    assert len(frame) == len(entries) == result.energy.numel() == (8 if per_wavelength else 4)
+    for row, entry, line in zip(frame.itertuples(), entries, str(result).splitlines()[3:], strict=True):
         assert [row.field_x, row.field_y] == entry["field"]
         assert row.object_distance == (entry["object_distance"] or math.inf)
         assert [row.centroid_x, row.centroid_y] == entry["centroid"]
-        assert row.sigma_x**2 == pytest.approx(entry["covariance"][0][0], rel=1e-12)
+        assert (1e-3 * row.sigma_x_um) ** 2 == pytest.approx(entry["covariance"][0][0], rel=1e-12)
         assert row.energy == entry["energy"]
         assert f"{row.energy:.4f}" in line
         assert not per_wavelength or row.wavelength == entry["wavelength"]
@@ -135,7 +135,7 @@ def test_centre_of_the_window_is_an_absolute_place_on_the_sensor(model):
     """Wherever the window is centred, the kernel's own mean, from absolute pixel places, is the same point."""
     lens, means = double_gauss(), []
     for center in ("chief", "centroid"):
-        found = psf(
+        result = psf(
             lens,
             model,
             fields=field(3.0),
@@ -146,10 +146,10 @@ def test_centre_of_the_window_is_an_absolute_place_on_the_sensor(model):
             tol=0.1,
         )
         offset = (torch.arange(9, dtype=torch.float64) - 4) * 0.02
-        mean_y = found.grid.centre[1, 0, 0] + (found.kernel[0, 0].sum(1) * offset).sum()
+        mean_y = result.grid.centre[1, 0, 0] + (result.kernel[0, 0].sum(1) * offset).sum()
         means.append(float(mean_y))
     assert means[0] == pytest.approx(means[1], abs=3e-3)
-    assert means[0] == pytest.approx(float(found.centroid[1, 0, 0]), abs=3e-3)
+    assert means[0] == pytest.approx(float(result.centroid[1, 0, 0]), abs=3e-3)
 
 
 def test_chief_is_the_landing_point_of_the_chief_ray_and_centroid_the_mean_of_the_light():
@@ -207,9 +207,9 @@ def test_energy_is_the_transmitted_share(model):
     assert 0.1 < share < 0.9
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)
-        found = psf(lens, model, fields=field(0.0), grid=grid(0.1, 41), tol=0.01)
+        result = psf(lens, model, fields=field(0.0), grid=grid(0.1, 41), tol=0.01)
     # The step of the radius, 1/4000, is 4e-4 of the area.
-    assert float(found.energy) == pytest.approx(share, abs=1e-3)
+    assert float(result.energy) == pytest.approx(share, abs=1e-3)
 
 
 # Models chosen, rays counted ------------------------------------------------------------------------------------------
@@ -229,10 +229,10 @@ def test_auto_chooses_by_the_scene_and_says_why():
 def test_auto_stays_with_rays_where_waves_are_too_many():
     """A spectrum of 26 mm: its light lands where a window's waves turn a thousand times."""
     with pytest.warns(NotConverged, match=r"drt: not compared with waves: the wave model needs \d+ pupil points"):
-        found = rt.psf(rt.read_lens("spectrometer"), "auto", tol=0.5, size=9)
-    assert found.model == "drt"
-    assert "not compared with waves" in found.reason
-    assert bool((found.kernel.sum((-1, -2)) > 0).all())
+        result = rt.psf(rt.read_lens("spectrometer"), "auto", tol=0.5, size=9)
+    assert result.model == "drt"
+    assert "not compared with waves" in result.reason
+    assert bool((result.kernel.sum((-1, -2)) > 0).all())
 
 
 def test_number_of_rays_is_kept_to():
@@ -250,10 +250,10 @@ def test_number_of_rays_is_kept_to():
 
 def test_an_order_repeats_what_a_tolerance_found():
     options = {"fields": field(14.0), "object_distances": number([1e4]), "center": "chief"}
-    found = psf(double_gauss(), "gaussian", tol=1e-3, **options)
-    again = psf(double_gauss(), Gaussian(order=found.order), **options)
-    torch.testing.assert_close(again.kernel, found.kernel, atol=0, rtol=0)
-    assert again.rays == found.rays
+    result = psf(double_gauss(), "gaussian", tol=1e-3, **options)
+    again = psf(double_gauss(), Gaussian(order=result.order), **options)
+    torch.testing.assert_close(again.kernel, result.kernel, atol=0, rtol=0)
+    assert again.rays == result.rays
     assert bool(again.error.isnan().all())
 
 
@@ -279,9 +279,9 @@ def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
 
 def test_a_tolerance_out_of_reach_is_said():
     with pytest.warns(NotConverged, match="gaussian: the estimated error .* stays above the tolerance 1e-11"):
-        found = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
-    assert float(found.error) > 1e-11
-    assert "stays above" in found.reason
+        result = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
+    assert float(result.error) > 1e-11
+    assert "stays above" in result.reason
 
 
 @pytest.mark.parametrize(
@@ -345,14 +345,14 @@ def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero(model):
     lens = lens.replace(1, apertures=(Aperture("circular", (0.0, 5.0)),)).replace(3, curvature=curvature)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)
-        found = psf(lens, model, fields=far_out, object_distances=number([1e4]), grid=grid(0.02, 5), tol=0.1)
-    assert float(found.energy[0, 0].detach()) > 0
-    assert float(found.energy[0, 1].detach()) == 0
-    for tensor in (found.kernel, found.energy, found.error, found.centroid[..., 0], found.covariance[..., 0]):
+        result = psf(lens, model, fields=far_out, object_distances=number([1e4]), grid=grid(0.02, 5), tol=0.1)
+    assert float(result.energy[0, 0].detach()) > 0
+    assert float(result.energy[0, 1].detach()) == 0
+    for tensor in (result.kernel, result.energy, result.error, result.centroid[..., 0], result.covariance[..., 0]):
         assert bool(torch.isfinite(tensor).all())
-    (empty,) = torch.autograd.grad(found.kernel[0, 1].square().sum(), curvature, retain_graph=True)
+    (empty,) = torch.autograd.grad(result.kernel[0, 1].square().sum(), curvature, retain_graph=True)
     assert float(empty) == 0
-    (whole,) = torch.autograd.grad(found.kernel.square().sum(), curvature)
+    (whole,) = torch.autograd.grad(result.kernel.square().sum(), curvature)
     assert math.isfinite(float(whole))
     assert float(whole) != 0
 
@@ -420,8 +420,8 @@ def test_derivatives_in_the_object_distance_and_the_field():
     lens = double_gauss()
 
     def moments(distance, angle):
-        found = psf(lens, "gaussian", object_distances=distance[None], fields=torch.stack([0 * angle, angle])[:, None])
-        return found.centroid, found.covariance
+        result = psf(lens, "gaussian", object_distances=distance[None], fields=torch.stack([0 * angle, angle])[:, None])
+        return result.centroid, result.covariance
 
     inputs = number(1e4).requires_grad_(), number(3.0).requires_grad_()
     assert gradcheck(moments, inputs, eps=1e-4, atol=1e-8, rtol=1e-3)
@@ -434,10 +434,10 @@ def test_derivatives_in_the_object_distance_and_the_field():
 def test_a_positive_field_lands_at_positive_y_at_f_tan_theta(model):
     """To the distortion of the design at 1°, 2e-5, and a fiftieth of a pixel."""
     lens = made_for(model, double_gauss(sensor=57.4851290372))
-    found = psf(lens, model, fields=field(1.0), object_distances=number([math.inf]), center="chief", tol=0.05)
+    result = psf(lens, model, fields=field(1.0), object_distances=number([math.inf]), center="chief", tol=0.05)
     height = float(first_order(lens).effective_focal_length) * math.tan(math.radians(1.0))
-    assert float(found.centroid[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
-    assert float(found.grid.centre[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
-    assert float(found.centroid[0, 0, 0]) == pytest.approx(0.0, abs=1e-12)
-    middle = found.kernel[0, 0, 6:15, 6:15].sum()
-    assert float(middle) > 0.5 * float(found.energy)
+    assert float(result.centroid[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
+    assert float(result.grid.centre[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
+    assert float(result.centroid[0, 0, 0]) == pytest.approx(0.0, abs=1e-12)
+    middle = result.kernel[0, 0, 6:15, 6:15].sum()
+    assert float(middle) > 0.5 * float(result.energy)

@@ -29,9 +29,9 @@ def window(*apertures: Aperture, diameter=2 * RADIUS) -> Scene:
     return scene(flat, vector(0.0, 0.0)[:, None], vector(math.inf), vector(0.55))
 
 
-def area(found: Scene, count: int = 256) -> torch.Tensor:
+def area(result: Scene, count: int = 256) -> torch.Tensor:
     unit = arms(count)
-    return between(*clear_arms(found, unit), unit, rings=3)[1].sum()
+    return between(*clear_arms(result, unit), unit, rings=3)[1].sum()
 
 
 @pytest.mark.parametrize(
@@ -67,15 +67,15 @@ def test_a_clear_pupil_is_whole_and_a_blocked_one_dark():
 
 def test_edge_is_where_the_ray_grazes_the_aperture():
     glass = double_gauss()
-    found = scene(
+    result = scene(
         glass.replace(6, apertures=(Aperture("circular", (0.0, 9.0)),)),
         vector(0.0, 3.0)[:, None],
         vector(1e4),
         vector(0.53),
     )
     unit = arms(12)
-    _, outer = clear_arms(found, unit)
-    _, (clearance, *_) = trace_clearances(found, outer.flatten() * unit)
+    _, outer = clear_arms(result, unit)
+    _, (clearance, *_) = trace_clearances(result, outer.flatten() * unit)
     assert float(outer.max()) < 1
     assert float(clearance.abs().max()) < 1e-10
 
@@ -120,9 +120,9 @@ def test_rays_of_the_search_are_counted(monkeypatch):
     traced = []
     plain = trace_clearances.__globals__["trace_apertures"]
 
-    def counting(found, disc):
+    def counting(result, disc):
         traced.append(disc.shape[-1])
-        return plain(found, disc)
+        return plain(result, disc)
 
     monkeypatch.setattr("raytrace.psf_models.pupil_clearance.trace_apertures", counting)
     inner, _ = clear_arms(window(Aperture("circular", (0.0, 1.0), True, (0.0, 2.0))), arms(16))

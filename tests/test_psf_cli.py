@@ -126,8 +126,8 @@ def test_rho_scales_the_paraxial_blur(capsys):
     sigmas = []
     for rho in ("0.5", "0.3"):
         assert main(["psf", str(LENS), "--model", "paraxial", "--object-distance", "1e4", "--rho", rho, "--json"]) == 0
-        found, *_ = json.loads(capsys.readouterr().out)["results"]
-        sigmas.append(found["covariance"][0][0] ** 0.5)
+        result, *_ = json.loads(capsys.readouterr().out)["results"]
+        sigmas.append(result["covariance"][0][0] ** 0.5)
     assert sigmas[1] / sigmas[0] == pytest.approx(0.6, rel=1e-12)
 
 
@@ -135,11 +135,11 @@ def test_without_fields_the_command_and_the_library_take_those_of_the_lens(tmp_p
     out = tmp_path / "psf.npz"
     assert main(["psf", LENS, "--model", "gaussian", "--tol", "0.01", "-o", str(out), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    found = psf(read_lens(LENS), "gaussian", tol=0.01)
+    result = psf(read_lens(LENS), "gaussian", tol=0.01)
     assert [entry["field"] for entry in document["results"]] == [[0.0, 0.0], [0.0, 10.0], [0.0, 14.0]]
     with np.load(out) as arrays:
-        np.testing.assert_array_equal(arrays["psf"], found.kernel.numpy())
-        np.testing.assert_array_equal(arrays["centre"], found.grid.centre.numpy())
+        np.testing.assert_array_equal(arrays["psf"], result.kernel.numpy())
+        np.testing.assert_array_equal(arrays["centre"], result.grid.centre.numpy())
 
 
 def test_what_is_printed_is_the_width_of_the_kernel_that_is_written(tmp_path, capsys):

@@ -109,11 +109,11 @@ def test_derivative_is_that_of_the_kernel(model, order, kind):
         return MODELS[model].kernels(*moved(kind, unit, where), order=order).kernel
 
     unit = scalar(0.0).requires_grad_()
-    found = kernel(unit)
+    result = kernel(unit)
     if (model, kind) in BLIND:
-        assert not found.requires_grad or float(torch.autograd.grad(found.square().sum(), unit)[0]) == 0
+        assert not result.requires_grad or float(torch.autograd.grad(result.square().sum(), unit)[0]) == 0
         return
-    (whole,) = torch.autograd.grad(found.square().sum(), unit)
+    (whole,) = torch.autograd.grad(result.square().sum(), unit)
     assert abs(float(whole)) > 1e-5
     assert gradcheck(kernel, unit, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=True)
 
@@ -133,10 +133,10 @@ def test_derivative_of_drt_comes_near_that_of_the_converged_kernel(kind):
         expected = (converged(1e-3) - converged(-1e-3)) / 2e-3
     errors = []
     for order in (0, 6):
-        found = slope(
+        result = slope(
             lambda unit, n=order: MODELS["drt"].kernels(*moved(kind, unit, where), order=n).kernel, scalar(0.0)
         )
-        errors.append(float((found - expected).abs().sum() / expected.abs().sum()))
+        errors.append(float((result - expected).abs().sum() / expected.abs().sum()))
     assert errors[1] < 0.015
     assert errors[1] < 0.4 * errors[0]
 
@@ -145,14 +145,14 @@ def test_derivative_of_the_transmitted_light_follows_the_edge_of_the_pupil():
     """Energy and σ² of `gaussian` at order 4 against differences at order 12: their own accuracy is 1e-6 here."""
 
     def light(unit, order):
-        found = gaussian.kernels(*moved("curvature", unit, Grid(scalar(10.0), 1, 1, vector(0.0, 0.0))), order=order)
-        return torch.stack([found.kernel.sum(), found.covariance[0].sum(), found.covariance[2].sum()])
+        result = gaussian.kernels(*moved("curvature", unit, Grid(scalar(10.0), 1, 1, vector(0.0, 0.0))), order=order)
+        return torch.stack([result.kernel.sum(), result.covariance[0].sum(), result.covariance[2].sum()])
 
-    found = slope(lambda unit: light(unit, 4), scalar(0.0))
+    result = slope(lambda unit: light(unit, 4), scalar(0.0))
     with torch.no_grad():
         expected = (light(scalar(1e-3), 12) - light(scalar(-1e-3), 12)) / 2e-3
-    assert abs(float(found[0])) > 0.01
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
+    assert abs(float(result[0])) > 0.01
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("angle", [0.0, ANGLE])
@@ -170,12 +170,12 @@ def test_symmetry_hides_no_derivative_by_the_field(transform, angle):
     first, second = (ahead - behind) / (2 * step), (ahead - 2 * here + behind) / step**2
     if transform == "second":
         assert abs(float(second)) > 1e-5
-        found = slope(torch.func.grad(height), start)
-        assert float(found) == pytest.approx(float(second), rel=1e-2)
+        result = slope(torch.func.grad(height), start)
+        assert float(result) == pytest.approx(float(second), rel=1e-2)
     else:
         assert abs(float(first)) > 0.5
-        found = torch.func.grad(height)(start) if transform == "reverse" else slope(height, start)
-        assert float(found) == pytest.approx(float(first), rel=1e-7)
+        result = torch.func.grad(height)(start) if transform == "reverse" else slope(height, start)
+        assert float(result) == pytest.approx(float(first), rel=1e-7)
 
 
 @pytest.mark.parametrize("model", ["gaussian", "drt"])

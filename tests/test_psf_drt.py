@@ -31,9 +31,9 @@ def window(of, pitch: float = 0.005, size: int = 21) -> Grid:
 @pytest.mark.parametrize("field", [0.0, 10.0, 14.0])
 def test_dozens_of_rays_place_every_ray_to_a_nanometre(field):
     of = scene_of(sharp_double_gauss(), field)
-    found = fit(of, 12)
-    assert found.rays <= 60
-    assert float(found.residual.max()) < 1 * NANOMETRE
+    result = fit(of, 12)
+    assert result.rays <= 60
+    assert float(result.residual.max()) < 1 * NANOMETRE
     assert float(fit(of, 8).residual.max()) < 100 * NANOMETRE
 
 
@@ -64,18 +64,18 @@ def test_smooth_vignetting_edges_are_mapped():
     where = window(of)
     with torch.no_grad():
         counted = drt.kernels_of_rays(of, where, rays=2**19, width=0).kernel
-        found = kernels(of, where, order=4)
-    assert float(found.residual.min()) > 0, "of a map"
+        result = kernels(of, where, order=4)
+    assert float(result.residual.min()) > 0, "of a map"
     assert float(counted.sum()) < 0.97
-    assert float(found.kernel.sum()) == pytest.approx(float(counted.sum()), abs=1e-3)
-    assert relative_l1(found.kernel, counted) < 0.005
+    assert float(result.kernel.sum()) == pytest.approx(float(counted.sum()), abs=1e-3)
+    assert relative_l1(result.kernel, counted) < 0.005
 
 
 def test_central_obscuration_is_mapped():
     of = scene_of(read_lens(LENSES / "hubble.zmx"), 0.05, distance=float("inf"))
-    found = kernels(of, window(of, pitch=0.02), order=4)
-    assert float(found.residual.min()) > 0, "of a map"
-    assert float(found.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=1e-3)
+    result = kernels(of, window(of, pitch=0.02), order=4)
+    assert float(result.residual.min()) > 0, "of a map"
+    assert float(result.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=1e-3)
 
 
 @pytest.mark.slow
@@ -84,9 +84,9 @@ def test_traces_all_rays_where_no_map_fits():
     lens = sharp_double_gauss()
     wild = torch.zeros(16, dtype=torch.float64)
     wild[15] = 2e-39
-    found = kernels(scene_of(lens.replace(3, coefficients=wild), 0.0), grid(0.005, 5), order=2)
-    assert float(found.residual.max()) == 0
-    assert torch.isfinite(found.kernel).all()
+    result = kernels(scene_of(lens.replace(3, coefficients=wild), 0.0), grid(0.005, 5), order=2)
+    assert float(result.residual.max()) == 0
+    assert torch.isfinite(result.kernel).all()
     lost = scene_of(lens.replace(3, curvature=1 / 12.0), 0.0)
     assert float(kernels(lost, grid(0.005, 5), order=0).residual.max()) == 0
 
@@ -133,9 +133,9 @@ def test_half_of_a_symmetric_fan_stands_for_all_of_it(monkeypatch):
     weights = torch.linspace(0.5, 2.0, 81, dtype=torch.float64).reshape(9, 9)
 
     def outcome():
-        found = kernels(of, pixels, order=2)
-        (gradient,) = torch.autograd.grad((found.kernel * weights).sum() + found.covariance.sum(), bend)
-        return found.kernel.detach(), found.centroid.detach(), found.covariance.detach(), gradient
+        result = kernels(of, pixels, order=2)
+        (gradient,) = torch.autograd.grad((result.kernel * weights).sum() + result.covariance.sum(), bend)
+        return result.kernel.detach(), result.centroid.detach(), result.covariance.detach(), gradient
 
     half = outcome()
     monkeypatch.setattr(drt, "varies", lambda tensor: True)

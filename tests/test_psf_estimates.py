@@ -133,13 +133,13 @@ def reference(model: str, lens: Lens, options: dict):
     batch = scene(lens, options["fields"], distances, wavelengths)
     with torch.no_grad():
         if model == "gaussian":
-            found = dense_gaussian(batch, window)
+            computed = dense_gaussian(batch, window)
         elif model == "drt":
             nothing = number([0.0]).expand(3, *batch.shape)
-            found = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
+            computed = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
         else:
-            found = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
-        return polychromatic(found, options["wavelength_weights"], model)
+            computed = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
+        return polychromatic(computed, options["wavelength_weights"], model)
 
 
 def dense_gaussian(batch: Scene, window) -> Kernels:
@@ -170,20 +170,20 @@ def measured(model: str, case: Case) -> list[tuple[float, float]]:
     """(estimated error, true error) of one kernel for every tolerance."""
     lens, options = prepared(model, case)
     converged = reference(model, lens, options)
-    found = []
+    computed = []
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", NotConverged)
         for tol in TOLERANCES[model]:
             one = psf(lens, model, tol=tol, **options)
-            found.append((float(one.error), true_error(one, converged)))
-    return found
+            computed.append((float(one.error), true_error(one, converged)))
+    return computed
 
 
-def coverage(found: list[tuple[float, float]]) -> tuple[int, float, float]:
+def coverage(computed: list[tuple[float, float]]) -> tuple[int, float, float]:
     """How many estimates; the share that bound the true error; the share that do, within a factor of ten."""
-    bounds = [true <= estimate for estimate, true in found]
-    close = [true <= estimate <= 10 * true for estimate, true in found]
-    return len(found), sum(bounds) / len(found), sum(close) / len(found)
+    bounds = [true <= estimate for estimate, true in computed]
+    close = [true <= estimate <= 10 * true for estimate, true in computed]
+    return len(computed), sum(bounds) / len(computed), sum(close) / len(computed)
 
 
 @pytest.mark.parametrize("model", TOLERANCES)
@@ -208,7 +208,7 @@ def test_estimates_bound_the_true_error_of_lenses_they_were_not_fitted_to(model)
 @pytest.mark.parametrize("model", ["gaussian", "drt", "wave"])
 def test_estimates_hold_in_single_precision(model):
     """Against the reference of the same rounded numbers in double precision, at a tolerance rounding may not meet."""
-    found = []
+    computed = []
     for case in (HELD_OUT[3], Case("telephoto", (0.0, 0.0), INF, 0.004), Case("tessar", (0.0, 5.0), 2e4, 0.01)):
         lens, options = prepared(model, case)
         narrow, options = to(lens, dtype=torch.float32), {k: to(v, dtype=torch.float32) for k, v in options.items()}
@@ -218,19 +218,19 @@ def test_estimates_hold_in_single_precision(model):
             one = psf(narrow, model, tol=1e-2 if model == "drt" else 1e-4, **options)
         assert one.kernel.dtype == torch.float32
         converged = reference(model, to(narrow, dtype=torch.float64), rounded)
-        found.append((float(one.error), true_error(to(one, dtype=torch.float64), converged)))
-    assert all(true <= estimate for estimate, true in found), found
+        computed.append((float(one.error), true_error(to(one, dtype=torch.float64), converged)))
+    assert all(true <= estimate for estimate, true in computed), computed
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
     for model in sys.argv[1:] or TOLERANCES:
         for name, cases in (("fitted", FITTED), ("held out", HELD_OUT)):
-            found = []
+            computed = []
             for case in cases:
                 entries = measured(model, case)
                 print(
                     model, case, " ".join(f"{e:.1e}/{t:.1e}={e / max(t, 1e-300):.2g}" for e, t in entries), flush=True
                 )
-                found += entries
-            print("| {} | {} | {} | {:.0%} | {:.0%} |".format(model, name, *coverage(found)), flush=True)
+                computed += entries
+            print("| {} | {} | {} | {:.0%} | {:.0%} |".format(model, name, *coverage(computed)), flush=True)

@@ -108,8 +108,8 @@ def test_parseval(waves):
 @pytest.mark.parametrize("sigma", [0.02, 0.05])
 def test_strehl_is_marechals(j, sigma):
     s = in_focus()
-    found = point(s, zernike=zernike(j, sigma)) / (math.pi * frequency(s) ** 2)
-    assert abs(found - math.exp(-((2 * math.pi * sigma) ** 2))) < 1e-3
+    computed = point(s, zernike=zernike(j, sigma)) / (math.pi * frequency(s) ** 2)
+    assert abs(computed - math.exp(-((2 * math.pi * sigma) ** 2))) < 1e-3
 
 
 def test_zero_aberrations_change_nothing():

@@ -57,8 +57,8 @@ EXACT = [
 
 @pytest.mark.parametrize(("place", "mean", "covariance", "energy", "allowed"), EXACT)
 def test_energy_of_a_pixel_is_exact(place, mean, covariance, energy, allowed):
-    found = pixels(mean, covariance, pitch=0.0025, size=8)[place].item()
-    assert abs(found - energy) <= allowed * ROUNDING * energy
+    computed = pixels(mean, covariance, pitch=0.0025, size=8)[place].item()
+    assert abs(computed - energy) <= allowed * ROUNDING * energy
 
 
 @pytest.mark.slow
@@ -85,8 +85,8 @@ def test_a_rotated_gaussian_is_that_of_a_dense_rule(sigma_x, sigma_y, rho):
     v = ((centre - mean[1])[:, None, :, None] / sigma_y - rho * u[:, None, :]) / math.sqrt(1 - rho**2)
     density = torch.exp(-0.5 * (u[:, None, :] ** 2 + v**2)) / (2 * math.pi * sigma_x * sigma_y * math.sqrt(1 - rho**2))
     expected = torch.einsum("yxnm,n,m->yx", density, weight, weight) / 4
-    found = gaussian_pixels(grid(scalar(1.0), 11), mean, covariance)
-    error = (found - expected).abs() / expected.clamp_min(1e-290)
+    computed = gaussian_pixels(grid(scalar(1.0), 11), mean, covariance)
+    error = (computed - expected).abs() / expected.clamp_min(1e-290)
     assert float(error[expected > 1e-6].max()) < 1e-14 + 10 * ROUNDING / (1 - rho**2)
     assert float(error[expected > 1e-250].max()) < 2e-13 + 575 * ROUNDING / (1 - rho**2)
 
@@ -122,11 +122,11 @@ def test_a_point_falls_in_one_pixel_or_halves_on_an_edge():
 
 def test_a_line_lies_where_it_is():
     """Σ of rank 1 along the diagonal: pixels on it hold Φ differences of the line, the others nothing."""
-    found = pixels((0.0, 0.0), (2.5e-5, 2.5e-5, 2.5e-5))
+    computed = pixels((0.0, 0.0), (2.5e-5, 2.5e-5, 2.5e-5))
     edge = (torch.arange(8, dtype=torch.float64) - 3.5) / math.sqrt(2)
     expected = torch.diff(0.5 * torch.erf(edge))
-    torch.testing.assert_close(found.diagonal(), expected, rtol=1e-13, atol=0)
-    assert (found - torch.diag(found.diagonal())).abs().max() <= 1e-16
+    torch.testing.assert_close(computed.diagonal(), expected, rtol=1e-13, atol=0)
+    assert (computed - torch.diag(computed.diagonal())).abs().max() <= 1e-16
 
 
 @pytest.mark.slow
@@ -183,8 +183,8 @@ def test_few_rays_on_the_axis(order, allowed):
 
 
 def test_forty_rays_at_full_field():
-    found = scene_of(lens_at(), (0.0, 14.0))
-    few, many = (gaussian.kernels(found, grid(0.005, 5), order=n) for n in (5, 10))
+    computed = scene_of(lens_at(), (0.0, 14.0))
+    few, many = (gaussian.kernels(computed, grid(0.005, 5), order=n) for n in (5, 10))
     assert few.rays == 40
     torch.testing.assert_close(few.covariance.sqrt(), many.covariance.sqrt(), rtol=1e-6, atol=0)
 
@@ -219,21 +219,23 @@ def test_centroid_follows_the_field_in_x_and_y(field):
         return gaussian.kernels(scene(lens, fields, vector(25_000.0), vector(0.530)), pixel, order=5).centroid.flatten()
 
     start, step = vector(*field)[:, None], 1e-4
-    found = torch.autograd.functional.jacobian(centroid, start)[:, :, 0]
+    computed = torch.autograd.functional.jacobian(centroid, start)[:, :, 0]
     for axis in (0, 1):
         moved = torch.zeros_like(start)
         moved[axis] = step
         expected = (centroid(start + moved) - centroid(start - moved)) / (2 * step)
         assert abs(float(expected[axis])) > 1.0
-        assert (found[:, axis] - expected).abs().max() <= 1e-6  # mm a degree; the difference errs by step² and rounding
+        assert (
+            computed[:, axis] - expected
+        ).abs().max() <= 1e-6  # mm a degree; the difference errs by step² and rounding
 
 
 def test_energy_is_the_transmitted_fraction_of_the_whole_pupil():
     lens = clipped(lens_at(), 6, 5.0)
-    found = gaussian.kernels(scene_of(lens), grid(0.2, 41), order=2).kernel.sum()
+    computed = gaussian.kernels(scene_of(lens), grid(0.2, 41), order=2).kernel.sum()
     # The ray at the edge of that share of the pupil's area grazes the aperture.
-    assert 0.05 < float(found) < 0.5
-    _, (clearance, *_) = trace_clearances(scene_of(lens), torch.stack([0 * found, found.sqrt()])[:, None])
+    assert 0.05 < float(computed) < 0.5
+    _, (clearance, *_) = trace_clearances(scene_of(lens), torch.stack([0 * computed, computed.sqrt()])[:, None])
     assert float(clearance.abs().max()) < 1e-9
     factors = torch.zeros(5, 3, dtype=torch.float64)
     factors[2, 2], factors[3, 2] = 0.1, 0.4
@@ -243,10 +245,10 @@ def test_energy_is_the_transmitted_fraction_of_the_whole_pupil():
     torch.testing.assert_close(share.flatten(), vector(1.0, 1.0, 0.9 * 0.6))
 
 
-def dense(found):
+def dense(computed):
     """Energy, centroid and covariance (6,) of a quarter of a million rays, blocked one by one."""
     points, weights = gauss_rings(1024, 256)
-    rays = trace_scene(found, points)
+    rays = trace_scene(computed, points)
     weights = weights * rays.valid.flatten()
     x, y = rays.position[:2].reshape(2, -1)
     share = weights / weights.sum()
@@ -272,9 +274,9 @@ def test_light_of_a_clipped_pupil_is_that_of_a_dense_one(name):
     pupil and arms tangent to an obscuration leave 1e-3 at 96 arms.
     """
     lens, field, distance = CLIPPED[name]
-    found = scene_of(lens, field, (distance,))
-    result = gaussian.kernels(found, Grid(scalar(1000.0), 1, 1, vector(0.0, 0.0)), order=4)
-    energy, mx, my, xx, xy, yy = dense(found)
+    computed = scene_of(lens, field, (distance,))
+    result = gaussian.kernels(computed, Grid(scalar(1000.0), 1, 1, vector(0.0, 0.0)), order=4)
+    energy, mx, my, xx, xy, yy = dense(computed)
     sigma = float((xx + yy).sqrt())
     assert 0.5 < float(energy) < 0.99
     assert float(result.kernel.sum()) == pytest.approx(float(energy), abs=1e-3)
@@ -284,8 +286,8 @@ def test_light_of_a_clipped_pupil_is_that_of_a_dense_one(name):
 
 def test_energy_of_an_obscured_mirror_is_its_area():
     """A flat obscuration of 396 mm before a mirror of 1,200 mm, in parallel light: exact, whatever the field."""
-    found = scene_of(CLIPPED["obscured"][0], (0.0, 0.05), (math.inf,))
-    energy = gaussian.kernels(found, Grid(scalar(1000.0), 1, 1, vector(0.0, 0.0)), order=2).kernel.sum()
+    computed = scene_of(CLIPPED["obscured"][0], (0.0, 0.05), (math.inf,))
+    energy = gaussian.kernels(computed, Grid(scalar(1000.0), 1, 1, vector(0.0, 0.0)), order=2).kernel.sum()
     assert float(energy) == pytest.approx(1 - (396 / 1200) ** 2, abs=1e-9)
 
 
@@ -380,11 +382,11 @@ def test_derivatives_with_vignetted_rays(field):
 )
 def test_residual_is_the_distance_from_many_rays(field, distance, stop):
     """L¹ between the Gaussian and a histogram of 65,536 traced rays, which carries about 1 % noise itself."""
-    found = scene_of(clipped(lens_at(), 6, stop), (0.0, field), (distance,))
-    place = gaussian.kernels(found, grid(0.005, 3), order=5).centroid.flatten()
+    computed = scene_of(clipped(lens_at(), 6, stop), (0.0, field), (distance,))
+    place = gaussian.kernels(computed, grid(0.005, 3), order=5).centroid.flatten()
     pixel = Grid(scalar(0.005), 21, 21, place)
-    result = gaussian.kernels(found, pixel, order=6)
-    rays = trace_scene(found, sobol(65_536)[0])
+    result = gaussian.kernels(computed, pixel, order=6)
+    rays = trace_scene(computed, sobol(65_536)[0])
     hits = rays.position[:2].reshape(2, -1)[:, rays.valid.flatten()]
     x, y = ((hits - place[:, None]) / 0.005 + 10.5).floor().to(torch.int64)
     kept = (x >= 0) & (x < 21) & (y >= 0) & (y < 21)

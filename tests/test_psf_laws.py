@@ -54,9 +54,9 @@ def test_defocus_on_the_axis_is_sinc_squared_of_the_wave_model():
         own = scene(lens, vector(0.0, 0.0)[:, None], vector(math.inf), lens.wavelengths)
         light = wave.waves(own, 0.0, order=2)
         U = wave.amplitude(light, vector(0.0), vector(0.0)).flatten()
-        found = (U.real**2 + U.imag**2) / (light.amplitude.sum() / WAVELENGTH) ** 2
+        result = (U.real**2 + U.imag**2) / (light.amplitude.sum() / WAVELENGTH) ** 2
         quarter = 0.25 * u * radius / (radius + delta)
-        assert float(found) == pytest.approx((math.sin(quarter) / quarter) ** 2, abs=2e-4)
+        assert float(result) == pytest.approx((math.sin(quarter) / quarter) ** 2, abs=2e-4)
 
 
 @pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt", "wave"])
@@ -103,7 +103,7 @@ def test_a_memo_changes_no_kernel_and_traces_less(model, stop):
             for m in (memo, None)
         )
         torch.testing.assert_close(with_memo.kernel, plain.kernel, atol=1e-13, rtol=0)
-        gradients = [torch.autograd.grad(found.kernel[..., 2].sum(), sensor)[0] for found in (with_memo, plain)]
+        gradients = [torch.autograd.grad(result.kernel[..., 2].sum(), sensor)[0] for result in (with_memo, plain)]
         torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)
     crossed, bundles = memo.crossed, []
     original = Memo.front

@@ -34,12 +34,12 @@ def sums(kernel: torch.Tensor, window) -> tuple[torch.Tensor, ...]:
 @pytest.mark.parametrize("model", WAVES)
 def test_what_is_said_of_waves_is_the_width_of_their_kernel_not_of_the_rays(model):
     """The telescope's rays meet in 0.01 µm, its diffraction pattern is a thousand times wider."""
-    found = psf(read_lens("hubble"), model, fields=axis(), tol=1e-3)
-    *_, xx, _, yy = sums(found.kernel[0, 0], found.grid)
-    assert found.covariance[0, 0, 0] == pytest.approx(float(xx), rel=3e-3)
-    assert found.covariance[2, 0, 0] == pytest.approx(float(yy), rel=3e-3)
-    assert 9e-3 < float(found.covariance[0, 0, 0].sqrt()) < 12e-3
-    assert 0 < float(found.ray_covariance[0, 0, 0].sqrt()) < 1e-5
+    result = psf(read_lens("hubble"), model, fields=axis(), tol=1e-3)
+    *_, xx, _, yy = sums(result.kernel[0, 0], result.grid)
+    assert result.covariance[0, 0, 0] == pytest.approx(float(xx), rel=3e-3)
+    assert result.covariance[2, 0, 0] == pytest.approx(float(yy), rel=3e-3)
+    assert 9e-3 < float(result.covariance[0, 0, 0].sqrt()) < 12e-3
+    assert 0 < float(result.ray_covariance[0, 0, 0].sqrt()) < 1e-5
 
 
 @pytest.mark.parametrize("model", WAVES)
@@ -62,13 +62,13 @@ def test_moments_of_waves_off_the_axis_are_those_of_a_fine_kernel():
     lens = read_lens("telephoto")
     lens = dataclasses.replace(lens, wavelengths=number([0.5, 0.6]), wavelength_weights=number([3.0, 1.0]))
     field, window = number([[1.0], [2.0]]), grid(number(0.0004), 61)
-    found = psf(lens, "wave", fields=field, grid=window, center="chief", tol=0.01)
-    kernel, centre = found.kernel[0, 0], found.grid.centre[:, 0, 0]
+    result = psf(lens, "wave", fields=field, grid=window, center="chief", tol=0.01)
+    kernel, centre = result.kernel[0, 0], result.grid.centre[:, 0, 0]
     x, y, xx, xy, yy = sums(kernel, window)
-    assert found.centroid[:, 0, 0].tolist() == pytest.approx([float(centre[0] + x), float(centre[1] + y)], abs=1e-7)
-    assert found.covariance[:, 0, 0].tolist() == pytest.approx([float(xx), float(xy), float(yy)], rel=2e-3)
+    assert result.centroid[:, 0, 0].tolist() == pytest.approx([float(centre[0] + x), float(centre[1] + y)], abs=1e-7)
+    assert result.covariance[:, 0, 0].tolist() == pytest.approx([float(xx), float(xy), float(yy)], rel=2e-3)
     # The mean of the whole wave is that of its rays (Ehrenfest); a window cuts tails off.
-    torch.testing.assert_close(found.ray_centroid, found.centroid, atol=5e-4, rtol=0)
+    torch.testing.assert_close(result.ray_centroid, result.centroid, atol=5e-4, rtol=0)
 
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian", "drt"])
@@ -126,8 +126,8 @@ def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
 
 def test_the_lenses_own_fields_are_seen_about_their_chief_rays():
     lens = read_lens("double_gauss")
-    found, asked = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
-    assert found.kernel.shape[1] == 3
-    assert bool((found.energy > 0.05).all())
+    result, asked = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
+    assert result.kernel.shape[1] == 3
+    assert bool((result.energy > 0.05).all())
     assert float(asked.energy) == 0  # fields that are given count from the axis
     assert asked.grid.centre.tolist() == [0.0, 0.0]

@@ -26,8 +26,8 @@ def double_gauss_at(sensor_distance, field=(0.0, 0.0), distances=(25_000.0,)):
 def test_blur_of_a_thin_lens(distance):
     """A lens of no thickness, f = 100 mm, radius 5: ε = R |1 - z_i (1/f - 1/z_o)| by hand; in object space at z_o."""
     thin = lens([surface(0.02, 0.0, 1.5), surface(0.0, 103.0)], object_distance=distance)
-    found = paraxial.blur_radius(scene(thin, vector(0.0, 0.0)[:, None], vector(distance), vector(0.55)))
-    assert found.item() == pytest.approx(5 * abs(1 - 103 * (1 / 100 - 1 / distance)), rel=1e-12)
+    computed = paraxial.blur_radius(scene(thin, vector(0.0, 0.0)[:, None], vector(distance), vector(0.55)))
+    assert computed.item() == pytest.approx(5 * abs(1 - 103 * (1 / 100 - 1 / distance)), rel=1e-12)
 
 
 def test_the_double_gauss_of_the_comparison():
@@ -42,11 +42,11 @@ def test_the_double_gauss_of_the_comparison():
 
 def test_centroid_is_the_chief_ray():
     """In focus at infinity the height is f tan θ; a positive field lands at +y."""
-    found = paraxial.kernels(double_gauss_at(57.4851290372, (3.0, 14.0), (INF,)), grid(0.005, 3)).centroid.flatten()
+    computed = paraxial.kernels(double_gauss_at(57.4851290372, (3.0, 14.0), (INF,)), grid(0.005, 3)).centroid.flatten()
     expected = [99.5145515666 * math.tan(math.radians(angle)) for angle in (3.0, 14.0)]
-    torch.testing.assert_close(found, vector(*expected), rtol=1e-9, atol=0)
+    torch.testing.assert_close(computed, vector(*expected), rtol=1e-9, atol=0)
     far = paraxial.kernels(double_gauss_at(57.4851290372, (3.0, 14.0), (1e12,)), grid(0.005, 3)).centroid.flatten()
-    torch.testing.assert_close(found, far, rtol=1e-9, atol=0)
+    torch.testing.assert_close(computed, far, rtol=1e-9, atol=0)
 
 
 def test_object_height_is_magnified():
@@ -70,8 +70,8 @@ def test_in_focus_all_is_in_one_pixel_and_the_gradient_is_finite():
 def test_derivatives():
     def kernel(curvature, sensor_distance, rho, pitch, centre):
         thin = lens([surface(curvature / 100, 2.0, 1.5), surface(-0.001, sensor_distance)])
-        found = scene(thin, vector(0.0, 0.01)[:, None], vector(5000.0), vector(0.55))
-        return paraxial.kernels(found, Grid(pitch / 50, 2, 3, centre / 50), rho=rho).kernel
+        computed = scene(thin, vector(0.0, 0.01)[:, None], vector(5000.0), vector(0.55))
+        return paraxial.kernels(computed, Grid(pitch / 50, 2, 3, centre / 50), rho=rho).kernel
 
     numbers = [scalar(2.0), scalar(97.0), scalar(0.5), scalar(1.5), vector(0.2, -0.3)]
     numbers = [number.requires_grad_() for number in numbers]
@@ -84,9 +84,9 @@ def test_a_nearly_empty_window_has_finite_derivatives():
     system = double_gauss()
     place = torch.tensor([[0.0], [2.4]], dtype=torch.float64, requires_grad=True)
     pixels = dataclasses.replace(grid(scalar(0.005), 5), centre=place[:, :, None])
-    found = psf(system, "paraxial", fields=system.wavelengths.new_zeros(2, 1), grid=pixels, normalise="window")
-    assert 0 < float(found.energy.detach()) < 1e-160
-    assert float(found.kernel.detach().sum()) == pytest.approx(1)
-    (slope,) = torch.autograd.grad(found.kernel[..., 0, 0].sum(), place)
+    computed = psf(system, "paraxial", fields=system.wavelengths.new_zeros(2, 1), grid=pixels, normalise="window")
+    assert 0 < float(computed.energy.detach()) < 1e-160
+    assert float(computed.kernel.detach().sum()) == pytest.approx(1)
+    (slope,) = torch.autograd.grad(computed.kernel[..., 0, 0].sum(), place)
     assert bool(torch.isfinite(slope).all())
     assert float(slope[1]) != 0

@@ -33,20 +33,20 @@ def test_energy_of_a_band_limited_intensity(size):
     expected = integrate(intensity(torch.hypot(x[None], y[:, None])), weight, window.pitch)
     for order, tolerance in ((0, 2e-3), (2, 1e-5), (4, 1e-7)):
         radii, matrix = radii_of_waves(window, k / math.pi, order)
-        found = unfold(window, matrix @ intensity(radii))
-        assert found.shape == expected.shape
-        assert float((found - expected).abs().sum() / expected.sum()) < tolerance
+        result = unfold(window, matrix @ intensity(radii))
+        assert result.shape == expected.shape
+        assert float((result - expected).abs().sum() / expected.sum()) < tolerance
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_energy_of_a_uniform_disc(size):
     """Against its area in every pixel, counted at 160,000 points of each (good to 1e-4 of the whole)."""
     window, radius = grid(0.005, size), 0.03
-    found = unfold(window, energy_of_rings(window, *line(200, radius)))
+    result = unfold(window, energy_of_rings(window, *line(200, radius)))
     x, y = (((np.arange(n * 400) + 0.5) / 400 - 0.5 * n) * 0.005 for n in (window.columns, window.rows))
     inside = np.hypot(x[None], y[:, None]) < radius
     expected = inside.reshape(window.rows, 400, window.columns, 400).mean((1, 3)) * 0.005**2 / (np.pi * radius**2)
-    assert np.abs(found.numpy() - expected).sum() < 2e-4
+    assert np.abs(result.numpy() - expected).sum() < 2e-4
 
 
 def test_all_light_inside_the_window_is_kept_and_the_rest_is_not_counted():
@@ -60,8 +60,8 @@ def test_all_light_inside_the_window_is_kept_and_the_rest_is_not_counted():
 def test_heights_below_the_axis_are_the_same_rings():
     window = grid(0.005, 21)
     first, last, energy = line(101, 0.05)
-    found, mirrored = (energy_of_rings(window, side * first, side * last, energy) for side in (1, -1))
-    torch.testing.assert_close(found, mirrored, atol=1e-15, rtol=0)
+    result, mirrored = (energy_of_rings(window, side * first, side * last, energy) for side in (1, -1))
+    torch.testing.assert_close(result, mirrored, atol=1e-15, rtol=0)
     # A cell on both sides of the axis covers the axis twice over.
     both = energy_of_rings(window, number([-0.01]), number([0.02]), number([1.0]))
     apart = energy_of_rings(window, number([-0.01, 0.0]), number([0.0, 0.02]), number([1 / 3, 2 / 3]))
@@ -72,10 +72,10 @@ def test_a_focus_and_a_caustic_are_finite_and_have_finite_derivatives():
     window = grid(0.005, 21)
     for heights in (torch.zeros(9), 0.013 * torch.ones(9), torch.linspace(-1, 1, 9) ** 2 * 0.02):
         heights = heights.to(torch.float64).requires_grad_()
-        found = energy_of_rings(window, heights[:-1], heights[1:], torch.full((8,), 0.125, dtype=torch.float64))
-        (gradient,) = torch.autograd.grad(found.square().sum(), heights)
+        result = energy_of_rings(window, heights[:-1], heights[1:], torch.full((8,), 0.125, dtype=torch.float64))
+        (gradient,) = torch.autograd.grad(result.square().sum(), heights)
         assert bool(torch.isfinite(gradient).all())
-        assert float(unfold(window, found).sum().detach()) == pytest.approx(1.0, abs=1e-9)
+        assert float(unfold(window, result).sum().detach()) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_derivatives_in_the_heights_the_energy_and_the_pitch():

@@ -86,9 +86,9 @@ def test_equals_brute_force_within_its_noise(field, times):
     where = window(of)
     with torch.no_grad():
         counted = sum(kernels_of_rays(of, where, rays=2**19, sampling=s, width=0).kernel for s in seeds(times)) / times
-        found = kernels_of_rays(of, where, order=6)
-    assert relative_l1(found.kernel, counted) < 0.01
-    assert float(found.kernel.sum()) == pytest.approx(float(counted.sum()), abs=2e-3)
+        result = kernels_of_rays(of, where, order=6)
+    assert relative_l1(result.kernel, counted) < 0.01
+    assert float(result.kernel.sum()) == pytest.approx(float(counted.sum()), abs=2e-3)
     assert float(counted.sum()) < 0.97  # some are vignetted
 
 
@@ -153,26 +153,26 @@ def test_no_light_is_zero_energy_and_zero_gradient():
     sensor = number(57.0).requires_grad_()
     of = scene_of(with_sensor_distance(lens, sensor), 10.0)
     for options in ({"order": 1}, {"rays": 64}):
-        found = kernels_of_rays(of, grid(0.005, 5), **options)
-        total = found.kernel.sum() + found.centroid.sum() + found.covariance.sum()
+        result = kernels_of_rays(of, grid(0.005, 5), **options)
+        total = result.kernel.sum() + result.centroid.sum() + result.covariance.sum()
         (slope,) = torch.autograd.grad(total, sensor)
-        assert float(found.kernel.detach().abs().sum()) == 0
+        assert float(result.kernel.detach().abs().sum()) == 0
         assert float(slope) == 0
 
 
 def test_a_positive_field_moves_the_light_to_positive_y():
-    found = kernels_of_rays(scene_of(sharp_double_gauss(), 10.0), grid(0.005, 3), order=2)
-    assert float(found.centroid[1]) > 10
-    assert abs(float(found.centroid[0])) < 1e-9
+    result = kernels_of_rays(scene_of(sharp_double_gauss(), 10.0), grid(0.005, 3), order=2)
+    assert float(result.centroid[1]) > 10
+    assert abs(float(result.centroid[0])) < 1e-9
 
 
 def test_central_obscuration_takes_its_area():
     lens = read_lens(LENSES / "hubble.zmx")
     of = scene_of(lens, 0.05, float("inf"))
-    found = kernels_of_rays(
+    result = kernels_of_rays(
         of, Grid(number(0.05), 21, 21, kernels_of_rays(of, grid(0.05, 3), order=2).centroid), order=5
     )
-    assert float(found.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=2e-3)
+    assert float(result.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=2e-3)
 
 
 def test_vignetting_factors_take_their_area():

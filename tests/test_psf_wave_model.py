@@ -126,8 +126,8 @@ def test_symmetry_changes_nothing(angle):
 def test_orders_converge():
     s = scene_of(gauss(), 10.0, 1e4)
     window = grid(0.005, 9, chief(s))
-    found = [wave.kernels(s, window, order=order).kernel for order in range(4)]
-    errors = [((k - found[3]).abs().sum() / found[3].sum()).item() for k in found[:3]]
+    computed = [wave.kernels(s, window, order=order).kernel for order in range(4)]
+    errors = [((k - computed[3]).abs().sum() / computed[3].sum()).item() for k in computed[:3]]
     assert errors[0] < 1e-3
     assert errors[1] < 0.3 * errors[0]
     assert errors[2] < 0.3 * errors[1]
@@ -162,9 +162,9 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
     opd = without(front, 3)
     sigma = torch.sqrt((weights * opd**2).sum(-1)) / 0.53e-3
     expected = torch.exp(-((2 * math.pi * sigma) ** 2))
-    found = wave.strehl(s)
+    computed = wave.strehl(s)
     assert 0.1 < expected < 0.99
-    assert abs(found - expected) < 0.1 * (1 - expected) ** 1.5
+    assert abs(computed - expected) < 0.1 * (1 - expected) ** 1.5
     assert rms(front) > 0
 
 

@@ -79,25 +79,25 @@ def test_energy_is_the_transmitted_share():
     s = scene_of(slow(stop=2.0), 3.0, 25e3)
     share = float(wavefront_of(s, *gauss_rings(50, 200)).energy.sum())
     assert 0.2 < share < 0.8
-    found = psf(slow(stop=2.0), "wave", fields=field(3.0), grid=grid(0.025, 11), center="chief",
+    result = psf(slow(stop=2.0), "wave", fields=field(3.0), grid=grid(0.025, 11), center="chief",
                 object_distances=number([25e3]), tol=1e-2)  # fmt: skip
-    assert -3e-3 < share - float(found.energy) < 0.015
+    assert -3e-3 < share - float(result.energy) < 0.015
 
 
 def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero():
     curvature = slow().surfaces[3].curvature.clone().requires_grad_()
     # A hole in front passes the beam of the axis, not that of 40°.
     lens = slow().replace(1, apertures=problems.vignetting_aperture(5.0)).replace(3, curvature=curvature)
-    found = psf(lens, "wave", fields=field(0.0, 40.0), object_distances=number([1e4]), grid=grid(0.01, 5), tol=0.1,
+    result = psf(lens, "wave", fields=field(0.0, 40.0), object_distances=number([1e4]), grid=grid(0.01, 5), tol=0.1,
                 center="chief")  # fmt: skip
-    assert float(found.energy[0, 0].detach()) > 0.5
-    assert float(found.energy[0, 1].detach()) == 0
-    moments = (t[..., 0] for t in (found.centroid, found.covariance, found.ray_centroid, found.ray_covariance))
-    for tensor in (found.kernel, found.energy, found.error, found.residual, *moments):
+    assert float(result.energy[0, 0].detach()) > 0.5
+    assert float(result.energy[0, 1].detach()) == 0
+    moments = (t[..., 0] for t in (result.centroid, result.covariance, result.ray_centroid, result.ray_covariance))
+    for tensor in (result.kernel, result.energy, result.error, result.residual, *moments):
         assert bool(torch.isfinite(tensor).all())
-    (empty,) = torch.autograd.grad(found.kernel[0, 1].square().sum(), curvature, retain_graph=True)
+    (empty,) = torch.autograd.grad(result.kernel[0, 1].square().sum(), curvature, retain_graph=True)
     assert float(empty) == 0
-    (whole,) = torch.autograd.grad(found.kernel.square().sum(), curvature)
+    (whole,) = torch.autograd.grad(result.kernel.square().sum(), curvature)
     assert math.isfinite(float(whole))
     assert float(whole) != 0
 
@@ -108,27 +108,27 @@ def test_a_positive_field_lands_at_positive_y_at_f_tan_theta(model):
     lens = slow(sensor=57.4851290372)
     height = float(first_order(lens).effective_focal_length) * math.tan(math.radians(1.0))
     window = grid(number(0.01), 7, vector(0.0, height))
-    found = psf(lens, model, fields=field(1.0), object_distances=number([math.inf]), grid=window, tol=0.01)
-    assert float(found.centroid[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
-    assert float(found.centroid[0, 0, 0]) == pytest.approx(0.0, abs=1e-12)
-    assert float(found.kernel[0, 0, 2:5, 2:5].sum()) > 0.7
+    result = psf(lens, model, fields=field(1.0), object_distances=number([math.inf]), grid=window, tol=0.01)
+    assert float(result.centroid[1, 0, 0]) == pytest.approx(height, abs=1.5e-3)
+    assert float(result.centroid[0, 0, 0]) == pytest.approx(0.0, abs=1e-12)
+    assert float(result.kernel[0, 0, 2:5, 2:5].sum()) > 0.7
 
 
 @pytest.mark.parametrize("model", WAVES)
 def test_a_window_beside_the_light_holds_next_to_nothing(model):
     """Of the rings at v = 100 Airy units, 2/(π v) lies outside, and of that a window of one part in a thousand."""
     s = scene_of(slow(beam=4.0), 0.0, 25e3)
-    found = psf(slow(beam=4.0), model, fields=field(0.0), object_distances=number([25e3]), tol=0.1,
+    result = psf(slow(beam=4.0), model, fields=field(0.0), object_distances=number([25e3]), tol=0.1,
                 grid=Grid(number(0.01), 3, 3, light_at(model, s) + vector(0.4, 0.0)))  # fmt: skip
-    assert 0 <= float(found.energy) < 1e-4
-    assert bool(torch.isfinite(found.kernel).all())
+    assert 0 <= float(result.energy) < 1e-4
+    assert bool(torch.isfinite(result.kernel).all())
 
 
 def test_a_tolerance_below_rounding_is_said():
     with pytest.warns(NotConverged, match="wave: the estimated error .* stays above the tolerance 1e-09"):
-        found = psf(slow(beam=3.0), "wave", fields=field(0.0), object_distances=number([25e3]), grid=grid(0.01, 3),
+        result = psf(slow(beam=3.0), "wave", fields=field(0.0), object_distances=number([25e3]), grid=grid(0.01, 3),
                     tol=1e-9)  # fmt: skip
-    assert 1e-9 < float(found.error) < 1e-6
+    assert 1e-9 < float(result.error) < 1e-6
 
 
 def test_a_looser_tolerance_takes_fewer_rays():
@@ -268,13 +268,13 @@ def test_transforms_of_torch_func_give_the_same_derivative(model):
     at = number(NUMBERS["curvature"][0])
     (expected,) = torch.autograd.grad(total(leaf := at.clone().requires_grad_()), leaf)
     assert float(expected) != 0
-    found = {
+    result = {
         "grad": torch.func.grad(total)(at),
         "jvp": torch.func.jvp(total, (at,), (torch.ones_like(at),))[1],
         "jacrev": torch.func.jacrev(total)(at),
         "jacfwd": torch.func.jacfwd(total)(at),
     }
-    for name, derivative in found.items():
+    for name, derivative in result.items():
         assert float(derivative) == pytest.approx(float(expected), rel=1e-7), name
 
 

@@ -115,10 +115,10 @@ def psf_centre(name: str, center: str) -> torch.Tensor:
 def test_a_held_window_has_no_forward_derivative_either():
     def centre(unit, window):
         at = moved("curvature", unit, grid(scalar(0.03), 3))[0]
-        found = psf(
+        result = psf(
             at.lens, Gaussian(order=2), fields=at.fields, object_distances=vector(1e4), center="chief", window=window
         )
-        return found.grid.centre.sum()
+        return result.grid.centre.sum()
 
     moving, fixed = (
         torch.func.jvp(lambda unit, w=window: centre(unit, w), (scalar(0.0),), (scalar(1.0),))[1]

@@ -208,8 +208,8 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     fields = torch.stack([lens.fields.x, lens.fields.y])
     expected = spot_of(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
-    radii = number([entry["rms_radius"] for entry in found[1]["results"]]).reshape(3, 3)
-    torch.testing.assert_close(radii, expected.rms_radius, rtol=1e-12, atol=0)
+    radii = number([entry["rms_radius_um"] for entry in found[1]["results"]]).reshape(3, 3)
+    torch.testing.assert_close(radii, 1e3 * expected.rms_radius, rtol=1e-12, atol=0)
     assert found[0]["reference"] == "centroid"
-    assert all(a["rms_radius"] != b["rms_radius"] for a, b in zip(*(d["results"] for d in found), strict=True))
+    assert all(a["rms_radius_um"] != b["rms_radius_um"] for a, b in zip(*(d["results"] for d in found), strict=True))
     assert main([*hexapolar, "--rays", "1000", "--reference", "chief"]) == 1

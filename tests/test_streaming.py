@@ -466,8 +466,8 @@ def test_command_gives_the_spot_of_few_rays(command):
     for one, other in zip(few["results"], many["results"], strict=True):
         assert one["field"] == other["field"]
         assert one["centroid"] == pytest.approx(other["centroid"], abs=PICOMETRE)
-        assert one["rms_radius"] == pytest.approx(other["rms_radius"], rel=1e-9)
-        assert one["geometric_radius"] == pytest.approx(other["geometric_radius"], rel=1e-9)
+        assert one["rms_radius_um"] == pytest.approx(other["rms_radius_um"], rel=1e-9)
+        assert one["geometric_radius_um"] == pytest.approx(other["geometric_radius_um"], rel=1e-9)
         assert other["launched"] == 3000
     lines = [
         command(*common, *a)[1].splitlines() for a in (("--sampling", "sobol", "--points", 3000), ("--rays", 3000))

@@ -66,9 +66,9 @@ def test_the_default_is_the_camera_of_the_literature():
 def test_true_spheres_are_met_by_the_series(radius, sensor, focus):
     setting = aim(radius=radius, sensor=sensor, focus=focus, exact=True)
     r = torch.linspace(0, radius, 50, dtype=torch.float64)
-    found = path((Element(EvenPowers(converging(setting)), setting.radius, constant(2.0)),), r, 0 * r, COLOURS[:1])[0]
+    result = path((Element(EvenPowers(converging(setting)), setting.radius, constant(2.0)),), r, 0 * r, COLOURS[:1])[0]
     wanted = -spheres(r, *(z for z in (number(sensor), number(focus)) if math.isfinite(z)))
-    assert (found - wanted).abs().max() < 1e-11  # mm; λ/50,000,000
+    assert (result - wanted).abs().max() < 1e-11  # mm; λ/50,000,000
 
 
 @pytest.mark.parametrize(
@@ -135,9 +135,9 @@ def test_the_ideal_lens_has_one_power():
 
 
 def test_the_singlet_focuses_as_its_index():
-    found = power(baseline("singlet", aim()), COLOURS)
-    assert (found / POWER - (index(PMMA, COLOURS) - 1) / (index(PMMA, COLOURS[1]) - 1)).abs().max() < 1e-9
-    near = found - 1 / 1000
+    result = power(baseline("singlet", aim()), COLOURS)
+    assert (result / POWER - (index(PMMA, COLOURS) - 1) / (index(PMMA, COLOURS[1]) - 1)).abs().max() < 1e-9
+    near = result - 1 / 1000
     for k in (0, 2):  # 0.37 and -0.23 dioptres off
         place, light = brightest(baseline("singlet", aim()), aim(), COLOURS[k], near[k])
         assert abs(float(place - near[k])) <= 2e-6
@@ -239,10 +239,10 @@ def test_the_cubic_plate_is_cubic(name, glass, strength):
     *lens, plate = baseline(name, aim(), strength=strength)
     x, y = torch.meshgrid(*[torch.linspace(-2.5, 2.5, 21, dtype=torch.float64)] * 2, indexing="xy")
     expected = strength * 0.55e-3 * (x**3 + y**3) / 2.5**3
-    found = path((plate,), x, y, COLOURS)
-    assert (found[1] - expected).abs().max() < 1e-15 * 1e3  # beyond the rim polynomials grow
+    result = path((plate,), x, y, COLOURS)
+    assert (result[1] - expected).abs().max() < 1e-15 * 1e3  # beyond the rim polynomials grow
     ratio = (index(glass, COLOURS) - 1) / (index(glass, COLOURS[1]) - 1)
-    assert (found - ratio[:, None, None] * expected).abs().max() < 1e-12
+    assert (result - ratio[:, None, None] * expected).abs().max() < 1e-12
     assert isinstance(plate.profile, Zernike)
     r = torch.linspace(0, 2.5, 101, dtype=torch.float64)
     assert torch.equal(path(lens, r, r, COLOURS), path(baseline(plain, aim()), r, r, COLOURS))
@@ -287,23 +287,23 @@ def test_encircled_energy_is_that_of_a_direct_sum(exact):
         bessel = torch.from_numpy(j0((2 * math.pi / (wavelength * 12) * rho[:, None] * r).numpy()))
         u = 2 * math.pi / (wavelength * 12) * (bessel * torch.polar(r, phase) * 0.0002).sum(-1)
         expected.append((u.abs() ** 2 * 2 * math.pi * rho * 5e-5).sum() / (math.pi * 0.8**2))
-    found = encircled_energy(setting, COLOURS, spot=0.02, pitch=0.005)(made)
-    assert (found - torch.stack(expected)).abs().max() < 2e-3 * found.max()  # 32 parts of a ring against 25
+    result = encircled_energy(setting, COLOURS, spot=0.02, pitch=0.005)(made)
+    assert (result - torch.stack(expected)).abs().max() < 2e-3 * result.max()  # 32 parts of a ring against 25
 
 
 def test_the_fresnel_lens_keeps_its_light_in_green_alone():
     energy = encircled_energy(aim(), COLOURS, spot=0.015, pitch=0.002)
-    found = energy(baseline("fresnel", aim())[0])
-    assert abs(float(found[1]) - 0.850) < 2e-3
-    assert found[[0, 2]].max() < 2e-3
+    result = energy(baseline("fresnel", aim())[0])
+    assert abs(float(result[1]) - 0.850) < 2e-3
+    assert result[[0, 2]].max() < 2e-3
 
 
 def test_the_achromat_shares_its_light_among_the_colours():
     """0.30, 0.25, 0.27 of the light in 15 µm, measured once; a Fresnel lens has 0.0016, 0.85, 0.0013."""
     (made,) = baseline("achromat", aim())
-    found = encircled_energy(aim(), COLOURS, spot=0.015, pitch=0.002)(made)
-    assert found.min() > 0.24
-    assert -torch.log(found).sum() < 3.92
+    result = encircled_energy(aim(), COLOURS, spot=0.015, pitch=0.002)(made)
+    assert result.min() > 0.24
+    assert -torch.log(result).sum() < 3.92
     assert (made.profile.heights >= 0).all()
     assert (made.profile.heights <= made.period).all()
     assert not made.profile.heights.requires_grad
@@ -354,9 +354,9 @@ def test_float32_stays_float32(name):
     single = short(
         name, aim(**{key: torch.tensor(n) for key, n in (("radius", 0.5), ("sensor", 35.5), ("focus", 1e3))})
     )
-    for exact, found in zip(double, single, strict=True):
-        assert found.radius.dtype == torch.float32
-        kept = getattr(found.profile, "heights", getattr(found.profile, "coefficients", None))
+    for exact, result in zip(double, single, strict=True):
+        assert result.radius.dtype == torch.float32
+        kept = getattr(result.profile, "heights", getattr(result.profile, "coefficients", None))
         wanted = getattr(exact.profile, "heights", getattr(exact.profile, "coefficients", None))
         assert (kept - wanted).abs().max() < 1e-5 * wanted.abs().max()
 

@@ -273,10 +273,10 @@ def test_without_height_the_kernel_is_that_of_the_wave_model(elements, y):
     view = view_of(slow_gauss(), y)
     pixels = window(view)
     expected = wave.kernels(view, pixels, order=1).kernel
-    found = bridge.kernels(view, elements, pixels, order=1)
-    assert (found.kernel - expected).abs().max() <= (2e-7 if y == 0 else 1e-14) * expected.max()
+    result = bridge.kernels(view, elements, pixels, order=1)
+    assert (result.kernel - expected).abs().max() <= (2e-7 if y == 0 else 1e-14) * expected.max()
     if all(isinstance(element.profile, EvenPowers | Rings) for element in elements):
-        assert torch.equal(found.kernel, expected)
+        assert torch.equal(result.kernel, expected)
 
 
 def test_defocus_moves_the_best_focus_as_a_thin_lens_at_the_stop_does():
@@ -348,9 +348,9 @@ def test_a_wrapped_height_is_the_whole_one_at_its_design_wavelength():
     wrapped = dataclasses.replace(whole, period=period(glass, 0.53))
     pixels = grid(scalar(0.02), 9)
     expected = bridge.kernels(view, (whole,), pixels, order=1).kernel
-    found = bridge.kernels(view, (wrapped,), pixels, order=1)
-    assert (found.kernel - expected).abs().max() < 1e-6 * expected.max()
-    assert found.rays > bridge.kernels(view, (whole,), pixels, order=1).rays
+    result = bridge.kernels(view, (wrapped,), pixels, order=1)
+    assert (result.kernel - expected).abs().max() < 1e-6 * expected.max()
+    assert result.rays > bridge.kernels(view, (whole,), pixels, order=1).rays
 
 
 def test_flat_pixels_are_as_the_smooth_height_they_sample():
@@ -362,8 +362,8 @@ def test_flat_pixels_are_as_the_smooth_height_they_sample():
     there = window(view)
     expected = bridge.kernels(view, (smooth,), there, order=1).kernel
     plain = bridge.kernels(view, (), there, order=1).kernel
-    found = bridge.kernels(view, (dataclasses.replace(smooth, profile=pixels),), there, order=1).kernel
-    assert (found - expected).abs().sum() < 0.01 * expected.sum()
+    result = bridge.kernels(view, (dataclasses.replace(smooth, profile=pixels),), there, order=1).kernel
+    assert (result - expected).abs().sum() < 0.01 * expected.sum()
     assert (plain - expected).abs().sum() > 0.05 * expected.sum()
 
 
@@ -373,19 +373,19 @@ def test_wavelengths_fields_and_distances_are_those_of_single_calls():
     pixels = grid(scalar(0.004), 5)
     fields = vector(0.0, 0.0, 0.0, 0.01).reshape(2, 2)
     distances = vector(25e3, 50e3)
-    found = bridge.kernels(scene(system, fields, distances, system.wavelengths), element, pixels, order=2).kernel
-    assert found.shape == (2, 2, 2, 5, 5)
+    result = bridge.kernels(scene(system, fields, distances, system.wavelengths), element, pixels, order=2).kernel
+    assert result.shape == (2, 2, 2, 5, 5)
     for d, f, w in ((0, 0, 1), (1, 1, 0)):
         single = scene(system, fields[:, f : f + 1], distances[d : d + 1], system.wavelengths[w : w + 1])
         alone = bridge.kernels(single, element, pixels, order=2).kernel[0, 0, 0]
-        assert (found[d, f, w] - alone).abs().max() < 1e-6 * alone.max()
+        assert (result[d, f, w] - alone).abs().max() < 1e-6 * alone.max()
 
 
 def test_light_in_a_wide_window_is_all_the_light():
     """Parseval: an element moves light and loses none; 1 % lies in the tails beyond 0.3 mm."""
     view = view_of(slow_gauss())
-    found = bridge.kernels(view, (noll(0.0, 0.0, 0.0, 5e-4, 0.0, 5e-4, 0.0, 4e-4),), grid(scalar(0.01), 61))
-    assert 0.98 < float(found.energy) < 1.0
+    result = bridge.kernels(view, (noll(0.0, 0.0, 0.0, 5e-4, 0.0, 5e-4, 0.0, 4e-4),), grid(scalar(0.01), 61))
+    assert 0.98 < float(result.energy) < 1.0
 
 
 def test_derivatives_by_heights_and_by_the_lens():

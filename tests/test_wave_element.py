@@ -186,15 +186,15 @@ def test_zernike_is_that_of_the_unit_disc():
 def test_pixels_lie_around_the_axis_with_row_0_at_the_smallest_y():
     h = torch.arange(6, dtype=torch.float64).reshape(2, 3)
     x, y = number([-1.0, 0.0, 1.0, -1.0, 0.0, 1.0]), number([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
-    found = height(element(Pixels(h, number(1.0))), x, y)
-    assert torch.equal(found, h.flatten())
+    result = height(element(Pixels(h, number(1.0))), x, y)
+    assert torch.equal(result, h.flatten())
 
 
 def test_a_pixel_is_flat_between_its_edges_and_the_last_one_goes_on():
     h = torch.arange(4, dtype=torch.float64).expand(4, 4)
     x = number([-99.0, -2.0, -1.001, -0.999, -0.001, 0.0, 0.999, 1.0, 99.0])
-    found = height(element(Pixels(h, number(1.0))), x, 0 * x)
-    assert found.tolist() == [0, 0, 0, 1, 1, 2, 2, 3, 3]
+    result = height(element(Pixels(h, number(1.0))), x, 0 * x)
+    assert result.tolist() == [0, 0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_rings_begin_on_the_axis_and_the_last_one_goes_on():
@@ -226,10 +226,10 @@ def test_only_rings_and_even_powers_are_radial():
 def test_float32_stays_float32_and_is_the_same_path(profile, levels):
     x, y = points()
     exact = element(profile, SILICA, period=None if levels == 0 else period(SILICA, 0.55), levels=levels)
-    found = path((to(exact, dtype=torch.float32),), x.float(), y.float(), COLOURS.float())
-    assert found.dtype == torch.float32
+    result = path((to(exact, dtype=torch.float32),), x.float(), y.float(), COLOURS.float())
+    assert result.dtype == torch.float32
     if levels == 0:  # a height near a step may fall on its other side
-        assert (found - path((exact,), x, y, COLOURS)).abs().max() < 1e-6 * 0.1  # mm: float32 of a sag below 0.1 mm
+        assert (result - path((exact,), x, y, COLOURS)).abs().max() < 1e-6 * 0.1  # mm: float32 of a sag below 0.1 mm
 
 
 PROFILES = {

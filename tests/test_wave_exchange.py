@@ -37,10 +37,10 @@ def rings(count=11, pitch=0.002):
 
 def there_and_back(profile, path, **known):
     write_heights(profile, path)
-    found = read_heights(path, **known)
-    assert type(found) is type(profile)
-    assert found.heights.shape == profile.heights.shape
-    return found
+    result = read_heights(path, **known)
+    assert type(result) is type(profile)
+    assert result.heights.shape == profile.heights.shape
+    return result
 
 
 # -- round trips ------------------------------------------------------------------------------------------------------
@@ -50,17 +50,17 @@ def there_and_back(profile, path, **known):
 @pytest.mark.parametrize("pitch", [0.002, 0.00369, 1 / 3e3])
 def test_pixels_come_back_bit_for_bit(suffix, pitch, tmp_path):
     written = pixels(pitch=pitch)
-    found = there_and_back(written, tmp_path / f"map{suffix}")
-    assert torch.equal(found.heights, written.heights)
-    assert abs(float(found.pitch) / pitch - 1) < 1e-14  # a table says the pitch by its coordinates
+    result = there_and_back(written, tmp_path / f"map{suffix}")
+    assert torch.equal(result.heights, written.heights)
+    assert abs(float(result.pitch) / pitch - 1) < 1e-14  # a table says the pitch by its coordinates
 
 
 @pytest.mark.parametrize("suffix", EXACT)
 def test_rings_come_back_bit_for_bit(suffix, tmp_path):
     written = rings()
-    found = there_and_back(written, tmp_path / f"map{suffix}")
-    assert torch.equal(found.heights, written.heights)
-    assert torch.equal(found.pitch, written.pitch)
+    result = there_and_back(written, tmp_path / f"map{suffix}")
+    assert torch.equal(result.heights, written.heights)
+    assert torch.equal(result.pitch, written.pitch)
 
 
 @pytest.mark.parametrize("suffix", PICTURES)
@@ -69,11 +69,11 @@ def test_rings_come_back_bit_for_bit(suffix, tmp_path):
 )
 def test_pictures_come_back_to_half_a_grey_value(suffix, make, tmp_path):
     written = make()
-    found = there_and_back(written, tmp_path / f"map{suffix}")
+    result = there_and_back(written, tmp_path / f"map{suffix}")
     span = written.heights.max() - written.heights.min()
-    assert (found.heights - written.heights).abs().max() <= 0.5001 * span / 65535
-    assert torch.equal(found.pitch, written.pitch)
-    assert len(torch.unique(found.heights)) > 1000  # 8 bits would leave 256
+    assert (result.heights - written.heights).abs().max() <= 0.5001 * span / 65535
+    assert torch.equal(result.pitch, written.pitch)
+    assert len(torch.unique(result.heights)) > 1000  # 8 bits would leave 256
 
 
 @pytest.mark.parametrize("suffix", [*EXACT, *PICTURES, *GRIDS])
@@ -81,8 +81,8 @@ def test_pictures_come_back_to_half_a_grey_value(suffix, make, tmp_path):
 def test_steps_come_back_exactly(suffix, levels, tmp_path):
     """Also where not all sixteen are there, so that a grey value is no whole share of a step."""
     steps = torch.tensor(levels)[torch.arange(64).reshape(8, 8) % len(levels)] * (number(WAVE) / 16)
-    found = there_and_back(Pixels(steps, number(0.002)), tmp_path / f"map{suffix}")
-    assert torch.equal(found.heights, steps)
+    result = there_and_back(Pixels(steps, number(0.002)), tmp_path / f"map{suffix}")
+    assert torch.equal(result.heights, steps)
 
 
 @pytest.mark.parametrize("suffix", [*EXACT, *PICTURES, *GRIDS])
@@ -91,18 +91,18 @@ def test_a_made_element_is_read_and_stepped_as_it_was(suffix, tmp_path):
     glass = find_glass("F_SILICA")
     lens = Element(EvenPowers(number([-0.03])), number(0.3), glass)
     made = fabricated(wrapped(as_pixels(lens, 0.01), 0.55, levels=16))
-    found = there_and_back(made.profile, tmp_path / f"map{suffix}")
-    assert len(torch.unique(found.heights)) == 16
-    assert torch.equal(found.heights, made.profile.heights)
-    assert (fabricated_height(found.heights, period(glass, 0.55), 16) - made.profile.heights).abs().max() < 1e-18
+    result = there_and_back(made.profile, tmp_path / f"map{suffix}")
+    assert len(torch.unique(result.heights)) == 16
+    assert torch.equal(result.heights, made.profile.heights)
+    assert (fabricated_height(result.heights, period(glass, 0.55), 16) - made.profile.heights).abs().max() < 1e-18
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".csv"])
 def test_float32_heights_keep_their_value(suffix, tmp_path):
     written = Pixels(drawn(5, 5).float(), torch.tensor(0.002))
-    found = there_and_back(written, tmp_path / f"map{suffix}")
-    assert torch.equal(found.heights.float(), written.heights)
-    assert found.heights.dtype == (torch.float32 if suffix == ".npy" else torch.float64)
+    result = there_and_back(written, tmp_path / f"map{suffix}")
+    assert torch.equal(result.heights.float(), written.heights)
+    assert result.heights.dtype == (torch.float32 if suffix == ".npy" else torch.float64)
 
 
 def test_large_and_small_heights_and_a_suffix_in_capitals(tmp_path):
@@ -180,9 +180,9 @@ def test_grid_sag_begins_at_the_upper_left_and_runs_along_x(tmp_path):
 def test_grid_sag_in_other_units_comes_in_mm(flag, unit, tmp_path):
     points = "\n".join(f"{k} 0 0 0" for k in range(25))
     (tmp_path / "map.dat").write_text(f"! made elsewhere\n5 5 0.1 0.1 {flag} 0 0\n{points}\n")
-    found = read_heights(tmp_path / "map.dat")
-    assert torch.equal(found.heights, unit * torch.arange(25, dtype=torch.float64).reshape(5, 5).flip(0))
-    assert abs(float(found.pitch) - 0.1 * unit) < 1e-12
+    result = read_heights(tmp_path / "map.dat")
+    assert torch.equal(result.heights, unit * torch.arange(25, dtype=torch.float64).reshape(5, 5).flip(0))
+    assert abs(float(result.pitch) - 0.1 * unit) < 1e-12
 
 
 def test_grid_points_without_data_are_0(tmp_path):
@@ -201,9 +201,9 @@ def test_a_picture_without_description_needs_span_and_pitch(suffix, tmp_path):
         read_heights(path)
     with pytest.raises(HeightMapError, match="give pitch"):
         read_heights(path, span=(0.0, 5.0))
-    found = read_heights(path, span=(-1.0, 4.0), pitch=0.002)
-    assert (found.heights - number([[0.0, -1.0], [-1.0, 4.0]])).abs().max() < 1e-12
-    assert float(found.pitch) == 0.002
+    result = read_heights(path, span=(-1.0, 4.0), pitch=0.002)
+    assert (result.heights - number([[0.0, -1.0], [-1.0, 4.0]])).abs().max() < 1e-12
+    assert float(result.pitch) == 0.002
 
 
 def test_big_endian_files_are_read(tmp_path):
@@ -226,9 +226,9 @@ def test_npy_of_another_program_needs_a_pitch(tmp_path):
 
 def test_what_the_file_says_counts_more_than_what_the_caller_knows(tmp_path):
     for suffix in (".npy", ".png", ".tif"):
-        found = there_and_back(pixels(), tmp_path / f"map{suffix}", pitch=9.0, span=(0.0, 9.0))
-        assert float(found.pitch) == 0.00369
-        assert found.heights.max() < 1e-3
+        result = there_and_back(pixels(), tmp_path / f"map{suffix}", pitch=9.0, span=(0.0, 9.0))
+        assert float(result.pitch) == 0.00369
+        assert result.heights.max() < 1e-3
 
 
 # -- refused ----------------------------------------------------------------------------------------------------------
@@ -277,13 +277,13 @@ def test_every_cut_file_is_refused_or_whole(suffix, tmp_path):
     for size in range(0, len(content), max(1, len(content) // 60)):
         path.write_bytes(content[:size])
         try:
-            found = read_heights(path)
+            result = read_heights(path)
         except HeightMapError:
             continue
         # A PNG is whole without its end mark.
         assert suffix == ".png"
         assert size > len(content) - 20
-        assert (found.heights - written.heights).abs().max() < 1e-7
+        assert (result.heights - written.heights).abs().max() < 1e-7
 
 
 def test_pictures_of_8_bits_and_in_colour_are_refused(tmp_path):

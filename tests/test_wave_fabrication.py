@@ -160,9 +160,9 @@ def test_gradients_pass_sampling_steps_and_tolerance():
     smooth = Element(EvenPowers(c), number(0.5), SILICA)
     made = with_tolerance(wrapped(as_rings(smooth, 0.02), 0.55, levels=16), 2e-5, generator=generator(1))
     weights = torch.arange(25, dtype=torch.float64)
-    found = torch.autograd.grad((made.profile.heights * weights).sum(), c)[0]
+    result = torch.autograd.grad((made.profile.heights * weights).sum(), c)[0]
     r2 = ((torch.arange(25).double() + 0.5) * 0.02).double() ** 2
-    assert (found - torch.stack([(weights * r2).sum(), (weights * r2**2).sum()])).abs().max() < 1e-6
+    assert (result - torch.stack([(weights * r2).sum(), (weights * r2**2).sum()])).abs().max() < 1e-6
 
 
 def test_float32_stays_float32():

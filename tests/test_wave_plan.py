@@ -39,8 +39,8 @@ def test_the_scene_chooses_the_engine():
 
 def test_blur_is_that_of_geometry():
     """R z |1/z' - 1/z_f| of a lens focused elsewhere."""
-    found = blur(original(depths=(500.0, 1000.0, math.inf)))[:, 0]
-    assert torch.allclose(found, vector(1, 0, 1) * R * 35.5e-3, atol=1e-9)
+    result = blur(original(depths=(500.0, 1000.0, math.inf)))[:, 0]
+    assert torch.allclose(result, vector(1, 0, 1) * R * 35.5e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("samples", [48, 64])
@@ -66,10 +66,10 @@ def test_an_undersampled_converging_field_is_warned_of_and_is_wrong():
     s = original(size=32)
     samples = round(2 * R / 0.00369)
     with pytest.warns(Aliased, match="undersampled"):
-        found = psf(s, engine="fresnel", samples=samples, pad=1.5)
+        result = psf(s, engine="fresnel", samples=samples, pad=1.5)
     expected = psf(s).kernel
-    assert relative(found.kernel, expected) > 0.1
-    assert found.error > 0.1
+    assert relative(result.kernel, expected) > 0.1
+    assert result.error > 0.1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         plan(original(wavelengths=(0.64,)), engine="fresnel", samples=samples)
@@ -81,11 +81,11 @@ def test_predicted_errors_hold(engine, tol):
     """Depths in and out of focus, three colours, two windows: an upper bound, not above the tolerance."""
     for size, pitch in ((64, 0.00369), (24, 0.006)):
         s = scene(depths=(500.0, 1000.0, math.inf), wavelengths=(0.46, 0.55, 0.64), size=size, pitch=pitch)
-        found = psf(s, engine=engine, tol=tol)
-        error = relative(found.kernel, psf(s, tol=1e-6).kernel)
-        assert error < found.error <= tol
-        assert found.plan.flops > 0
-        assert found.plan.memory > 0
+        result = psf(s, engine=engine, tol=tol)
+        error = relative(result.kernel, psf(s, tol=1e-6).kernel)
+        assert error < result.error <= tol
+        assert result.plan.flops > 0
+        assert result.plan.memory > 0
 
 
 @pytest.mark.parametrize("strength", [5e-5, 3e-4])
@@ -94,9 +94,9 @@ def test_predicted_errors_hold_for_any_shape(strength):
     generator = torch.Generator().manual_seed(5)
     coefficients = strength * torch.randn(11, generator=generator, dtype=torch.float64)
     s = scene(lens(), Element(Zernike(coefficients), scalar(R), PLASTIC), depths=(700.0,), size=48)
-    found, fine = psf(s, tol=1e-3), psf(s, tol=3e-5)
-    error = relative(found.kernel, fine.kernel)
-    assert 0.01 * found.error < error < found.error <= 1e-3
+    result, fine = psf(s, tol=1e-3), psf(s, tol=3e-5)
+    error = relative(result.kernel, fine.kernel)
+    assert 0.01 * result.error < error < result.error <= 1e-3
 
 
 def test_cost_grows_with_what_is_asked_for():
@@ -125,8 +125,8 @@ def test_hard_samplings():
     assert relative(psf(odd, engine="pupil", samples=101, nodes=3).kernel, expected) < 1e-3
     heights = -0.5 * (torch.arange(37).double() - 18)[:, None] ** 2 * 1e-6 * torch.ones(37, dtype=torch.float64)
     uneven = Element(Pixels(heights, scalar(0.03)), scalar(0.4), PLASTIC)
-    found, fine = (psf(scene(uneven), samples=n) for n in (37 * 4, 37 * 12))
-    assert relative(found.kernel, fine.kernel) < found.error < 0.1
+    result, fine = (psf(scene(uneven), samples=n) for n in (37 * 4, 37 * 12))
+    assert relative(result.kernel, fine.kernel) < result.error < 0.1
 
 
 def test_engines_are_named():

@@ -125,11 +125,11 @@ def test_predictions_are_neither_far_too_good_nor_far_too_bad(name, engine, how)
     s = SCENES[name]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = psf(s, engine=engine, **how)
-    error = relative(found.kernel, limit(name))
+        result = psf(s, engine=engine, **how)
+    error = relative(result.kernel, limit(name))
     assert 1e-4 < error < 0.5
     most = 12 if name in ("lens in focus", "rings and polynomials") else 6
-    assert 0.5 * error < found.error < most * error
+    assert 0.5 * error < result.error < most * error
 
 
 @pytest.mark.parametrize("name", ["blurred lens", "few waves, wide blur", "etched lens, other colour", "wrapped lens"])
@@ -145,9 +145,9 @@ def test_the_plan_of_an_etched_element_meets_its_tolerance():
     s = SCENES["hybrid"]()
     assert plan(s, engine="pupil", samples=2500).error < 3e-3
     free = SCENES["rings and polynomials"]()
-    found = psf(free, tol=1e-2)
-    assert found.plan.samples < 1000
-    assert relative(found.kernel, limit("rings and polynomials")) < found.error < 1e-2
+    result = psf(free, tol=1e-2)
+    assert result.plan.samples < 1000
+    assert relative(result.kernel, limit("rings and polynomials")) < result.error < 1e-2
 
 
 def test_width_and_steps_of_a_ring():
@@ -164,10 +164,10 @@ def test_a_kinoform_under_a_cubic_plate_is_computed_without_cutting_its_rings(ex
     """Beside the sum over every ring and angle, to half of what is predicted."""
     elements = baseline("cubic", aim(radius=0.2, exact=exact))
     seen = scene(*elements, depths=(500.0,), wavelengths=BLUE, size=8, exact=exact)
-    found = psf(seen)
-    assert found.plan.cells == "mixed"
-    assert found.error < 1e-3
-    assert relative(found.kernel, polar_sum(seen, nodes=4, arms=768)) < 0.5 * found.error
+    result = psf(seen)
+    assert result.plan.cells == "mixed"
+    assert result.error < 1e-3
+    assert relative(result.kernel, polar_sum(seen, nodes=4, arms=768)) < 0.5 * result.error
 
 
 def test_a_mixed_scene_does_not_depend_on_its_band():

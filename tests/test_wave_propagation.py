@@ -40,11 +40,11 @@ def scene(*elements, depths=(1000.0,), wavelengths=(0.55,), size=32, pitch=0.003
 
 def density(s, x, y, samples=256):
     """Light per mm² (D, W, K) at points, by the pupil engine."""
-    found = []
+    result = []
     for a, b in zip(x, y, strict=True):
         point = dataclasses.replace(s, grid=grid(scalar(1e-9), 1, torch.stack([a, b])))
-        found.append(pupil.intensity(point, pupil.prepare(point, samples, 1))[..., 0, 0])
-    return torch.stack(found, -1)
+        result.append(pupil.intensity(point, pupil.prepare(point, samples, 1))[..., 0, 0])
+    return torch.stack(result, -1)
 
 
 def along_x(s, x, samples=256):
@@ -62,9 +62,9 @@ def along_x(s, x, samples=256):
     return pupil.intensity(s, unfolded)[..., 0, :]
 
 
-def relative(found, expected):
+def relative(result, expected):
     """Largest relative L2 error of the kernels."""
-    return float(((found - expected).flatten(2).norm(dim=-1) / expected.flatten(2).norm(dim=-1)).max())
+    return float(((result - expected).flatten(2).norm(dim=-1) / expected.flatten(2).norm(dim=-1)).max())
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -93,8 +93,8 @@ def test_axis_of_a_defocused_lens():
         s = scene(lens(extra=w * 0.55e-3))
         expected = torch.sinc(w) ** 2 * math.pi * R**2 / (0.55e-3 * Z) ** 2
         for samples in (128, 200):
-            found = density(s, vector(0.0), vector(0.0), samples)[0, 0, 0]
-            assert abs(found - expected) < 2e-4 * math.pi * R**2 / (0.55e-3 * Z) ** 2, (k, samples)
+            result = density(s, vector(0.0), vector(0.0), samples)[0, 0, 0]
+            assert abs(result - expected) < 2e-4 * math.pi * R**2 / (0.55e-3 * Z) ** 2, (k, samples)
 
 
 def test_encircled_energy():
@@ -105,9 +105,9 @@ def test_encircled_energy():
     for v in (1.0, 3.8317, 7.0, 20.0):
         rho = 0.5 * v / edge * (1 + place)
         light = along_x(s, rho)[0, 0]
-        found = (light * 2 * math.pi * rho * share).sum() * 0.5 * v / edge
+        result = (light * 2 * math.pi * rho * share).sum() * 0.5 * v / edge
         j0, j1 = torch.special.bessel_j0(scalar(v)), torch.special.bessel_j1(scalar(v))
-        assert abs(found - (1 - j0**2 - j1**2)) < 1e-3
+        assert abs(result - (1 - j0**2 - j1**2)) < 1e-3
 
 
 def test_transfer_functions_keep_energy():
@@ -147,9 +147,9 @@ def test_kinoform_focuses_as_the_wavelength():
         s = dataclasses.replace(
             scene(element, depths=(math.inf,), wavelengths=(wavelength,)), sensor_distance=scalar(distance)
         )
-        found = propagation.radial_field(s, vector(0.0), 4).abs().square()[0, 0, 0]
+        result = propagation.radial_field(s, vector(0.0), 4).abs().square()[0, 0, 0]
         full = math.pi * R**2 / (1e-3 * wavelength * distance) ** 2
-        assert abs(found / full - torch.sinc(scalar(0.55 / wavelength - 1)) ** 2) < 2e-3
+        assert abs(result / full - torch.sinc(scalar(0.55 / wavelength - 1)) ** 2) < 2e-3
 
 
 @pytest.mark.parametrize(("depth", "tolerance"), [(1000.0, 5e-5), (500.0, 1e-3), (math.inf, 1e-3)])
@@ -171,13 +171,13 @@ def test_engines_agree_on_any_element(exact):
     coefficients = vector(0, 0, 0, 0, 2e-4, -1.5e-4, 2e-4, 1e-4, -1e-4, 5e-5, 5e-5)
     aberrated = (lens(exact=exact, radius=0.9), Element(Zernike(coefficients), scalar(0.9), PLASTIC))
     s = scene(*aberrated, size=(28, 32), exact=exact)
-    found = psf(s, engine="pupil", samples=200, nodes=5).kernel
+    result = psf(s, engine="pupil", samples=200, nodes=5).kernel
     engine = "angular_spectrum" if exact else "fresnel"
-    assert relative(found, psf(s, engine=engine, samples=720, nodes=5).kernel) < 2e-4
-    assert relative(found.flip(-1), found) > 0.1
-    assert relative(found.flip(-2), found) > 0.1
+    assert relative(result, psf(s, engine=engine, samples=720, nodes=5).kernel) < 2e-4
+    assert relative(result.flip(-1), result) > 0.1
+    assert relative(result.flip(-2), result) > 0.1
     part = scene(*aberrated, size=(10, 12), centre=(0.00369 * 6, -0.00369 * 4), exact=exact)
-    assert relative(psf(part, engine="pupil", samples=200, nodes=5).kernel, found[..., 5:15, 16:28]) < 1e-6
+    assert relative(psf(part, engine="pupil", samples=200, nodes=5).kernel, result[..., 5:15, 16:28]) < 1e-6
 
 
 @pytest.mark.parametrize("depth", [1000.0, 700.0])
@@ -210,8 +210,8 @@ def test_efficiency_of_a_stepped_kinoform(levels):
     """sinc²(1/L) of the light reaches the focus of 160 whole zones (Goodman and Silvestri 1970)."""
     radius = math.sqrt(2 * 160 * 0.55e-3 / (1 / 1000 + 1 / Z))
     element = dataclasses.replace(lens(radius=radius), period=scalar(0.55e-3), levels=levels)
-    found = propagation.radial_field(scene(element), vector(0.0), 8).abs().square()[0, 0, 0]
-    assert abs(found / (math.pi * radius**2 / (0.55e-3 * Z) ** 2) - torch.sinc(scalar(1 / levels)) ** 2) < 1e-9
+    result = propagation.radial_field(scene(element), vector(0.0), 8).abs().square()[0, 0, 0]
+    assert abs(result / (math.pi * radius**2 / (0.55e-3 * Z) ** 2) - torch.sinc(scalar(1 / levels)) ** 2) < 1e-9
 
 
 def test_flat_pixels_are_summed_exactly():
@@ -224,12 +224,12 @@ def test_flat_pixels_are_summed_exactly():
         s = scene(plate, depths=(500.0, math.inf), centre=centre)
         fine = psf(dataclasses.replace(s, elements=(plate, flat)), samples=24 * 24, nodes=4)
         assert fine.plan.cells == "sampled"
-        found = psf(s, samples=24 * 24, nodes=4)
-        assert found.plan.cells == "flat"
-        assert relative(found.kernel, fine.kernel) < 4e-3
+        result = psf(s, samples=24 * 24, nodes=4)
+        assert result.plan.cells == "flat"
+        assert relative(result.kernel, fine.kernel) < 4e-3
         # Fewer parts err by the edge of the aperture alone.
         coarse = psf(s, samples=24 * 10, nodes=4)
-        assert relative(coarse.kernel, found.kernel) < 2 * coarse.error
+        assert relative(coarse.kernel, result.kernel) < 2 * coarse.error
 
 
 def test_rings_and_pixels_of_one_shape():
@@ -258,9 +258,9 @@ def test_interpolation_of_the_transfer_functions_field():
     place = (torch.arange(200, dtype=torch.float64) - 99.5) * 0.002
     wave = torch.polar(torch.ones_like(place), 2 * math.pi * 150.0 * place)
     u = torch.linspace(-0.05, 0.05, 37, dtype=torch.float64)
-    found = propagation.at_nodes(wave * wave[:, None], scalar(0.002), u, u)
+    result = propagation.at_nodes(wave * wave[:, None], scalar(0.002), u, u)
     expected = torch.polar(torch.ones_like(u), 2 * math.pi * 150.0 * u)
-    assert (found - expected * expected[:, None]).abs().max() < 1e-6
+    assert (result - expected * expected[:, None]).abs().max() < 1e-6
 
 
 def test_integrals_over_pixels_add_up():

@@ -106,11 +106,11 @@ def test_single_precision(engine):
     glass = find_glass("PMMA")
     thick = Element(EvenPowers(vector(-0.5 * (1e-3 + 1 / Z) / 0.4936)), scalar(0.6), glass)
     s = scene(thick, depths=depths, wavelengths=(0.46, 0.64), size=16)
-    found = psf(to(s, dtype=torch.float32), engine=engine, samples={"pupil": 280}.get(engine))
-    assert found.kernel.dtype == torch.float32
-    expected = psf(s, plan=found.plan)
-    assert relative(found.kernel.double()[1:], expected.kernel[1:]) < 1e-4
-    assert relative(found.kernel.double(), expected.kernel) < 5e-4
+    result = psf(to(s, dtype=torch.float32), engine=engine, samples={"pupil": 280}.get(engine))
+    assert result.kernel.dtype == torch.float32
+    expected = psf(s, plan=result.plan)
+    assert relative(result.kernel.double()[1:], expected.kernel[1:]) < 1e-4
+    assert relative(result.kernel.double(), expected.kernel) < 5e-4
 
 
 def test_the_naive_phase_would_fail():
@@ -197,8 +197,8 @@ def test_a_window_that_is_not_square():
 def test_a_tilted_element_moves_the_light():
     """Light is bent towards the thicker side: a slope 2c/R of the path along x moves it by z times that, two pixels."""
     tilt = Element(Zernike(vector(0, 2 * 0.00369 * R / (2 * Z))), scalar(R), PLASTIC)
-    found, straight = (psf(scene(lens(), *extra, size=33), samples=160, nodes=5) for extra in ((tilt,), ()))
-    assert relative(found.kernel[..., 2:], straight.kernel[..., :-2]) < 1e-3
+    result, straight = (psf(scene(lens(), *extra, size=33), samples=160, nodes=5) for extra in ((tilt,), ()))
+    assert relative(result.kernel[..., 2:], straight.kernel[..., :-2]) < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["zernike", "pixels"])

@@ -45,10 +45,10 @@ def test_rings_against_their_closed_form():
     disc = edge[:, None] * bessel_j1(edge[:, None] * q) / q
     signs = 1 - 2 * (torch.arange(count) % 2).double()
     expected = (signs[:, None] * disc.diff(dim=0)).sum(0) * 2 * math.sqrt(math.pi) / (R * 0.55e-3 * Z)
-    found = propagation.radial_field(s, rho, 40)[0, 0]
+    result = propagation.radial_field(s, rho, 40)[0, 0]
     # The Bessel functions of torch err by up to 5e-7 about x = 5.
-    assert (found.real - expected).abs().max() < 3e-6 * expected.abs().max()
-    assert found.imag.abs().max() < 1e-9 * expected.abs().max()
+    assert (result.real - expected).abs().max() < 3e-6 * expected.abs().max()
+    assert result.imag.abs().max() < 1e-9 * expected.abs().max()
 
 
 def test_rings_of_unlike_pitches_and_the_edge_that_cuts_one():
@@ -62,10 +62,10 @@ def test_zones_lie_where_the_height_has_wrapped():
     """√(2 m λ/P), to a nanometre."""
     power = 1 / 1000 + 1 / Z
     s = scene(dataclasses.replace(lens(), period=scalar(0.55e-3)))
-    found = propagation.edges(s)[1:-1]
-    m = torch.arange(1, len(found) + 1, dtype=torch.float64)
-    assert len(found) == int(R**2 * power / 2 / 0.55e-3)
-    assert (found - torch.sqrt(2 * m * 0.55e-3 / power)).abs().max() < 1e-6
+    result = propagation.edges(s)[1:-1]
+    m = torch.arange(1, len(result) + 1, dtype=torch.float64)
+    assert len(result) == int(R**2 * power / 2 / 0.55e-3)
+    assert (result - torch.sqrt(2 * m * 0.55e-3 / power)).abs().max() < 1e-6
 
 
 def test_nodes_converge():

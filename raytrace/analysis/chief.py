@@ -1,7 +1,6 @@
 """Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
 
 import math
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,7 +21,7 @@ from raytrace.analysis.setting import (
 from raytrace.analysis.spot_diagram import airy_radius
 from raytrace.maths.dual import divide
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
-from raytrace.maths.result import masked
+from raytrace.maths.result import Column, masked
 from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, new_figure, styled
 from raytrace.system.lens import Lens
@@ -92,7 +91,7 @@ class FieldCurvature(OverField):
     valid: Tensor
 
     COMMAND = "field-curvature"
-    UNITS: ClassVar = {"tangential": "mm", "sagittal": "mm"}
+    COLUMNS = Column("tangential", "mm"), Column("sagittal", "mm")
 
     def columns(self) -> dict[str, Tensor]:
         tangential, sagittal = masked(self.tangential, self.valid), masked(self.sagittal, self.valid)

@@ -129,7 +129,7 @@ class Comparison(Result):
         return {
             "model": axis(torch.arange(len(self.models), device=self.object_distances.device), 0, 2),
             "object_distance": axis(self.object_distances, 1, 2),
-            "sigma": self.sigma,
+            "sigma_um": 1e3 * self.sigma,
             "energy": torch.stack([one.energy[:, 0] for one in self.psfs]),
             "difference": self.difference,
             "error": self.error,
@@ -160,7 +160,7 @@ class Comparison(Result):
     def __str__(self) -> str:
         pixels = self.psfs[-1].grid
         size = f"{pixels.columns} × {pixels.rows} pixels of {1000 * float(pixels.pitch):g} µm"
-        distances = " ".join(f"{f'{distance / 1000:g} m':>24}" for distance in self.object_distances.tolist())
+        distances = " ".join(f"{f'{distance:g} mm':>24}" for distance in self.object_distances.tolist())
         said = [
             f"{self.sensor}; on the axis, {size}",
             f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {self.models[-1]}, "

@@ -8,7 +8,7 @@ from raytrace.analysis.panels import by_wavelength, drawn_at_least, field_labels
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting
 from raytrace.maths.pupil import fan as pupil_fan
-from raytrace.maths.result import masked
+from raytrace.maths.result import Column, masked
 from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, array, new_figure, styled
 from raytrace.system.lens import Lens
@@ -40,9 +40,7 @@ class Fan(Analysis):
 
     EVERY = 5
     COMMAND = property(lambda self: f"{self.quantity}-fan")
-    UNITS = property(
-        lambda self: dict.fromkeys(("tangential", "sagittal"), "mm" if self.quantity == "ray" else "waves")
-    )
+    COLUMNS = property(lambda self: [Column(name, _UNIT[self.quantity]) for name in ("tangential", "sagittal")])
 
     def columns(self) -> dict[str, Tensor]:
         tangential = masked(self.tangential, self.tangential_valid)

@@ -23,7 +23,7 @@ from raytrace.analysis.spot_diagram import (
 from raytrace.io import write_lens
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, number, numbers, object_text
+from raytrace.maths.result import Result, number, numbers, object_text, rows
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
@@ -119,7 +119,7 @@ class Focus(Result):
     def columns(self) -> dict[str, Tensor]:
         sensors = torch.stack([sensor for _, sensor in self._sensors()])
         radii = torch.stack([self.rms_radius(sensor) for sensor in sensors])
-        return {"place": torch.arange(len(sensors)), "sensor_distance": sensors, "rms_radius": radii}
+        return {"place": torch.arange(len(sensors)), "sensor_distance": sensors, "rms_radius_um": 1e3 * radii}
 
     def words(self) -> dict:
         return {"place": [words for words, _ in self._sensors()]}
@@ -133,8 +133,8 @@ class Focus(Result):
             "sensor_paraxial": numbers(self.paraxial)[0] if alone else numbers(self.paraxial),
             "sensor_rms": number(self.rms),
             "sensor_after": number(self.sensor_distance),
-            "rms_before": number(self.rms_radius(before)),
-            "rms_after": number(self.rms_radius()),
+            "rms_before_um": number(1e3 * self.rms_radius(before)),
+            "rms_after_um": number(1e3 * self.rms_radius()),
             "is_real": self.is_real,
         }
 
@@ -153,10 +153,10 @@ class Focus(Result):
             f"criterion {self.criterion}\n",
             f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
         ]
-        for words, sensor in self._sensors():
-            rms = number(self.rms_radius(sensor))
-            radius = "no rays" if rms is None else f"{1000 * rms:>15.4f} µm"
-            lines.append(f"  {words:<28} {float(sensor):>15.6f} mm {radius}")
+        for row, (words, _) in zip(rows(self.columns()), self._sensors(), strict=True):
+            rms = row["rms_radius_um"]
+            radius = "no rays" if rms is None else f"{rms:>15.4f} µm"
+            lines.append(f"  {words:<28} {row['sensor_distance']:>15.6f} mm {radius}")
         return "\n".join(lines)
 
     def _sensors(self) -> list[tuple[str, Tensor]]:

@@ -15,7 +15,7 @@ from raytrace.analysis.setting import (
     unvignetted,
 )
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import axis, cell, masked
+from raytrace.maths.result import Column, axis, cell, masked
 from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
@@ -43,11 +43,11 @@ class GridDistortion(Analysis):
     valid: Tensor
 
     COMMAND = "distortion-grid"
-    UNITS = property(
-        lambda self: (
-            dict.fromkeys(("ideal_x", "ideal_y", "actual_x", "actual_y"), "mm")
-            | dict.fromkeys(("field_x", "field_y"), "" if is_at_infinity(self.lens) else "mm")
-        )
+    COLUMNS = property(
+        lambda self: [
+            *(Column(name, "mm") for name in ("ideal_x", "ideal_y", "actual_x", "actual_y")),
+            *(Column(name, "" if is_at_infinity(self.lens) else "mm") for name in ("field_x", "field_y")),
+        ]
     )
 
     def columns(self) -> dict[str, Tensor]:

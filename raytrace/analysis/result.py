@@ -8,7 +8,7 @@ from torch import Tensor
 
 from raytrace.analysis.setting import field_line, refuse_axis
 from raytrace.maths.numerics import broadcast_shape
-from raytrace.maths.result import Result, axis, cell, flat, rows
+from raytrace.maths.result import Result, axis, flat, rows, text_table
 
 _FINE = 321  # points of a curve over frequency or radius, when it is drawn
 
@@ -43,7 +43,7 @@ class Analysis(Result):
         return {}
 
     def units(self) -> dict[str, str]:
-        return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self.unit_of(name))}
+        return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self.column(name).unit)}
 
     def document(self) -> dict:
         found = {"analysis": self.COMMAND, **self.about(), "units": self.units(), "results": rows(self.columns())}
@@ -65,11 +65,7 @@ class Analysis(Result):
         listed = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
         if "field_x" in listed and not listed["field_x"].any():
             del listed["field_x"]
-        texts = (
-            [name, self.unit_of(name), *(cell(value, ".6g") for value in column)] for name, column in listed.items()
-        )
-        padded = [[f"{text:>{max(len(column[0]), 9)}}" for text in column] for column in texts]
-        lines = ["  ".join(row) for row in zip(*padded, strict=True)]
+        lines = text_table({self.column(name): column for name, column in listed.items()}, "  ")
         if thin > 1:
             lines.append(f"{len(range(0, length, thin))} of {length} points of each curve; --json lists all")
         return "\n".join(lines)

@@ -12,7 +12,7 @@ from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting, wavelength_shares
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import cell
+from raytrace.maths.result import Column, cell
 from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, INK, array, styled
 from raytrace.system.lens import Lens, name_of_field
@@ -42,7 +42,7 @@ class RmsOverField(OverField):
     reference: str
 
     COMMAND = "rms-over-field"
-    UNITS = property(lambda self: dict.fromkeys(("rms", "polychromatic"), "mm" if self.strehl is None else "waves"))
+    COLUMNS = Column("rms", "waves"), Column("polychromatic", "waves")
 
     @property
     def quantity(self) -> str:
@@ -50,27 +50,31 @@ class RmsOverField(OverField):
         return "spot" if self.strehl is None else "wavefront"
 
     def columns(self) -> dict[str, Tensor]:
-        return {**self.heads(wavelength=self.wavelengths), "rms": self.rms}
+        return {**self.heads(wavelength=self.wavelengths), **self._listed("rms")}
+
+    def _listed(self, name: str) -> dict[str, Tensor]:
+        """The column of a number that is stored: waves, µm of spots."""
+        return {name: getattr(self, name)} if self.strehl is not None else {f"{name}_um": 1e3 * getattr(self, name)}
 
     def about(self) -> dict[str, str]:
         return {"quantity": self.quantity, "reference": self.reference}
 
     def summary(self) -> dict[str, Tensor]:
-        table = {**self.heads(), "polychromatic": self.polychromatic}
+        table = {**self.heads(), **self._listed("polychromatic")}
         return table if self.strehl is None else {**table, "strehl": self.strehl}
 
     def __str__(self) -> str:
         """A row for each field, a column for each wavelength."""
-        unit, factor = ("waves", 1.0) if self.strehl is not None else ("µm", 1e3)
+        (rms,), (together,) = (self._listed(name).items() for name in ("rms", "polychromatic"))
         heads = ["all, weighted", *(f"{wavelength:g} µm" for wavelength in self.wavelengths.tolist())]
-        table = factor * torch.cat([self.polychromatic[:, None], self.rms], 1)
+        table = torch.cat([together[1][:, None], rms[1]], 1)
         names = ["field", *map(name_of_field, self.fields.T)]
         texts = [[f"{head:>14}" for head in heads], *([cell(x, ">14.6g") for x in row] for row in table.tolist())]
         if self.strehl is not None:
             ratios = ["Strehl".rjust(13), *(cell(ratio, ">13.4f") for ratio in self.strehl.tolist())]
             texts = [[*row, ratio] for row, ratio in zip(texts, ratios, strict=True)]
         lines = [f"{name:>10}" + "".join(row) for name, row in zip(names, texts, strict=True)]
-        lines.insert(1, f"{self.lens.fields.unit:>10}" + f"{unit:>14}" * len(heads))
+        lines.insert(1, f"{self.lens.fields.unit:>10}" + f"{self.column(rms[0]).unit:>14}" * len(heads))
         return "\n".join(lines)
 
     def at(self, fields: Tensor) -> "RmsOverField":

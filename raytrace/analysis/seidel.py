@@ -19,7 +19,7 @@ from torch import Tensor
 from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
-from raytrace.maths.result import cell
+from raytrace.maths.result import Column, cell
 from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
@@ -61,7 +61,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
-    UNITS = property(lambda self: dict.fromkeys(self.names, self.unit))
+    COLUMNS = property(lambda self: [Column(name, self.unit) for name in self.names])
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)

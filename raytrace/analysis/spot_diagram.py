@@ -13,7 +13,7 @@ from raytrace.analysis.panels import first_order_text
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
-from raytrace.maths.result import Result, axis, cell, number, numbers
+from raytrace.maths.result import Column, Result, axis, number, numbers, text_table
 from raytrace.maths.value import detached, value
 from raytrace.plotting import style
 from raytrace.system.lens import (
@@ -52,6 +52,16 @@ class Spots(Result):
     lens, fields: (2, F). The table has a row a spot; `save` writes the rays.
     """
 
+    COLUMNS = property(
+        lambda self: [
+            Column("field_x", self.lens.fields.unit), Column("field_y", self.lens.fields.unit, ">10g", "field"),
+            Column("wavelength", "µm", ">11g"), Column("centroid_x", "mm", ">13.7f", "centroid x"),
+            Column("centroid_y", "mm", ">13.7f", "centroid y"), Column("rms_radius_um", "µm", ">10.4f", "RMS"),
+            Column("geometric_radius_um", "µm", ">10.4f", "GEO"),
+            Column("lost", "", ">11.0f" if self.arrivals is None else ">7.0f", "rays\nlost"),
+        ]
+    )  # fmt: skip
+
     lens: Lens
     fields: Tensor
     each: Spot | StreamedSpot
@@ -73,12 +83,7 @@ class Spots(Result):
 
     def columns(self) -> dict[str, Tensor]:
         x, y = (axis(component, 0, 2) for component in self.fields)
-        names = ("rms_radius", "geometric_radius", "rays")
-        return {
-            "field_x": x, "field_y": y, "wavelength": self.lens.wavelengths,
-            "centroid_x": self.centroid[0], "centroid_y": self.centroid[1],
-            **{name: getattr(self.each, name) for name in names},
-        }  # fmt: skip
+        return {"field_x": x, "field_y": y, "wavelength": self.lens.wavelengths, **_figures(self.each)}
 
     def document(self) -> dict:
         places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
@@ -92,31 +97,29 @@ class Spots(Result):
             "field": numbers(self.fields[:, f]),
             "wavelength": number(self.lens.wavelengths[w]),
             "centroid": numbers(self.centroid[:, f, w]),
-            "rms_radius": number(self.rms_radius[f, w]),
-            "geometric_radius": number(self.geometric_radius[f, w]),
+            "rms_radius_um": number(1e3 * self.rms_radius[f, w]),
+            "geometric_radius_um": number(1e3 * self.geometric_radius[f, w]),
             "rays": int(self.rays[f, w]),
         }
         if self.arrivals is None:
-            found["geometric_bound"] = number(self.each.geometric_bound[f, w])
+            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[f, w])
         else:
             found["vignetted"] = int((self.arrivals.status[f, w] == STATUS.index("vignetted")).sum())
         return {**found, "launched": self.launched}
 
     def __str__(self) -> str:
-        unit, width = self.lens.fields.unit, 7 if self.arrivals is not None else 11
-        heads = ("centroid x", "centroid y", "RMS", "GEO"), ("mm", "mm", "µm", "µm")
-        lines = [f"{'field':>10} {'wavelength':>11} {_row(heads[0])} {'rays':>{width}}"]
-        lines += [f"{unit:>10} {'µm':>11} {_row(heads[1])} {'lost':>{width}}"]
-        colours = self.lens.wavelengths.tolist()
-        for f, field in enumerate(self.fields.unbind(1)):
-            for w, wavelength in enumerate(colours):
-                lost = self.launched - int(self.rays[f, w])
-                lines.append(
-                    f"{name_of_field(field):>10} {wavelength:>11g} {_cells(self.each, (f, w))} {lost:>{width}}"
-                )
-            if len(colours) > 1:
-                lines.append(f"{'':>10} {'all':>11} {_cells(self.whole, (f,))}")
-        return "\n".join(lines)
+        """A row for each spot, and one for each field of several wavelengths together."""
+        waves = [f"{wavelength:g}" for wavelength in self.lens.wavelengths.tolist()]
+        several, whole = len(waves) > 1, _figures(self.whole)
+        colours = [*waves, *["all"] * several]
+        places = [(field, k < len(waves)) for field in self.fields.unbind(1) for k in range(len(colours))]
+        listed = {"field_y": [name_of_field(field) if single else "" for field, single in places]}
+        listed["wavelength"] = colours * self.fields.shape[1]
+        for name, values in _figures(self.each).items():
+            listed[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten().tolist()
+        rays = zip(listed.pop("rays"), places, strict=True)
+        listed["lost"] = [f"{self.launched - count}" if single else "" for count, (_, single) in rays]
+        return "\n".join(line.rstrip() for line in text_table({self.column(n): v for n, v in listed.items()}))
 
     @style.styled
     def draw(self):
@@ -245,15 +248,11 @@ def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray
     return Spots(lens, fields, each, whole)
 
 
-def _row(cells: Sequence[str]) -> str:
-    return " ".join(f"{words:>{width}}" for words, width in zip(cells, (13, 13, 10, 10), strict=True))
-
-
-def _cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
-    """Centroid in mm, RMS and geometric radius in µm of one spot, as the table has them; - where no ray arrives."""
-    x, y = spots.centroid[(slice(None), *at)].tolist()
-    radii = (1000 * float(radius[at]) for radius in (spots.rms_radius, spots.geometric_radius))
-    return " ".join([*(cell(v, ">13.7f") for v in (x, y)), *(cell(v, ">10.4f") for v in radii)])
+def _figures(spots: Spot | StreamedSpot) -> dict[str, Tensor]:
+    """Columns of the table, of spots (...)."""
+    x, y = spots.centroid
+    radii = {"rms_radius_um": 1e3 * spots.rms_radius, "geometric_radius_um": 1e3 * spots.geometric_radius}
+    return {"centroid_x": x, "centroid_y": y, **radii, "rays": spots.rays}
 
 
 def airy_radius(lens: Lens) -> Tensor:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import warnings
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, 
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths import zernike
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import cell
+from raytrace.maths.result import Column, cell
 from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.wave import strehl
@@ -57,7 +56,7 @@ class WavefrontMap(Analysis):
     listed: bool = False
 
     COMMAND = "wavefront"
-    UNITS: ClassVar = {"rms": "waves", "peak_to_valley": "waves", "coefficient": "waves"}
+    COLUMNS = Column("rms", "waves"), Column("peak_to_valley", "waves"), Column("coefficient", "waves")
 
     def columns(self) -> dict[str, Tensor]:
         term = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)

@@ -96,7 +96,7 @@ class GlassFigures(Result):
                 f"  at       {in_words(self.environment)}, relative to air; dn/dT relative to air, and to vacuum"
             )
             changes = torch.stack([self.dn_dt, self.dn_dt_absolute], -1).mul(1e6).round(decimals=3).tolist()
-            slopes = (f"   {relative:8.3f} {absolute + 0.0:8.3f} e-6/K" for relative, absolute in changes)
+            slopes = (f"   {relative:8.3f}e-6/K {absolute + 0.0:8.3f}e-6/K" for relative, absolute in changes)
             shown = [line + slope for line, slope in zip(shown, slopes, strict=True)]
         return "\n".join([*lines, *shown])
 

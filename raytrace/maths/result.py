@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -13,18 +13,33 @@ from raytrace.files import write_atomically
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.plotting import style
 
-#: Units of columns by name; those of fields are the lens's, the name of a column in per cent ends in _percent.
-UNITS = {
+
+class Column(NamedTuple):
+    """A column of a table: its name in JSON, CSV and frames, and its unit there and in text.
+
+    form, heading: in text, the format of its numbers with their width, and one line or two; by default the name.
+    """
+
+    name: str
+    unit: str = ""
+    form: str = ".6g"
+    heading: str = ""
+
+
+#: Columns of several results; the unit of fields is the lens's, other names end in their unit (SUFFIXES).
+COLUMNS = {
     "wavelength": "µm", "frequency": "1/mm", "projected_solid_angle": "sr", "lower": "°", "chief": "°", "upper": "°",
+    "dn_dt": "1/K", "dn_dt_absolute": "1/K", "seconds": "s",
     **dict.fromkeys(
         (
             "radius", "thickness", "semi_diameter", "height", "shift", "crossing", "x", "y", "z", "opl",
-            "object_distance", "sensor_distance", "rms_radius", "geometric_radius", "optical_invariant", "sigma",
-            "marginal_yni", "chief_yni", "centroid_x", "centroid_y", "sigma_x", "sigma_y", "efl",
+            "object_distance", "sensor_distance", "optical_invariant", "marginal_yni", "chief_yni", "centroid_x",
+            "centroid_y", "efl", "depth",
         ),
         "mm",
     ),
 }  # fmt: skip
+SUFFIXES = {"_percent": "%", "_um": "µm"}
 
 
 class Result:
@@ -36,8 +51,8 @@ class Result:
 
     __slots__ = ()
 
-    #: Units of columns that differ from the table UNITS, by name.
-    UNITS: ClassVar[Mapping[str, str]] = {}
+    #: Columns that are not in the table COLUMNS, or have another unit or format.
+    COLUMNS: ClassVar[Sequence[Column]] = ()
 
     @property
     def falls_short(self) -> bool:
@@ -52,17 +67,18 @@ class Result:
         """Texts of a column whose numbers, 0 and up, count them, by the name of the column."""
         return {}
 
-    def unit_of(self, column: str) -> str:
-        """The unit of a column, in text, JSON and frames; "" of a plain number."""
-        if column in self.UNITS:
-            return self.UNITS[column]
-        if column in ("field_x", "field_y"):
-            return self.lens.fields.unit
-        return "%" if column.endswith("_percent") else UNITS.get(column, "")
+    def column(self, name: str) -> Column:
+        """Unit, format and heading of a column by its name."""
+        if column := next((column for column in self.COLUMNS if column.name == name), None):
+            return column
+        if name in ("field_x", "field_y"):
+            return Column(name, self.lens.fields.unit)
+        ending = next((unit for suffix, unit in SUFFIXES.items() if name.endswith(suffix)), "")
+        return Column(name, COLUMNS.get(name, ending))
 
     def units(self) -> dict[str, str]:
         """Units of columns by their names, of those that have one; `to_frame` has them in `attrs`."""
-        return {name: unit for name in self.columns() if (unit := self.unit_of(name))}
+        return {name: unit for name in self.columns() if (unit := self.column(name).unit)}
 
     def to_frame(self):
         """The table for pandas, a row for every point of every curve; units are in `frame.attrs["units"]`."""
@@ -70,7 +86,7 @@ class Result:
 
         columns = self.columns()
         frame = pandas.DataFrame(flat(columns))
-        frame.attrs["units"] = {name: unit for name in columns if (unit := self.unit_of(name))}
+        frame.attrs["units"] = {name: unit for name in columns if (unit := self.column(name).unit)}
         return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in self.words().items()})
 
     def save(self, path: str | PathLike) -> None:
@@ -146,6 +162,17 @@ def cell(value: float, form: str) -> str:
         return f"{'-':>{len(f'{0.0:{form}}')}}"
     shown = f"{value:{form}}"
     return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
+
+
+def text_table(columns: Mapping[Column, Sequence], gap: str = " ") -> list[str]:
+    """Lines of columns of numbers, or of texts, under their headings and units."""
+    texts = []
+    for (name, unit, form, heading), values in columns.items():
+        shown = [value if isinstance(value, str) else cell(value, form) for value in values]
+        width = len(f"{0.0:{form}}") if form.startswith(">") else max(len(name), 9)
+        first, _, second = (heading or name).partition("\n")
+        texts.append([f"{text:>{width}}" for text in (first, ", ".join(filter(None, (second, unit))), *shown)])
+    return [gap.join(row) for row in zip(*texts, strict=True)]
 
 
 def object_text(distance: float) -> str:

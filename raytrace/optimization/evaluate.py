@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.result import Result, cell, rows
+from raytrace.maths.result import Column, Result, cell, rows
 from raytrace.maths.value import value
 from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
@@ -49,7 +49,9 @@ class MeritResult(Result):
     skipped: tuple[int, ...]
     each: bool = False
 
-    UNITS = property(lambda self: dict.fromkeys(("target", "value"), f"of the operand, lengths in {self.unit:g} mm"))
+    COLUMNS = property(
+        lambda self: [Column(name, f"of the operand, lengths in {self.unit:g} mm") for name in ("target", "value")]
+    )
 
     def columns(self) -> dict[str, Tensor]:
         words, valued = self.words(), self.valued()
@@ -62,7 +64,7 @@ class MeritResult(Result):
             "target": self.targets,
             "weight": self.weights,
             "value": self.values,
-            "contribution": self.contributions,
+            "contribution_percent": 100 * self.contributions,
             "lost": self.lost,
         }
 

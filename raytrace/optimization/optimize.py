@@ -123,7 +123,7 @@ class Optimized(Result):
             "weight": torch.tensor([row.weight for row in rows], dtype=torch.float64),
             "before": self.values_before[indices],
             "after": self.values_after[indices],
-            "contribution": self.contributions[indices],
+            "contribution_percent": 100 * self.contributions[indices],
         }
 
     def words(self) -> dict:

@@ -95,7 +95,7 @@ class Searched(Result):
         return self.lenses[0]
 
     def columns(self) -> dict[str, Tensor]:
-        fields = {f"rms_{f}": self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
+        fields = {f"rms_{f}_um": 1e3 * self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
         variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
         number = torch.arange(1, len(self.lenses) + 1)
         of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields}
@@ -115,8 +115,9 @@ class Searched(Result):
             f"  {'':>7} {'':>12} {'EFL':>10} {'RMS spots':>{width}}\n  {'minimum':>7} {'merit':>12} {'mm':>10} "
             f"{'µm, by field':>{width}} {'found':>6}",
         ]
+        radii = [column for name, column in self.columns().items() if name.startswith("rms_")]
         for k in range(len(self.lenses)):
-            spots = "".join(cell(1e3 * float(one), "8.2f") for one in self.spots[k])
+            spots = "".join(cell(float(spots[k]), "8.2f") for spots in radii)
             length = cell(float(self.focal_length[k]), "10.4f")
             merit, found = float(self.merit[k]), int(self.found[k])
             lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")

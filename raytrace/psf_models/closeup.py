@@ -46,8 +46,7 @@ def close_up(psfs: Psf) -> CloseUp:
     """
     half, centre = _windows(psfs)
     plain = MODELS[psfs.model].plain is not None
-    numbers = {"rays": _RAYS, "order": None} if plain else {"order": psfs.order}
-    model = dataclasses.replace(psfs.parameters, **numbers)
+    model = dataclasses.replace(psfs.parameters, **({"rays": _RAYS, "order": None} if plain else {"order": psfs.order}))
     colours = {"wavelengths": psfs.wavelengths, "wavelength_weights": psfs.wavelength_weights}
     colours |= {"per_wavelength": not psfs.wavelengths_summed}
 
@@ -69,11 +68,7 @@ def close_up(psfs: Psf) -> CloseUp:
 
 
 def _windows(psfs: Psf) -> tuple[Tensor, Tensor]:
-    """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill, or that waves can afford.
-
-    The pupil points of a kernel of waves grow with the square of blur and window (`phase_along_radius`), the nodes of
-    the sensor with the square of the window over the finest fringes of the light.
-    """
+    """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill, or that waves can afford."""
     centroid, covariance = (moment.nan_to_num(0.0) for moment in (psfs.ray_centroid, psfs.ray_covariance))
     blur = 2 * safe_sqrt(torch.maximum(covariance[0], covariance[2]))
     if not psfs.wavelengths_summed:
@@ -88,6 +83,7 @@ def _windows(psfs: Psf) -> tuple[Tensor, Tensor]:
     if psfs.waves:
         least = 0.5 * psfs.grid.pitch * max(psfs.grid.shape)
         cutoff = 1e3 / (psfs.wavelengths.min() * torch.where(torch.isfinite(number), number, 1.0))
+        # Pupil points grow with the square of blur and window, nodes with that of the window over the finest fringes.
         for _ in range(20):
             points = psfs.rays * ((blur + 1.4 * half) / (blur + 1.4 * least)) ** 2
             nodes = math.pi * cutoff * half + 2 * _SAMPLES

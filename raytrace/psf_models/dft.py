@@ -71,8 +71,7 @@ def fft_psf(amplitude: Tensor, waves: Tensor, *, pad: int) -> Tensor:
         step = waves.diff(dim=axis).abs()
         lit = (amplitude != 0).narrow(axis, 1, step.shape[axis]) & (amplitude != 0).narrow(axis, 0, step.shape[axis])
         if bool((lit & (step > 0.5)).any()):
-            largest = float(torch.where(lit, step, 0.0).max())
-            message = f"OPD steps by up to {largest:.3g} waves between pupil samples"
+            message = f"OPD steps by up to {float(step[lit].max()):.3g} waves between pupil samples"
             warnings.warn(message, Aliased, stacklevel=calling_level())
             break
     size = pad * amplitude.shape[-1]
@@ -172,8 +171,7 @@ def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -
 def nodes_per_pixel(pitch: float, cutoff: float, order: int) -> int:
     """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm.
 
-    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch; little light is near the cutoff. From
-    order -2 on; a margin of two nodes makes order 0.
+    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch. Order 0 has a margin of two nodes.
     """
     return max(1, math.ceil(0.5 * math.pi * cutoff * pitch) + 2 + order)
 
@@ -243,35 +241,24 @@ def _bessel_slope(x: Tensor, number: int) -> Tensor:
     return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
 
 
-# -- memory ------------------------------------------------------------------------------------------------------------
-
 _HELPS = "give a larger `tol`, a smaller `size` or `pixel`, a slower aperture (`f_number`), `model=drt`"
 
 
-def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
-    """Raise OverBudget where a pupil of so many Gauss rings exceeds the memory budget.
+def _speed(scene: Scene) -> str:
+    return f"F/{float(axial_f_number(scene.lens).detach().abs().min()):.3g}"
 
-    phase: radians along a pupil radius. n rings are counted as a matrix n × n: the points that they serve grow alike.
-    """
-    D, F, W = scene.shape
+
+def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
+    """Raise OverBudget where so many Gauss rings exceed the memory budget; phase: radians along a pupil radius."""
     turns = phase / (2 * math.pi)
-    afford(
-        24.0 * rings**2 + 128.0 * rings * D * F * W,
-        f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times",
-        helps=_HELPS,
-    )
+    need = f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times"
+    # A matrix n × n: the points that the rings serve grow alike.
+    afford(24.0 * rings**2 + 128.0 * rings * math.prod(scene.shape), need, helps=_HELPS)
 
 
 def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
     """Raise OverBudget where the light at `nodes`² points of each pixel exceeds the memory budget, field by field."""
     D, _, W = scene.shape
     rows, columns = grid.rows * nodes, grid.columns * nodes
-    afford(
-        64.0 * D * W * rows * columns,
-        f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels",
-        helps=_HELPS,
-    )
-
-
-def _speed(scene: Scene) -> str:
-    return f"F/{float(axial_f_number(scene.lens).detach().abs().min()):.3g}"
+    need = f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels"
+    afford(64.0 * D * W * rows * columns, need, helps=_HELPS)

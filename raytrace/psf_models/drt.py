@@ -19,7 +19,7 @@ fits, the cells are traced (`trace_fans`).
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -47,14 +47,11 @@ def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
     """
 
     def between_centres(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """The pixel centre i below u, -1 … count - 1, and the share u - i of its neighbour i + 1."""
         u = torch.where((u > -1) & (u < count), u, -1.0)  # a NaN is outside
         below = torch.floor(u).detach()
         return below.long(), u - below
 
-    column, right = between_centres(_in_pixels(grid, points, 0) - 0.5, grid.columns)
-    row, up = between_centres(_in_pixels(grid, points, 1) - 0.5, grid.rows)
-    return _deposit(grid, column, row, _products(weights, right, up))
+    return _shared(grid, weights, *(between_centres(u - 0.5, n) for u, n in _in_pixels(grid, points)))
 
 
 def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -> Tensor:
@@ -67,25 +64,19 @@ def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -
     """
 
     def about_edges(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """The pixel i below the edge nearest to u, and the share of pixel i + 1 behind that edge."""
         u = torch.where((u > -0.5) & (u < count + 0.5), u, -0.5)
         edge = torch.floor(u + 0.5).detach()
         s = (0.5 + (u - edge) / (2 * width)).clamp(0, 1)
         return edge.long() - 1, s * s * s * (10 - s * (15 - 6 * s))
 
-    column, right = about_edges(_in_pixels(grid, points, 0), grid.columns)
-    row, up = about_edges(_in_pixels(grid, points, 1), grid.rows)
-    return _deposit(grid, column, row, _products(weights, right, up))
+    return _shared(grid, weights, *(about_edges(u, n) for u, n in _in_pixels(grid, points)))
 
 
 def histogram(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
     """Energy of the points in each pixel, without derivative in their positions; arguments as for `splat`."""
-    column, row = (torch.floor(_in_pixels(grid, points, axis)) for axis in (0, 1))
+    pixels = ((torch.floor(u), count) for u, count in _in_pixels(grid, points))
     # -1 or `count`, outside the window, for all points further out and for NaN.
-    column, row = (
-        torch.where(torch.isfinite(pixel), pixel.clamp(-1, count), -1.0).long()
-        for pixel, count in ((column, grid.columns), (row, grid.rows))
-    )
+    column, row = (torch.where(torch.isfinite(u), u.clamp(-1, count), -1.0).long() for u, count in pixels)
     return _deposit(grid, column, row, [weights])
 
 
@@ -97,8 +88,7 @@ def splat_cells(
     To first order the image of a cell is a parallelogram c ± a ± b; on a caustic it folds to a segment or a point.
     Along x it has the density of the sum of two uniform variables of half widths |a_x| and |b_x|, so its share on
     either side of a pixel edge is exact. At a pixel corner the joint share F_x F_y + cov f_x f_y is used, whose mean
-    over all positions of the corner is exact (Hoeffding), clamped to the range that the marginal shares allow. There is
-    no bias as cells shrink.
+    over all positions of the corner is exact (Hoeffding), clamped to the range that the marginal shares allow.
 
     points: (2, ..., A, N) mm, N nodes on each of A lines at equal angles; radius: (N,) of the nodes.
     clearances: each (..., A, N), positive where light passes; the share of a cell below 0 is cut away.
@@ -106,10 +96,9 @@ def splat_cells(
     A cell may be at most one pixel wide (`cell_widths`).
     """
     lines = points.shape[-2] - (0 if closed else 1)
-    u, v = _in_pixels(grid, points, 0), _in_pixels(grid, points, 1)
     energy = cell_energy(radius, lines) * clear_share(clearances, radius, closed=closed)
-    (x, ax, bx), (y, ay, by) = (cells(w, radius, closed=closed) for w in (u, v))
-    (column, right, dense_x), (row, up, dense_y) = _shares(x, ax, bx, grid.columns), _shares(y, ay, by, grid.rows)
+    pixels = ((cells(u, radius, closed=closed), count) for u, count in _in_pixels(grid, points))
+    (column, right, dense_x, ax, bx), (row, up, dense_y, ay, by) = (_shares(*cell, count) for cell, count in pixels)
     both = right * up + (ax * ay + bx * by) / 3 * dense_x * dense_y
     both = torch.maximum(torch.minimum(both, torch.minimum(right, up)), (right + up - 1).clamp_min(0))
     shares = (1 - right - up + both, right - both, up - both, both)
@@ -147,12 +136,9 @@ def cell_energy(radius: Tensor, lines: int) -> Tensor:
 
 def clear_share(clearances: Sequence[Tensor], radius: Tensor, *, closed: bool = True) -> Tensor | float:
     """Unvignetted share (..., A, N - 1) of each cell; clearances (..., A, N)."""
-    share = None
-    for values in clearances:
-        centre, along, across = cells(values, radius, closed=closed)
-        passed = 1 - below_edge(-centre, along, across)[0]
-        share = passed if share is None else torch.minimum(share, passed)
-    return 1.0 if share is None else share
+    parts = (cells(values, radius, closed=closed) for values in clearances)
+    shares = [1 - below_edge(-centre, along, across)[0] for centre, along, across in parts]
+    return functools.reduce(torch.minimum, shares) if shares else 1.0
 
 
 def below_edge(z: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,35 +161,32 @@ def below_edge(z: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(z > 0, 1 - tail, tail), density
 
 
-def _shares(centre: Tensor, along: Tensor, across: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The pixel below the edge nearest to each cell, the cell's share beyond that edge, and the density at the edge."""
+def _shares(centre: Tensor, along: Tensor, across: Tensor, count: int) -> tuple[Tensor, ...]:
+    """The pixel below the edge nearest to each cell, the cell's share beyond it, the density there, and the cell."""
     reached = (centre > -1) & (centre < count + 1)
     centre = torch.where(reached, centre, -1.0)
     edge = torch.round(centre).detach()
     below, density = below_edge(edge - centre, along, across)
-    return edge.long() - 1, 1 - below, density
+    return edge.long() - 1, 1 - below, density, along, across
 
 
-def _in_pixels(grid: Grid, points: Tensor, axis: int) -> Tensor:
-    """Coordinate in pixels: pixel i covers i to i + 1. The batch axes of the grid precede those of the points."""
-    count = grid.columns if axis == 0 else grid.rows
-    like = points[axis]
-    centre, pitch = (
-        t.reshape(*t.shape, *(1,) * (like.dim() - t.dim())) if t.dim() else t for t in (grid.centre[axis], grid.pitch)
-    )
-    return (like - centre) / pitch + 0.5 * count
+def _in_pixels(grid: Grid, points: Tensor) -> Iterator[tuple[Tensor, int]]:
+    """x, then y, in pixels (pixel i covers i to i + 1), with the count; batch axes of the grid precede the points'."""
+    for like, centre, count in zip(points, grid.centre, grid.shape[::-1], strict=True):
+        pair = (t.reshape(*t.shape, *(1,) * (like.dim() - t.dim())) if t.dim() else t for t in (centre, grid.pitch))
+        centre, pitch = pair
+        yield (like - centre) / pitch + 0.5 * count, count
 
 
-def _products(weights: Tensor, right: Tensor, up: Tensor) -> list[Tensor]:
-    """Weights of a pixel and its three neighbours, for independent shares along x and y."""
+def _shared(grid: Grid, weights: Tensor, along_x: tuple[Tensor, Tensor], along_y: tuple[Tensor, Tensor]) -> Tensor:
+    """Pixels of weights whose shares of the next pixel along x and y, (pixel, share), are independent."""
+    (column, right), (row, up) = along_x, along_y
     right, left = weights * right, weights * (1 - right)
-    return [left * (1 - up), right * (1 - up), left * up, right * up]
+    return _deposit(grid, column, row, [left * (1 - up), right * (1 - up), left * up, right * up])
 
 
 def _deposit(grid: Grid, column: Tensor, row: Tensor, energies: list[Tensor], *, axes: int = 1) -> Tensor:
-    """Pixels (..., rows, columns) that hold energies (..., P), over the last `axes` axes, of the pixel (column, row)
-    and, if four are given, of its neighbours (1, 0), (0, 1) and (1, 1) further.
-    """
+    """Pixels (..., rows, columns) of energies (..., P) in (column, row) and its neighbours right, above and both."""
     image, dropped = None, grid.rows * grid.columns
     for (right, up), energy in zip(((0, 0), (1, 0), (0, 1), (1, 1)), energies, strict=False):
         i, j = column + right, row + up
@@ -250,8 +233,8 @@ def kernels_of_rays(
     """PSFs of traced rays, without the polynomial map; differentiable in the lens, the sensor distance and the grid.
 
     order: 0 … 10; each has twice the rays of the one before, and half its error. rays: instead, that many independent
-    rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by `splat_smooth` of half width `width` pixels; a
-    width of 0 is the histogram, which has no derivative. A kernel that no ray reaches has energy 0 and gradient 0.
+    rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by `splat_smooth` of half width `width` pixels; 0
+    is the histogram, without derivative. A kernel that no ray reaches has energy 0 and gradient 0.
     """
     if rays is None:
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
@@ -265,10 +248,7 @@ def trace_fans(scene: Scene, order: int) -> Fans:
     like = scene.lens.surfaces[-2].thickness
     angle, radius = (like.new_tensor(t) for t in pupil_lines(_LINES[order], _LINES[order] // 2))
     fold = symmetry(scene)
-    if fold == "round":
-        traced = like.new_tensor([torch.pi / 2])
-    else:
-        traced = angle[: len(angle) // 2] if fold == "mirror" else angle
+    traced = {"round": like.new_tensor([torch.pi / 2]), "mirror": angle[: len(angle) // 2], "none": angle}[fold]
     disc = radius * torch.stack([torch.cos(traced), torch.sin(traced)])[..., None]
     hits, clearances = trace_clearances(scene, disc.flatten(1))
     hits, clearances = hits.unflatten(-1, disc.shape[1:]), [c.unflatten(-1, disc.shape[1:]) for c in clearances]
@@ -348,27 +328,24 @@ def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
     The window of a half fan must be symmetric in x too.
     """
     count = fans.points.shape[-2]
-    if not fans.is_half:
-        return _energy_of_lines(grid, fans, range(count + 1), count)
-    whole = 2 * (count - 2)
-    half = _energy_of_lines(grid, fans, range(1, count - 1), whole)
-    on_axis = [_energy_of_lines(grid, fans, range(first, first + 2), whole) for first in (0, count - 2)]
-    return half + half.flip(-1) + sum(on_axis)
-
-
-def _energy_of_lines(grid: Grid, fans: Fans, lines: range, cells_round: int) -> Tensor:
-    """Energy of the cells between consecutive `lines`, of `cells_round` cells round the pupil."""
-    count = fans.points.shape[-2]
     height = max(1, _CHUNK // fans.points[0, ..., 0, :].numel())
-    if len(lines) > count and height >= count:
-        return splat_cells(grid, fans.points, fans.radius, fans.clearances)
-    kernel = 0.0
-    for first in range(lines.start, lines.stop - 1, height):
-        rows = torch.arange(first, min(first + height + 1, lines.stop), device=fans.points.device) % count
-        points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
-        part = splat_cells(grid, points, fans.radius, clearances, closed=False)
-        kernel = kernel + part * ((len(rows) - 1) / cells_round)
-    return kernel
+
+    def between(first: int, last: int, cells_round: int) -> Tensor:
+        kernel = 0.0
+        for start in range(first, last, height):
+            rows = torch.arange(start, min(start + height, last) + 1, device=fans.points.device) % count
+            points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
+            part = splat_cells(grid, points, fans.radius, clearances, closed=False)
+            kernel = kernel + part * ((len(rows) - 1) / cells_round)
+        return kernel
+
+    if not fans.is_half:
+        if height >= count:
+            return splat_cells(grid, fans.points, fans.radius, fans.clearances)
+        return between(0, count, count)
+    whole = 2 * (count - 2)
+    half = between(1, count - 2, whole)
+    return half + half.flip(-1) + (between(0, 1, whole) + between(count - 2, count - 1, whole))
 
 
 def refined(fans: Fans, parts: Sequence[int]) -> Fans:
@@ -390,17 +367,11 @@ def refined(fans: Fans, parts: Sequence[int]) -> Fans:
 
 
 def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float) -> None:
-    """Raise OverBudget if the pupil cells, `each` bytes, exceed the memory budget.
-
-    kernels: (D, F, W); across, along: cells round the pupil and from its centre to its rim.
-    """
+    """Raise OverBudget if (D, F, W) kernels of across × along pupil cells, `each` bytes, exceed the memory budget."""
     count = math.prod(kernels)
-    afford(
-        each * count * across * along,
-        f"the ray-traced PSF needs {across:,} × {along:,} pupil cells for each of {count} kernels: the blur "
-        "spans many pixels",
-        helps="give a larger `pixel`, fewer fields or wavelengths at once, `rays`, `model=gaussian`",
-    )
+    need = f"the ray-traced PSF needs {across:,} × {along:,} pupil cells for each of {count} kernels"
+    helps = "give a larger `pixel`, fewer fields or wavelengths at once, `rays`, `model=gaussian`"
+    afford(each * count * across * along, f"{need}: the blur spans many pixels", helps=helps)
 
 
 def cut_line(t: Tensor, parts: int) -> Tensor:
@@ -461,8 +432,7 @@ def stream_kernels(
     max_bytes: float = streaming.MAX_BYTES,
     progress: streaming.Progress | None = None,
 ) -> tuple[Kernels, Kernels]:
-    """Kernels of `rays` Sobol rays for each distance, field and wavelength, as `kernels_of_rays`, and of the first half
-    of them; without derivatives.
+    """Kernels of `rays` Sobol rays, as `kernels_of_rays`, and of the first half of them; without derivatives.
 
     width: half width in pixels of the blur of each ray, 0 for none; max_bytes: additional memory; progress: called with
     the number of rays traced since the last call. Sums are float64.
@@ -592,9 +562,8 @@ def fit(scene: Scene, degree: int) -> RayMap:
     crossings = tuple(coefficients(hit) for _, hit in crossed)
     edge = torch.zeros_like(hits[0, ..., 0])
     for (aperture, hit), terms in zip(crossed, crossings, strict=True):
-        edge = torch.maximum(
-            edge, largest(clearance(aperture, terms @ check.T) - clearance(aperture, hit[..., count:]))
-        )
+        error = clearance(aperture, terms @ check.T) - clearance(aperture, hit[..., count:])
+        edge = torch.maximum(edge, largest(error))
     residual = largest((mapped @ check.T - hits[..., count:]).abs().amax(0))
     apertures = tuple(aperture for aperture, _ in crossed)
     return RayMap(degree, axial, mapped, crossings, apertures, residual, edge, disc.shape[1], mirrored)
@@ -617,16 +586,13 @@ def fans_of_map(ray_map: RayMap, across: int, along: int, *, is_half: bool = Fal
             return rotated((terms[1] @ radial.T)[..., None, :], angle)
         return around @ (terms[..., None] * radial.T)
 
-    clearances = tuple(
-        clearance(aperture, on_fans(terms))
-        for aperture, terms in zip(ray_map.apertures, ray_map.crossings, strict=True)
-    )
+    pairs = zip(ray_map.apertures, ray_map.crossings, strict=True)
+    clearances = tuple(clearance(aperture, on_fans(terms)) for aperture, terms in pairs)
     return Fans(on_fans(ray_map.hits), radius, clearances, ray_map.rays, is_half)
 
 
 def reference(scene: Scene, grid: Grid, *, lines: int = 2048) -> Tensor:
-    """Converged energy (D, F, W, rows, columns), for tests and measurements; error below 1e-4, as that of 10⁸ random
-    rays.
+    """Converged energy (D, F, W, rows, columns), for tests; error below 1e-4, as that of 10⁸ random rays.
 
     2 million cells of the map of degree 20, or 0.26 million traced rays where that fails.
     """
@@ -645,8 +611,8 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     coarse = fans_of_map(ray_map, 2 * _MAP_LINES, _MAP_LINES)
     *widths, both = cell_widths(grid, coarse.points, scene.largest)
     across, along = (
-        2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
-        for width, count, least in zip(widths, (2 * _MAP_LINES, _MAP_LINES), (_MAP_LINES, _MAP_LINES // 2), strict=True)
+        2 * math.ceil(min(_MOST_LINES, max(least, width * 2 * least) * both * 2 ** (order / 2)) / 2)
+        for width, least in zip(widths, (_MAP_LINES, _MAP_LINES // 2), strict=True)
     )
     # The window is symmetric in x too, and stays so under differentiation.
     is_half = ray_map.is_mirrored and not varies(grid.centre) and not bool((grid.centre[0] != 0).any())
@@ -655,8 +621,7 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     afford_cells(scene.shape, across // 2 if is_half else across, along, each=each)
     fans = fans_of_map(ray_map, across, along, is_half=is_half)
     kernel = energy_of_fans(grid, fans) * beam_share(scene)[..., None, None]
-    centroid, covariance = moments_of_fans(fans)
-    return _with_residual(Kernels(kernel, grid, centroid, covariance, ray_map.rays), ray_map.residual)
+    return _with_residual(Kernels(kernel, grid, *moments_of_fans(fans), ray_map.rays), ray_map.residual)
 
 
 def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
@@ -665,10 +630,8 @@ def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) 
     nodes = np.linspace(0, 1, math.ceil(_PIECES * 2 ** (order / 2)) + 1)
     basis = like.new_tensor(_axial_basis(ray_map.degree, nodes))
     height, *crossed = (terms[1] @ basis.mT for terms in (ray_map.hits, *ray_map.crossings))
-    clearances = [
-        clearance(aperture, torch.stack([torch.zeros_like(hit), hit]))
-        for aperture, hit in zip(ray_map.apertures, crossed, strict=True)
-    ]
+    crossed = (torch.stack([torch.zeros_like(hit), hit]) for hit in crossed)
+    clearances = [clearance(aperture, hit) for aperture, hit in zip(ray_map.apertures, crossed, strict=True)]
     first, last, share = lit_part(height[..., :-1], height[..., 1:], clearances)
     energy = (share * like.new_tensor(np.diff(nodes**2))).expand(first.shape)
     kernel = unfold(grid, energy_of_rings(grid, first, last, energy)) * beam_share(scene)[..., None, None]
@@ -676,8 +639,8 @@ def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) 
     # A ring of radius h has the variance h²/2 per axis; h² is averaged over every segment.
     variance = (weights * (first * first + first * last + last * last)).sum(-1) / 6
     zero = torch.zeros_like(variance)
-    covariance = torch.stack([variance, zero, variance])
-    return _with_residual(Kernels(kernel, grid, torch.stack([zero, zero]), covariance, ray_map.rays), ray_map.residual)
+    moments = torch.stack([zero, zero]), torch.stack([variance, zero, variance])
+    return _with_residual(Kernels(kernel, grid, *moments, ray_map.rays), ray_map.residual)
 
 
 def _with_residual(kernels: Kernels, residual: Tensor) -> Kernels:
@@ -710,6 +673,11 @@ def _disc_nodes(degree: int, mirrored: bool) -> tuple[np.ndarray, np.ndarray, np
 
 
 @functools.lru_cache(maxsize=32)
+def _solution(degree: int) -> np.ndarray:
+    return np.linalg.inv(_basis(degree, _rings(degree)))
+
+
+@functools.lru_cache(maxsize=32)
 def _rings(degree: int) -> np.ndarray:
     """Points (2, T) on rings of 2n + 5 - 4j points, j = 1, 2, …, symmetric in x; as many as the basis has terms."""
     points = []
@@ -720,11 +688,6 @@ def _rings(degree: int) -> np.ndarray:
         angle = np.pi / 2 + np.arange(count) * (2 * np.pi / count)
         points.append(radius * np.stack([np.cos(angle), np.sin(angle)]))
     return np.concatenate(points, 1)
-
-
-@functools.lru_cache(maxsize=32)
-def _solution(degree: int) -> np.ndarray:
-    return np.linalg.inv(_basis(degree, _rings(degree)))
 
 
 def _basis(degree: int, points: np.ndarray) -> np.ndarray:

@@ -17,41 +17,41 @@ _MOST_PIXELS = 16  # across a panel, whose edges are drawn
 
 
 @styled
-def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False):
+def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
-    Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
-    fills, with the edges of the pixels. close_up: that light, if it is there already.
-    Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
-    Below each: the energy inside the window (or that it was normalised by), and that of the brightest pixel.
+    Where its pixels were specified, or rays are independent, pixels are drawn; else the light itself in windows that
+    it fills, with the edges of the pixels. close_up: that light, if it is already computed. Kernels of each wavelength
+    have a row each, fields outermost. log: four decades of brightness below the peak. Below each: the energy inside the
+    window, and that of the brightest pixel.
     """
-    if close_up is None and not found.framed and found.order is not None:
-        close_up = light_of(found)
-    distances = found.object_distances.tolist()
-    labels = [field_label(found.lens, field) for field in array(found.fields).T]
-    if not found.wavelengths_summed:
-        labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in found.wavelengths.tolist()]
-    title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))
-    energy, kernels = _rows(array(found.energy), 0), _rows(array(found.kernel), 2)
+    if close_up is None and not psfs.framed and psfs.order is not None:
+        close_up = light_of(psfs)
+    distances = psfs.object_distances.tolist()
+    labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
+    if not psfs.wavelengths_summed:
+        labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in psfs.wavelengths.tolist()]
+    title = ": ".join(filter(None, (psfs.lens.name, f"{psfs.model} PSF")))
+    energy, kernels = _rows(array(psfs.energy), 0), _rows(array(psfs.kernel), 2)
     notes = [
         [f"energy {e:.3f}, max {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
         for row in zip(energy, kernels, strict=True)
     ]
-    pitch = float(found.grid.pitch)
-    half = 0.5 * pitch * found.grid.columns
+    pitch = float(psfs.grid.pitch)
+    half = 0.5 * pitch * psfs.grid.columns
     if close_up is None:
         figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
-        return worded(figure, title, [f"{window(found.grid)}; max: light of the brightest pixel", brightness(log)])
+        return worded(figure, title, [f"{window(psfs.grid)}; max: light of the brightest pixel", brightness(log)])
     drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
     figure, axes = panels(drawn, halves, distances, labels, notes, log)
-    centre = array(found.grid.centre).reshape(2, *(found.grid.centre.shape[1:] or (1, 1)))
+    centre = array(psfs.grid.centre).reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
         for d, panel in enumerate(row):
-            _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
-    one = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
-    drawn = f"{one}; energy and brightest pixel (max): of the {window(found.grid)}, outlined where they lie inside"
+            _draw_pixels(panel, place[:, d], pitch, psfs.grid.columns, psfs.grid.rows)
+    size = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
+    drawn = f"{size}; energy and brightest pixel (max): of the {window(psfs.grid)}, outlined where they lie inside"
     return worded(figure, title, [drawn, brightness(log)])
 
 
@@ -64,9 +64,11 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
 def panels(kernels, halves, distances, labels, notes, log: bool):
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
-    Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
+    Distances are above and labels on the left; kernels of one distance follow each other in lines of four, each under
     its label.
     """
+    from matplotlib.colors import LogNorm, Normalize
+
     rows, columns = len(labels), len(distances)
     flows = columns == 1 and rows > 1
     shape = (-(-rows // 4), min(rows, 4)) if flows else (rows, columns)
@@ -78,9 +80,9 @@ def panels(kernels, halves, distances, labels, notes, log: bool):
         panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
         tall = half * kernel.shape[0] / kernel.shape[1]
         extent = (-half, half, -tall, tall)
-        panel.imshow(
-            kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
-        )
+        peak = float(kernel.max()) or 1.0
+        norm = LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
+        panel.imshow(kernel, origin="lower", cmap="magma", norm=norm, extent=extent, interpolation="nearest")
         framed(panel)
         panel.set(xlim=extent[:2], ylim=extent[2:])
         panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
@@ -97,21 +99,8 @@ def panels(kernels, halves, distances, labels, notes, log: bool):
     return figure, axes
 
 
-def _norm(kernel: np.ndarray, log: bool):
-    """Brightness from 0, or four decades below, to the peak."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    peak = float(kernel.max())
-    peak = peak if peak > 0 else 1.0
-    return LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
-
-
 def brightness(log: bool) -> str:
-    return (
-        f"each panel from {10.0**-DECADES:g} of its own peak, logarithmic"
-        if log
-        else "each panel from 0 to its own peak"
-    )
+    return f"each panel from {f'{10.0**-DECADES:g} of its own peak, logarithmic' if log else '0 to its own peak'}"
 
 
 def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
@@ -125,14 +114,10 @@ def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: in
         x, y = (corner[k] + pitch * np.arange(count + 1) for k, count in enumerate((columns, rows)))
         lines = [[(at, y[0]), (at, y[-1])] for at in x if low < at < high]
         lines += [[(x[0], at), (x[-1], at)] for at in y if bottom < at < top]
-        panel.add_collection(
-            LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45, gid="pixels"), autolim=False
-        )
-    panel.add_patch(
-        Rectangle(
-            corner, pitch * columns, pitch * rows, fill=False, edgecolor="white", linewidth=0.7, alpha=0.7, gid="window"
-        )
-    )
+        edges = LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45, gid="pixels")
+        panel.add_collection(edges, autolim=False)
+    line = {"fill": False, "edgecolor": "white", "linewidth": 0.7, "alpha": 0.7, "gid": "window"}
+    panel.add_patch(Rectangle(corner, pitch * columns, pitch * rows, **line))
     panel.set(xlim=(low, high), ylim=(bottom, top))
 
 

@@ -45,12 +45,12 @@ class Light:
 def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """Gaussians with the centroid and covariance of `order` Gauss rings of 4·(order - 1) arms, 8 at least.
 
-    Only rays that the scene's symmetry does not give are traced: `order` rays of one meridian if every field is on the
-    axis of a rotationally symmetric lens, half the pupil if every field lies in the y-z plane of a lens symmetric about
-    it. σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give
-    9e-8. Where rays are lost, rings follow the clear part of every arm, see `trace_light`. The energy is the
-    transmitted fraction of the light through the whole entrance pupil, of which vignetting factors leave the share (1 -
-    VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
+    Only rays that the scene's symmetry does not give are traced: `order` rays of one meridian on the axis of a
+    rotationally symmetric lens, half the pupil for fields in the y-z plane of a lens symmetric in x. σ of the double
+    Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give 9e-8. Where rays fail,
+    rings follow the clear part of every arm, see `trace_light`. The energy is the transmitted fraction of the light
+    through the whole entrance pupil, of which vignetting factors leave the share (1 - VCX)(1 - VCY); 0 with gradient 0
+    where no ray arrives.
     """
     light, shape, gaussians = _kernels(scene, grid, order)
     return dataclasses.replace(gaussians, residual=residual(light, grid, shape, order, symmetry(scene)))
@@ -74,31 +74,26 @@ def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kerne
 def trace_light(scene: Scene, order: int, fold: str) -> Light:
     """The rays of an order, of the part of the pupil that symmetry needs.
 
-    If any ray is lost, of these or of those at the rim that are added for a lens with apertures, or an obstruction lies
-    in the pupil, 2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ
-    then err by 2e-4 at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
+    If any ray fails, of these or of those at the rim of a lens with apertures, or an obstruction lies in the pupil,
+    2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ then err by 2e-4
+    at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
     """
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     count = 0
     if not any(stands_inside(aperture) for aperture in apertures):
         points, weights = fold_pupil(order, fold, scene.wavelengths)
-        rim = rim_points(order, fold, scene.wavelengths) if apertures else points[:, :0]
-        hits, valid = _traced(scene, torch.cat([points, rim], 1))
+        rim = _RIM * directions(2 * arms_of(order), fold, scene.wavelengths, start=0.0) if apertures else points[:, :0]
+        rays = trace_scene(scene, torch.cat([points, rim], 1))
+        hits, valid = rays.position[:2], rays.valid
         inside, count = points.shape[1], points.shape[1] + rim.shape[1]
         if scene.everywhere(valid.all()):
             return Light(hits[..., :inside], valid[..., :inside], weights, count)
     unit = directions(32 * max(order - 1, 1), fold, scene.wavelengths)
     inner, outer = clear_arms(scene, unit)
     points, weights = between(inner, outer, unit, rings=2 * order)
-    hits, valid = _traced(scene, points)
+    rays = trace_scene(scene, points)
     count += rays_of_search(unit.shape[1], inner.shape[-1]) + points.shape[-1]
-    return Light(hits, valid, weights, count, inner, outer)
-
-
-def _traced(scene: Scene, pupil: Tensor) -> tuple[Tensor, Tensor]:
-    """Hits (2, D, F, W, P) on the sensor and which rays arrive (D, F, W, P)."""
-    rays = trace_scene(scene, pupil)
-    return rays.position[:2], rays.valid
+    return Light(rays.position[:2], rays.valid, weights, count, inner, outer)
 
 
 def arms_of(order: int) -> int:
@@ -119,22 +114,13 @@ def fold_pupil(order: int, fold: str, like: Tensor) -> tuple[Tensor, Tensor]:
     return points[:, right], 2 * weights[right]
 
 
-def rim_points(order: int, fold: str, like: Tensor) -> Tensor:
-    """Points (2, P) at the rim of the part of the pupil that is traced, at and between the arms of an order."""
-    if fold == "round":
-        return like.new_tensor([[0.0], [_RIM]])
-    angle = torch.arange(2 * arms_of(order), dtype=like.dtype, device=like.device) * (math.pi / arms_of(order))
-    points = _RIM * torch.stack([torch.sin(angle), torch.cos(angle)])
-    return points if fold == "none" else points[:, : arms_of(order) + 1]
-
-
-def directions(arms: int, fold: str, like: Tensor) -> Tensor:
-    """Unit vectors (2, A) of the traced ones of so many arms, half a step off the axes; of a round lens (0, 1)."""
+def directions(arms: int, fold: str, like: Tensor, *, start: float = 0.5) -> Tensor:
+    """Unit vectors (2, A) of the traced ones of so many arms, `start` steps off the axes; of a round lens (0, 1)."""
     if fold == "round":
         return like.new_tensor([[0.0], [1.0]])
-    angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
+    angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + start) * (2 * math.pi / arms)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
-    return unit if fold == "none" else unit[:, : arms // 2]
+    return unit if fold == "none" else unit[:, : arms // 2 + (start == 0)]
 
 
 def spot_moments(light: Light, fold: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -154,28 +140,25 @@ def spot_moments(light: Light, fold: str) -> tuple[Tensor, Tensor, Tensor]:
         variance = 0.5 * (share * y * y).sum(-1)
         return torch.stack([zero, zero]), torch.stack([variance, zero, variance]), transmitted
     first = valid & (valid.to(torch.int64).cumsum(-1) == 1)
-    x_mean, x = _centred(x, share, first, valid) if fold == "none" else (zero, x)
-    y_mean, y = _centred(y, share, first, valid)
+
+    def centred(x: Tensor) -> tuple[Tensor, Tensor]:
+        reference = torch.where(first, x, 0.0).sum(-1, keepdim=True)
+        offset = torch.where(valid, x - reference, 0.0)
+        mean = (share * offset).sum(-1, keepdim=True)
+        return (reference + mean)[..., 0], torch.where(valid, offset - mean, 0.0)
+
+    (x_mean, x), (y_mean, y) = centred(x) if fold == "none" else (zero, x), centred(y)
     xy = (share * x * y).sum(-1) if fold == "none" else zero
     covariance = torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
     return torch.stack([x_mean, y_mean]), covariance, transmitted
-
-
-def _centred(x: Tensor, share: Tensor, first: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (...) and x - mean (..., P), 0 for lost rays."""
-    reference = torch.where(first, x, 0.0).sum(-1, keepdim=True)
-    offset = torch.where(valid, x - reference, 0.0)
-    mean = (share * offset).sum(-1, keepdim=True)
-    return (reference + mean)[..., 0], torch.where(valid, offset - mean, 0.0)
 
 
 def residual(light: Light, grid: Grid, shape: Tensor, order: int, fold: str) -> Tensor:
     """Distance of the Gaussian from the rays: Σ |h - g| / Σ h over the pixels of the window, (...), without gradient.
 
     g: the Gaussian's share of every pixel, `shape`; h: that of the rays themselves, counted at thousands of points of
-    a polynomial map from pupil to sensor through the same few rays (a constant matrix: nothing more is traced). Within
-    0.01 of the true distance on the double Gauss (0.32 at 25 m on the axis, 0.59 at 14°, of 5 µm pixels); the counting
-    itself leaves about 0.01. 2 is the largest distance of two distributions of equal energy.
+    a polynomial map from pupil to sensor through the same few rays: nothing more is traced. The counting leaves about
+    0.01. 2 is the largest distance of two distributions of equal energy.
     """
     with torch.no_grad():
         if light.inner is None:  # of Sobol points of the pupil, by a fit through the rings
@@ -229,16 +212,14 @@ def _unfold(position: Tensor, order: int, fold: str) -> Tensor:
 
 @functools.cache
 def _ray_map(order: int) -> np.ndarray:
-    """Matrix (4096, P) from values on the rings to Sobol points.
-
-    A fit of r^n cos mθ and r^n sin mθ, m ≤ n < 2·order, n - m even, up to the m that the arms resolve.
-    """
+    """Matrix (4096, P) from values on the rings to Sobol points: a fit of r^n cos mθ, r^n sin mθ, m ≤ n < 2·order."""
     arms = arms_of(order)
     points, weights = (t.numpy() for t in gauss_rings(order, arms))
     fine = sobol(_MAP_POINTS)[0].numpy()
 
     def basis(p: np.ndarray) -> np.ndarray:
         r, angle = np.hypot(*p), np.arctan2(p[1], p[0])
+        # n - m even, up to the m that the arms resolve.
         powers = [(n, m) for m in range(min(2 * order, arms // 2)) for n in range(m, 2 * order, 2)]
         terms = [r**n * wave(m * angle) for n, m in powers for wave in (np.cos, np.sin)]
         return np.stack(terms, axis=1)

@@ -258,15 +258,43 @@ def psf(
             raise ValueError(f"{option} {word!r} is not known; expected {', '.join(words)}")
     parameters = MODELS[name].parameters() if isinstance(model, str) and name != "auto" else model
     order, rays = (getattr(parameters, number, None) for number in ("order", "rays"))
-    _check(tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    for wrong, message in (
+        (tol is not None and rays is not None, "tol and rays exclude each other: tol chooses the number of rays"),
+        (
+            order is not None and (tol, rays) != (None, None),
+            "an order fixes the amount of work: it excludes tol and rays",
+        ),
+        (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
+        (rays is not None and (rays < 1 or rays % 1), f"rays {rays}: expected a whole number above 0"),
+        (grid is not None and (pixel, size) != (None, None), "a grid has a pixel and a size: leave these out"),
+        (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
+    ):
+        if wrong:
+            raise ValueError(message)
     like = lens.wavelengths
+
+    def row(numbers: Tensor | Sequence[float]) -> Tensor:
+        return numbers if isinstance(numbers, Tensor) else like.new_tensor(numbers)
+
     base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
     fields = fields if isinstance(fields, Tensor) else field_points(fields, like=lens)
-    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else _row(object_distances, like)
+    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else row(object_distances)
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
-    wavelengths = like if wavelengths is None else _row(wavelengths, like)
-    weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
-    _check_batch(fields, distances, wavelengths, weights)
+    wavelengths = like if wavelengths is None else row(wavelengths)
+    weights = torch.ones_like(wavelengths) if weights is None else row(weights)
+    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
+    for option, values in (("object_distances", distances), ("wavelengths", wavelengths)):
+        if values.dim() != 1 or not len(values):
+            raise ValueError(f"{option} of shape {tuple(values.shape)}; expected one axis")
+        if bool(values.isnan().any()) or bool((values == 0).any()):
+            raise ValueError(
+                f"{option} {values.tolist()}; expected numbers other than 0 and nan; give others by `{option}`"
+            )
+    if weights.shape != wavelengths.shape:
+        raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
+    if bool((weights < 0).any()) or not bool(weights.sum() > 0):
+        raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
     drive = _driver(lens, name, parameters, tol or 0.01, execution)
@@ -275,7 +303,12 @@ def psf(
     def compute(chosen: Tensor) -> Psf:
         centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
         batch = scene(lens, fields, distances[chosen], wavelengths, execution.memo)
-        origin = _origin(batch, lens, center, shares)
+        origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
+        if center == "centroid" and symmetry(batch) != "round":
+            alone = gaussian.kernels_alone(batch, make_grid(batch.wavelengths.new_tensor(1.0), 1), order=6)
+            origin = polychromatic(alone, shares, "").centroid
+        elif center != "axis":
+            origin = chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
         if origin is not None and window == "fixed":
             origin = origin.detach()
         if origin is not None or centre.dim() > 1:  # a single point stays a single point
@@ -290,10 +323,10 @@ def psf(
             psfs = _merged(compute(~infinite), compute(infinite), infinite)
         else:
             psfs = compute(torch.ones_like(infinite))
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
         trial = with_object_distance(lens, distances[0].detach())
-        points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
         failures = ray_failures(trial, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
         reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
         raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
@@ -303,7 +336,13 @@ def psf(
         kernel = safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
         psfs = dataclasses.replace(psfs, kernel=kernel, normalised="window")
     psfs = without_dark(psfs, execution.empty)
-    _warn_of_dark(lens, fields, distances, wavelengths, psfs)
+    dark = psfs.ray_centroid[0].detach().isnan()
+    if bool(dark.any()):  # warn LostRays of every field with a wavelength of which no ray reaches the sensor
+        dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
+        for distance, failed in zip(distances.detach(), dark, strict=True):
+            at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+            trial = with_object_distance(lens, distance)
+            warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
     return dataclasses.replace(
         psfs,
         lens=lens,
@@ -316,63 +355,21 @@ def psf(
     )
 
 
-def _row(numbers: Tensor | Sequence[float], like: Tensor) -> Tensor:
-    return numbers if isinstance(numbers, Tensor) else like.new_tensor(numbers)
-
-
-def _check(*, tol, rays, order, grid, pixel, size) -> None:
-    for refused, message in (
-        (tol is not None and rays is not None, "tol and rays exclude each other: tol chooses the number of rays"),
-        (
-            order is not None and (tol, rays) != (None, None),
-            "an order fixes the amount of work: it excludes tol and rays",
-        ),
-        (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
-        (rays is not None and (rays < 1 or rays % 1), f"rays {rays}: expected a whole number above 0"),
-        (grid is not None and (pixel, size) != (None, None), "a grid has a pixel and a size: leave these out"),
-        (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
-    ):
-        if refused:
-            raise ValueError(message)
-
-
-def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights: Tensor) -> None:
-    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
-        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
-    for name, values in (("object_distances", distances), ("wavelengths", wavelengths)):
-        if values.dim() != 1 or not len(values):
-            raise ValueError(f"{name} of shape {tuple(values.shape)}; expected one axis")
-        if bool(values.isnan().any()) or bool((values == 0).any()):
-            raise ValueError(
-                f"{name} {values.tolist()}; expected numbers other than 0 and nan; give others by `{name}`"
-            )
-    if weights.shape != wavelengths.shape:
-        raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
-    if bool((weights < 0).any()) or not bool(weights.sum() > 0):
-        raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
-
-
 def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution) -> Callable[..., Psf]:
     """The function (scene, grid, weights) -> Psf that the arguments of `psf` select."""
-    share, max_bytes, progress = execution.share, execution.max_bytes, execution.progress
-    processes = share is not None and share.processes > 1
-    if processes:
+    share = execution.share if execution.share is not None and execution.share.processes > 1 else None
+    if share is not None:
         check_shares(lens, parameters)
 
     def configured(row: Model, numbers) -> Model:
         keywords = {field.name: getattr(numbers, field.name) for field in dataclasses.fields(numbers)}
         keywords = {key: number for key, number in keywords.items() if key not in ("order", "rays")}
         row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **keywords)) if keywords else row
-        if not processes:
+        if share is None:
             return row
         deal = functools.partial(shared, share=share, by_field=row.by_field)
         plain = row.plain and functools.partial(plain_rays_shared, row.plain, share)
         return dataclasses.replace(row, kernels=deal(row.kernels), lean=row.lean and deal(row.lean), plain=plain)
-
-    def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
-        with progress(rays * math.prod(batch.shape), "ray") if progress else contextlib.nullcontext() as bar:
-            halves = drt.stream_kernels(batch, pixels, rays, max_bytes=max_bytes, progress=bar and bar.update)
-        return _of_halves(*halves, weights, MODELS[name])
 
     if name == "auto":
         rungs = [row for row in _ROWS if row.is_rung and (row.traces or paraxial.has_one_focus(lens))]
@@ -383,32 +380,17 @@ def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution)
     if getattr(parameters, "rays", None) is None:
         return functools.partial(by_tolerance, model=model, tol=tol)
     rays = int(parameters.rays)
-    if max_bytes is not None and model.plain is not None:
-        return stream
-    return functools.partial(by_rays, model=model, count=rays)
+    if execution.max_bytes is None or model.plain is None:
+        return functools.partial(by_rays, model=model, count=rays)
 
+    def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
+        bars = execution.progress
+        with bars(rays * math.prod(batch.shape), "ray") if bars else contextlib.nullcontext() as bar:
+            update = bar and bar.update
+            halves = drt.stream_kernels(batch, pixels, rays, max_bytes=execution.max_bytes, progress=update)
+        return _of_halves(*halves, weights, MODELS[name])
 
-def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor, psfs: Psf) -> None:
-    """Warn LostRays of every field with a wavelength of which no ray reaches the sensor, with the ray status."""
-    dark = psfs.ray_centroid[0].detach().isnan()
-    if not bool(dark.any()):
-        return
-    dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
-    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
-    for distance, lost in zip(distances.detach(), dark, strict=True):
-        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
-        trial = with_object_distance(lens, distance)
-        warn_of_failures(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
-
-
-def _origin(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
-    """Origin of the grids on the sensor, with its derivatives: None for the axis, else (2, D, F) mm."""
-    if center == "axis":
-        return None
-    if center == "centroid" and symmetry(batch) != "round":
-        pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
-        return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
-    return chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
+    return stream
 
 
 def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
@@ -423,9 +405,6 @@ def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
         centre = in_order([centre, infinite.grid.centre], 1)
     reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
     return dataclasses.replace(merged, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)
-
-
-# -- orders ------------------------------------------------------------------------------------------------------------
 
 
 def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, order: int) -> Psf:
@@ -496,8 +475,7 @@ def _of_halves(whole: Kernels, half: Kernels, weights: Tensor | None, model: Mod
 def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
     """The first model whose kernels differ from those of the next by less than the tolerance.
 
-    Where diffraction would need too many samples (a spectrum many pixels long), the geometric model is returned with a
-    NotConverged warning.
+    Where diffraction would need too many samples, the geometric model is returned with a NotConverged warning.
     """
     here = by_tolerance(batch, pixels, weights, rungs[0], tol)
     for model in rungs[1:]:
@@ -511,19 +489,15 @@ def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Mo
             return dataclasses.replace(here, reason=reason)
         with torch.no_grad():
             gap = float(_kernel_change(above, here).max())
-        if gap <= tol and (model.waves or not _diffracts(batch, pixels, above)):
+            # Where a pixel and its blur are both narrower than two Airy discs, agreement of ray models proves nothing.
+            airy = 1.22e-3 * batch.wavelengths.max() * axial_f_number(batch.lens).max()
+            blur = 2 * safe_sqrt(above.ray_covariance[0] + above.ray_covariance[2])
+            is_diffracted = gap <= tol and bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
+        if gap <= tol and (model.waves or not is_diffracted):
             reason = f"{here.model}: its kernels differ from those of {model.name} by {gap:.1e}, within {tol:g}"
             return dataclasses.replace(here, reason=reason)
         here, below = above, here.model
     return dataclasses.replace(here, reason=f"{here.model}: {below} differs from it by {gap:.1e}, more than {tol:g}")
-
-
-def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
-    """Whether any pixel and blur are both narrower than two Airy discs: agreement of ray models then proves nothing."""
-    with torch.no_grad():
-        airy = 1.22e-3 * batch.wavelengths.max() * axial_f_number(batch.lens).max()
-        blur = 2 * safe_sqrt(light.ray_covariance[0] + light.ray_covariance[2])
-        return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
 
 
 def _estimate(model: Model, changes: list[Tensor], psfs: Psf, rounding: Tensor) -> Tensor:
@@ -549,13 +523,11 @@ def _rounding(batch: Scene, pixels: Grid, psfs: Psf, model: Model) -> Tensor:
     """Error (D, F) by rounding, at least the model's floor.
 
     Of rays: the rounding of directions over a focal length, in units of σ or of a pixel; inf if σ itself is rounding.
-    In float32 the measured error is 0.02 to 0.7 of it. Waves are summed in float64: the rounding is that of the lens
-    data, whose image is defocused by ε f and so blurred by ε f/2N.
+    Waves are summed in float64: the lens data round, which defocuses the image by ε f and so blurs it by ε f/2N.
     """
-    paraxial = first_order(batch.lens)
-    focal, f_number = (
-        t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.paraxial_working_f_number)
-    )
+    data = first_order(batch.lens)
+    numbers = data.effective_focal_length, data.paraxial_working_f_number
+    focal, f_number = (t.abs().reshape(-1)[:1] for t in numbers)
     spread = torch.finfo(psfs.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
     if model.waves:
         spread = spread / (2 * torch.where(torch.isfinite(f_number), f_number, 1.0))

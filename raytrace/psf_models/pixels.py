@@ -9,6 +9,7 @@ import torch
 from numpy.polynomial import legendre
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.maths.grid import Grid, centres, edges
 from raytrace.maths.numerics import safe_divide, safe_sqrt
@@ -47,10 +48,9 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
     y, y_edges = ((t - centroid[1][..., None])[..., :, None] for t in (y, y_edges))
     # A σ of 1e-30 mm is a point: its derivatives would overflow.
     smallest = 1e-60 if covariance.dtype == torch.float64 else 1e-16
-    both = (covariance[0] > smallest) & (covariance[-1] > smallest)
-    variance_x, variance_y = (
-        torch.where(t > smallest, t, 0.0)[..., None, None] for t in (covariance[0], covariance[-1])
-    )
+    xx, yy = covariance[0], covariance[-1]
+    both = (xx > smallest) & (yy > smallest)
+    variance_x, variance_y = (torch.where(t > smallest, t, 0.0)[..., None, None] for t in (xx, yy))
     if len(covariance) == 2:
         across, along = _sides(x, x_edges, y, y_edges, half)
         return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
@@ -60,10 +60,7 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
 
 def _sides(x: Tensor, x_edges: Tensor, y: Tensor, y_edges: Tensor, half: Tensor) -> tuple[tuple, tuple]:
     """Lower and upper edge, middle and half width of the pixels along x (..., 1, columns) and y (..., rows, 1)."""
-    return (
-        (x_edges[..., :-1], x_edges[..., 1:], x, half),
-        (y_edges[..., :-1, :], y_edges[..., 1:, :], y, half),
-    )
+    return (x_edges[..., :-1], x_edges[..., 1:], x, half), (y_edges[..., :-1, :], y_edges[..., 1:, :], y, half)
 
 
 def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
@@ -74,12 +71,7 @@ def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
 
 
 def _interval(lower: Tensor, upper: Tensor, middle: Tensor, half: Tensor, sigma: Tensor) -> Tensor:
-    """Φ(upper/σ) - Φ(lower/σ) to a few roundings of its own size; middle, half: of the same interval, all mm.
-
-    Differences of erfc on the side of a tail, of erf around the centre, and where those would cancel,
-
-        2 h φ(m) Σ_k He_2k(m) h^2k / (2k + 1)!
-    """
+    """Φ(upper/σ) - Φ(lower/σ) to a few roundings of its own size; middle, half: of the same interval, all mm."""
     a, b, m, h = (_standard(distance, sigma) for distance in (lower, upper, middle, half))
     root = 2.0**-0.5
     left = m < 0
@@ -87,7 +79,8 @@ def _interval(lower: Tensor, upper: Tensor, middle: Tensor, half: Tensor, sigma:
     wide = torch.where(near > 0, torch.erfc(near) - torch.erfc(far), torch.erf(far) - torch.erf(near))
     narrow = (h <= _NARROW) & ((h * m).abs() <= _NARROW)
     h, m = torch.where(narrow, h, 0.0), torch.where(narrow, m, 0.0)
-    # e_n = He_n(m) h^n by He_(n+1) = m He_n - n He_(n-1).
+    # Differences of erfc on the side of a tail, of erf around the centre, and where those would cancel,
+    # 2 h φ(m) Σ_k He_2k(m) h^2k / (2k + 1)!, with e_n = He_n(m) h^n by He_(n+1) = m He_n - n He_(n-1).
     q, z = h * h, h * m
     before, now, total, factorial = torch.ones_like(z), z, torch.ones_like(z), 1.0
     for n in range(1, 2 * _TERMS, 2):
@@ -112,12 +105,8 @@ class _Rotated(torch.autograd.Function):
     """The value by quadrature, its derivatives in closed form.
 
     With p the density, ∂P/∂x is p integrated over an edge; as ∂p/∂Σxx = ½ ∂²p/∂x² and ∂p/∂Σxy = ∂²p/∂x∂y (Plackett
-    1954), derivatives in the covariance are integrals over edges and values at corners. An edge is a density in
-    one coordinate times a Φ difference in the other.
-
-    Arguments: middles x (..., 1, columns) and y (..., rows, 1), the half width, Σxx, Σyy, Σxy (..., 1, 1); and the
-    edges (..., 1, columns + 1) and (..., rows + 1, 1), which move with the middles and the half width: these have the
-    derivative.
+    1954), derivatives in the covariance are integrals over edges and values at corners. Arguments: middles x (..., 1,
+    columns) and y (..., rows, 1), half width, Σxx, Σyy, Σxy (..., 1, 1); and the edges, which have no derivative.
     """
 
     generate_vmap_rule = True
@@ -163,15 +152,13 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
     batch = torch.broadcast_shapes(*(t.shape[:-2] for t in (xx, across[2], along[2])))
     narrow = narrow.expand(*batch, 1, 1)[..., 0, 0]
 
-    def chosen(mask: Tensor) -> tuple:
-        def some(t: Tensor) -> Tensor:
-            return t.expand(*batch, *t.shape[-2:])[mask] if t.dim() else t
-
-        return *(tuple(map(some, side)) for side in (across, along)), *map(some, (xx, xy, yy, det))
-
     energy = xx.new_zeros(*batch, along[2].shape[-2], across[2].shape[-1])
-    energy[narrow] = _product_rule(*chosen(narrow))
-    energy[~narrow] = _rule(*chosen(~narrow))
+    for rule, mask in ((_product_rule, narrow), (_rule, ~narrow)):
+        arguments = pytree.tree_map(
+            lambda t, mask=mask: t.expand(*batch, *t.shape[-2:])[mask] if t.dim() else t,
+            (across, along, xx, xy, yy, det),
+        )
+        energy[mask] = rule(*arguments)
     return energy
 
 
@@ -209,10 +196,8 @@ def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tenso
 
 @functools.cache
 def _count_nodes(width: int, slope: int) -> int:
-    """Gauss nodes that integrate exp(-a s - b² s²/2) over [-1, 1], b half a pixel over σ and a up to 6 b and more.
-
-    width, slope: 12 log₂ of b and of the largest a.
-    """
+    """Gauss nodes that integrate exp(-a s - b² s²/2) over [-1, 1]; width, slope: 12 log₂ of b and of the largest a."""
+    # b is half a pixel over σ, a up to 6 b and more.
     b, steepest = (2 ** (t / 12) for t in (width, slope))
     cases = (min(steepest, _CLOSE * b), _CLOSE_ERROR), (steepest, _TAIL_ERROR)
 
@@ -270,30 +255,25 @@ def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor)
 
     E(x) = ∫ p dy and E′(x) = ∫ ∂p/∂x dy over an edge, C(x): p at its upper end less p at its lower end.
     """
-    lower, upper, middle, half = other
+    lower, upper, middle, half_width = other
     sigma, slope = safe_sqrt(variance), safe_divide(xy, variance)
     s = safe_sqrt(safe_divide(det, variance))
     density, strip, energy, tilt, ends = [], [], [], [], []
     for x in side[:2]:
         shift = slope * x
         density.append(_density(x, sigma))
-        strip.append(_interval(lower - shift, upper - shift, middle - shift, half, s))
+        strip.append(_interval(lower - shift, upper - shift, middle - shift, half_width, s))
         ends.append(density[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
         energy.append(density[-1] * strip[-1])
         tilt.append(-(safe_divide(x, torch.broadcast_tensors(variance, x)[0]) * energy[-1]) - slope * ends[-1])
-    difference = 0.5 * (
-        _difference(density, side, sigma) * (strip[0] + strip[1]) + (density[0] + density[1]) * (strip[1] - strip[0])
-    )
-    return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
-
-
-def _difference(density: list, side: tuple, sigma: Tensor) -> Tensor:
-    """Density at x₁ less that at x₀; for a narrow pixel -2 p(m) exp(-h²/2) sinh(m h), which does not cancel."""
+    # The difference of densities of a narrow pixel, -2 p(m) exp(-h²/2) sinh(m h), does not cancel.
     m, h = (_standard(distance, sigma) for distance in side[2:])
     narrow = (h <= 1) & ((h * m).abs() <= 1)
     h, m = torch.where(narrow, h, 0.0), torch.where(narrow, m, 0.0)
     stable = safe_divide(-2 * _bell(m) * torch.exp(-0.5 * h * h) * torch.sinh(m * h), sigma)
-    return torch.where(narrow, stable, density[1] - density[0])
+    step = torch.where(narrow, stable, density[1] - density[0])
+    difference = 0.5 * (step * (strip[0] + strip[1]) + (density[0] + density[1]) * (strip[1] - strip[0]))
+    return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
 
 
 def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
@@ -344,12 +324,10 @@ def _pieces(a: Tensor, b: Tensor, y0: Tensor, y1: Tensor, rho: Tensor, r: Tensor
     beyond = torch.maximum(y0 - rho * peak, rho * peak - y1).clamp_min(0.0) / r.clamp_min(floor)
     R = torch.sqrt(peak * peak + beyond * beyond + _DROP)
     reach0, reach1 = (r * safe_sqrt(R * R - y * y) for y in (y0, y1))
-    first = torch.maximum(
-        torch.where(y0 > -rho * R, rho * y0 - reach0, -R), torch.where(y1 < -rho * R, rho * y1 - reach1, -R)
-    )
-    last = torch.minimum(
-        torch.where(y1 < rho * R, rho * y1 + reach1, R), torch.where(y0 > rho * R, rho * y0 + reach0, R)
-    )
+    below0, below1 = y0 > -rho * R, y1 < -rho * R
+    above0, above1 = y0 > rho * R, y1 < rho * R
+    first = torch.maximum(torch.where(below0, rho * y0 - reach0, -R), torch.where(below1, rho * y1 - reach1, -R))
+    last = torch.minimum(torch.where(above1, rho * y1 + reach1, R), torch.where(above0, rho * y0 + reach0, R))
     first, last = torch.maximum(first, a), torch.minimum(last, b)
     steps = [y / rho.clamp_min(floor) for y in (y0, y0 + _SATURATED * r, y1 - _SATURATED * r, y1)]
     return [first, last, *(torch.minimum(torch.maximum(t, first), last) for t in (peak, *steps))]

@@ -24,13 +24,12 @@ def clear_arms(scene: Scene, unit: Tensor) -> tuple[Tensor, Tensor]:
     B is A, or a multiple of it if an obstruction lies in an arm: then the second clear parts of all arms follow the
     first ones. A part that an arm does not have lies between 0 and 0. First derivatives are exact to 1e-6, second ones
     to 1e-3, where an aperture of any shape sets the edge; where rays miss a surface or are totally reflected the edge
-    has none. Clear parts and gaps shorter than a step of the scan, 1/32, may be missed, and gaps behind the third clear
-    part are filled: their rays are blocked one by one.
+    has none. Parts and gaps shorter than 1/32 may be missed; gaps behind the third part are filled.
     """
     arms = unit.shape[1]
     with torch.no_grad():
         step = torch.linspace(0, 1, _SCAN + 1, dtype=unit.dtype, device=unit.device)
-        passed = _clear(_clearances(scene, step[:, None, None, None, None].expand(-1, 1, 1, 1, arms), unit))
+        passed = (_clearances(scene, step[:, None, None, None, None].expand(-1, 1, 1, 1, arms), unit) >= 0).all(0)
         part = (passed & ~torch.cat([torch.zeros_like(passed[:1]), passed[:-1]])).cumsum(0).clamp_max(_MOST_PARTS)
         count = max(1, int(part.max()))
         here = torch.cat([passed & (part == number + 1) for number in range(count)], -1)
@@ -64,10 +63,7 @@ def between(inner: Tensor, outer: Tensor, unit: Tensor, *, rings: int) -> tuple[
 
 
 def _clearances(scene: Scene, radii: Tensor, unit: Tensor) -> Tensor:
-    """Clearances (C + 1, K, D, F, W, B) at radii (K, D, F, W, B) of the arms; the last is ±1: whether the ray arrives.
-
-    Axes D, F and W of radii may be 1.
-    """
+    """Clearances (C + 1, K, D, F, W, B) at radii (K, D, F, W, B) of the arms; the last: ±1, whether the ray arrives."""
     points = torch.stack([(radii * direction).movedim(0, -2).flatten(-2) for direction in unit])
     _, crossed, met = trace_apertures(scene, points)
     arrives = torch.where(met, 1.0, -1.0).to(radii.dtype)
@@ -75,22 +71,14 @@ def _clearances(scene: Scene, radii: Tensor, unit: Tensor) -> Tensor:
     return clearances.unflatten(-1, (len(radii), unit.shape[1])).movedim(-2, 1)
 
 
-def _clear(clearances: Tensor) -> Tensor:
-    return (clearances >= 0).all(0)
-
-
 def _edges(scene: Scene, passes: Tensor, blocked: Tensor, unit: Tensor) -> Tensor:
-    """Zeros (2, D, F, W, B) of the clearance between radii that pass and those that are blocked.
-
-    Newton's step with a constant slope s has the error (1 - c'/s)(ρ - ρ₀) to first order, in the value as in its
-    derivatives by any number of the lens: two steps leave the square of the error of s.
-    """
+    """Zeros (2, D, F, W, B) of the clearance between radii that pass and those that are blocked."""
     with torch.no_grad():
         share = torch.linspace(0, 1, _SECTIONS + 1, dtype=passes.dtype, device=passes.device)
         for _ in range(_ZOOMS):
             radii = passes + share[:, None, None, None, None, None] * (blocked - passes)
             clearances = _clearances(scene, radii.flatten(0, 1), unit).unflatten(1, radii.shape[:2])
-            index = _clear(clearances)[1:].to(torch.int64).cumprod(0).sum(0)[None]
+            index = (clearances >= 0).all(0)[1:].to(torch.int64).cumprod(0).sum(0)[None]
             pair = index, (index + 1).clamp_max(_SECTIONS)
             passes, blocked = (radii.gather(0, at)[0] for at in pair)
         inside, outside = (clearances.gather(1, at.expand(len(clearances), *at.shape))[:, 0] for at in pair)
@@ -98,6 +86,7 @@ def _edges(scene: Scene, passes: Tensor, blocked: Tensor, unit: Tensor) -> Tenso
         lowest, number = outside.min(0, keepdim=True)
         slope = safe_divide((outside - inside).gather(0, number)[0], blocked - passes)
         slope = torch.where(((lowest < 0) & (number < len(clearances) - 1))[0], slope, 0.0)
+    # A step with a constant slope has the error (1 - c'/s)(ρ - ρ₀) to first order, in value and derivatives.
     radius = passes
     for _ in range(2):
         radius = radius - safe_divide(_clearances(scene, radius, unit).gather(0, number)[0], slope)

@@ -118,22 +118,22 @@ def unfold(grid: Grid, values: Tensor) -> Tensor:
     return values[..., index]
 
 
+def _offsets(rows: int, columns: int) -> list[np.ndarray]:
+    """y and x (rows, columns) of the centres of the pixels, in pixels."""
+    return np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in (rows, columns)), indexing="ij")
+
+
 @functools.lru_cache(maxsize=16)
 def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (U, 2) in pixels of the distinct pixels, 0 <= a <= b; and the index of each pixel among them, (rows,
-    columns).
-    """
-    y, x = np.abs(np.arange(rows) - 0.5 * (rows - 1)), np.abs(np.arange(columns) - 0.5 * (columns - 1))
-    pair = np.sort(np.stack(np.broadcast_arrays(y[:, None], x[None, :]), -1), -1)
+    """Centres (U, 2) in pixels of the distinct pixels, 0 <= a <= b, and the index of each pixel in them."""
+    pair = np.sort(np.abs(np.stack(_offsets(rows, columns), -1)), -1)
     places, index = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
     return places, index.reshape(rows, columns)
 
 
 @functools.lru_cache(maxsize=16)
 def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Chebyshev radii (K,) in pixels; and the matrices (U, K) to pixels and (2, K) to the second moments of all of them
-    along x and y, by Gauss-Legendre nodes.
-    """
+    """Chebyshev radii (K,) in pixels; matrices (U, K) to pixels and (2, K) to the second moments along x and y."""
     corner = 0.5 * math.hypot(rows, columns)
     angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
     terms = 2 * np.arange(count)
@@ -151,24 +151,17 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     twice = 2 * (2 * np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0) ** 2 - 1)
     previous, current = 0.5 * twice, np.ones_like(twice)  # T_-2 = T_2, T_0
     pixels, second = np.empty((len(places), count)), np.empty((2, count))
-    share_of_x, share_of_y = _squares(rows, columns, x, y, weight)
+    # Weights (U, A, A) of ∬ I x² and ∬ I y²: a pixel with |x| > |y| on the sensor is the image of one exchanged.
+    (height, width), index = np.abs(_offsets(rows, columns)), _distinct(rows, columns)[1]
+    upright = width <= height
+    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (upright, ~upright))
+    xx, yy, rule = x[:, :, None] ** 2, y[:, None, :] ** 2, weight[:, None] * weight
+    squares = rule * (as_is * xx + exchanged * yy), rule * (as_is * yy + exchanged * xx)
     for m in range(count):
         pixels[:, m] = np.einsum("uab,a,b->u", current, weight, weight, optimize=True)
-        second[:, m] = [np.einsum("uab,uab->", current, share, optimize=True) for share in (share_of_x, share_of_y)]
+        second[:, m] = [np.einsum("uab,uab->", current, share, optimize=True) for share in squares]
         previous, current = current, twice * current - previous
     return corner * np.cos(angle), pixels @ series, second @ series
-
-
-def _squares(rows: int, columns: int, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Weights (U, A, A) by which an intensity at the nodes of the distinct pixels gives ∬ I x² and ∬ I y².
-
-    x, y: (U, A) of `_distinct`, x <= y: a pixel with |x| > |y| on the sensor is the image of one with both exchanged.
-    """
-    upright = np.abs(np.arange(columns) - 0.5 * (columns - 1)) <= np.abs(np.arange(rows) - 0.5 * (rows - 1))[:, None]
-    index = _distinct(rows, columns)[1]
-    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (upright, ~upright))
-    x, y, rule = x[:, :, None] ** 2, y[:, None, :] ** 2, weight[:, None] * weight
-    return rule * (as_is * x + exchanged * y), rule * (as_is * y + exchanged * x)
 
 
 @functools.lru_cache(maxsize=16)
@@ -181,15 +174,12 @@ def _ring_table(rows: int, columns: int) -> np.ndarray:
     places = _distinct(rows, columns)[0]
     # Share of a ring in the quadrant rectangle [0, a] × [0, b]: from acos(a/r) to asin(b/r).
     edges = np.unique(np.concatenate([places - 0.5, places + 0.5]))
-    arc = {edge: np.sign(edge) * np.arcsin(np.minimum(1.0, abs(edge) / r)) for edge in edges}
+    arc = {edge: np.arcsin(np.minimum(1.0, abs(edge) / r)) for edge in edges}
 
-    def corner_share(a: float, b: float) -> np.ndarray:
-        share = np.maximum(0.0, np.abs(arc[a]) + np.abs(arc[b]) - 0.5 * np.pi) / (2 * np.pi)
-        return np.sign(a) * np.sign(b) * share
+    def below(a: float, b: float) -> np.ndarray:
+        return np.sign(a) * np.sign(b) * np.maximum(0.0, arc[a] + arc[b] - 0.5 * np.pi) / (2 * np.pi)
 
-    shares = []
-    for a, b in places:
-        (a0, a1), (b0, b1) = (a - 0.5, a + 0.5), (b - 0.5, b + 0.5)
-        shares.append(corner_share(a1, b1) - corner_share(a0, b1) - corner_share(a1, b0) + corner_share(a0, b0))
+    corners = ((a - 0.5, a + 0.5, b - 0.5, b + 0.5) for a, b in places)
+    shares = [below(a1, b1) - below(a0, b1) - below(a1, b0) + below(a0, b0) for a0, a1, b0, b1 in corners]
     steps = np.stack(shares, -1).reshape(count, fine, -1).mean(1) / _STEPS
     return np.concatenate([np.zeros((1, len(places))), np.cumsum(steps, 0)])

@@ -11,7 +11,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, axis, cell, number, numbers
+from raytrace.maths.result import Column, Result, axis, flat, number, numbers, text_table
 from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.tracing.spot import where_lit
@@ -65,7 +65,7 @@ class Kernels:
     @property
     def dark(self) -> Tensor:
         """Which kernels no traced ray reaches, (D, F, W): their moments are 0, without meaning."""
-        return _is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
+        return _is_dark(self, *self.ray_moments, of_waves=self.ray_centroid is not None)
 
 
 @value
@@ -126,8 +126,21 @@ class Psf(Result):
 
         return psf_grid(self, **options)
 
+    @property
+    def COLUMNS(self) -> Sequence[Column]:
+        field = FIELD_UNITS[self.lens.fields.kind]
+        return (
+            Column("object_distance", "mm", ">12g", "object"), Column("field_x", field),
+            Column("field_y", field, ">9g", "field"), Column("wavelength", "µm", ">9g", "λ"),
+            *(Column(f"centroid_{a}", "mm", ">12.6f", f"centroid {a}") for a in "xy"),
+            *(Column(f"sigma_{a}_um", "µm", ">9.4f", f"σ {a}") for a in "xy"),
+            *(Column(f"ray_sigma_{a}_um", "µm", ">9.4f", f"rays' σ {a}") for a in "xy"),
+            Column("energy", "", ">8.4f", "energy\nwindow"), Column("error", "", ">9.1e", "error\nest."),
+            Column("rays", "", ">7.0f"),
+        )  # fmt: skip
+
     def columns(self) -> dict[str, Tensor]:
-        """A row for every kernel: mm, widths of the light before pixels."""
+        """A row for every kernel: widths of the light before pixels, of waves also those of their rays."""
         axes = self.energy.dim()
         colours = {} if self.wavelengths_summed else {"wavelength": axis(self.wavelengths, 2, axes)}
         return {
@@ -135,9 +148,11 @@ class Psf(Result):
             **{f"field_{a}": axis(field, 1, axes) for a, field in zip("xy", self.fields, strict=True)},
             **colours,
             **{f"centroid_{a}": t for a, t in zip("xy", self.centroid, strict=True)},
-            **{f"sigma_{a}": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
+            **{f"sigma_{a}_um": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
+            **{f"ray_sigma_{a}_um": t for a, t in zip("xy", _sigmas(self.ray_covariance), strict=True) if self.waves},
             "energy": self.energy,
             "error": self.error,
+            "rays": torch.tensor(self.rays, device=self.energy.device),
         }
 
     def document(self) -> dict:
@@ -153,15 +168,14 @@ class Psf(Result):
 
     def _entry(self, place: tuple[int, ...]) -> dict:
         at = (slice(None), *place)
+        xx_xy_yy = {"covariance": self.covariance[at], "ray_covariance": self.ray_covariance[at]}
         return {
             "object_distance": number(self.object_distances[place[0]]),
             "field": numbers(self.fields[:, place[1]]),
             **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
-            **{key: numbers(getattr(self, key)[at]) for key in ("centroid", "ray_centroid")},
-            **{  # [[xx, xy], [xy, yy]]
-                key: [numbers(getattr(self, key)[at][:2]), numbers(getattr(self, key)[at][1:])]
-                for key in ("covariance", "ray_covariance")
-            },
+            "centroid": numbers(self.centroid[at]),
+            "ray_centroid": numbers(self.ray_centroid[at]),
+            **{key: [numbers(moments[:2]), numbers(moments[1:])] for key, moments in xx_xy_yy.items()},
             "energy": number(self.energy[place]),
             "error": number(self.error[place]),
             "residual": None if self.residual is None else number(self.residual[place]),
@@ -184,21 +198,11 @@ class Psf(Result):
         lines += [self.reason] if self.reason else []
         if self.waves:
             lines.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
-        sigmas, rays = (1000 * _sigmas(covariance) for covariance in (self.covariance, self.ray_covariance))
-        columns = [("centroid x", "mm", 12, self.centroid[0], ".6f"), ("centroid y", "mm", 12, self.centroid[1], ".6f")]
-        columns += [("σ x", "µm", 9, sigmas[0], ".4f"), ("σ y", "µm", 9, sigmas[1], ".4f")]
-        if self.waves:
-            columns += [("rays' σ x", "µm", 9, rays[0], ".4f"), ("rays' σ y", "µm", 9, rays[1], ".4f")]
-        columns += [("energy", "window", 8, self.energy, ".4f"), ("error", "est.", 9, self.error, ".1e")]
-        first = [("object", "mm", 12), ("field", FIELD_UNITS[self.lens.fields.kind], 9), ("λ", "µm", 9)]
-        first = first[: self.energy.dim()]
-        headings = [*first, *(column[:3] for column in columns), ("rays", "", 7)]
-        lines += [" ".join(f"{heading[k]:>{heading[2]}}" for heading in headings) for k in (0, 1)]
-        for at in np.ndindex(self.energy.shape):
-            cells = [f"{float(self.object_distances[at[0]]):g}", name_of_field(self.fields[:, at[1]])]
-            cells += [f"{float(self.wavelengths[w]):g}" for w in at[2:]]
-            cells += [cell(float(values[at]), form) for *_, values, form in columns] + [f"{self.rays}"]
-            lines.append(" ".join(f"{text:>{heading[2]}}" for text, heading in zip(cells, headings, strict=True)))
+        listed = flat(self.columns())
+        fields = torch.stack([*map(torch.as_tensor, (listed.pop("field_x"), listed["field_y"]))], 1)
+        listed["field_y"] = [*map(name_of_field, fields)]
+        listed["object_distance"] = [f"{distance:g}" for distance in listed["object_distance"]]
+        lines += text_table({self.column(name): values for name, values in listed.items()})
         if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
             lines.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
         return "\n".join(lines)
@@ -214,8 +218,8 @@ class Psf(Result):
 
 
 def _sigmas(covariance: Tensor) -> Tensor:
-    """σ_x and σ_y (2, ...); nan where there is no light."""
-    return covariance[::2].clamp_min(0.0).sqrt()
+    """σ_x and σ_y (2, ...) in µm; nan where there is no light."""
+    return 1e3 * covariance[::2].clamp_min(0.0).sqrt()
 
 
 def combined(parts: Sequence, join: Callable[[list[Tensor], int], Tensor]):
@@ -235,13 +239,11 @@ def centroid_and_covariance(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor
 
 
 def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) and covariance (3, ...) of all light of K distributions (2, ..., K), (3, ..., K).
-
-    energy: (..., K), theirs.
+    """Centroid (2, ...) and covariance (3, ...) of the light of K distributions, (2, ..., K) and (3, ..., K).
 
         m = Σ_k s_k m_k,   C = Σ_k s_k (C_k + (m_k - m)(m_k - m)ᵀ),   s_k = E_k / Σ E
 
-    Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
+    Nothing large is subtracted (Chan, Golub and LeVeque, Stanford STAN-CS-79-773, 1979, eq. 2.1).
     """
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
     mean, apart = centroid_and_covariance(*centroid, share)
@@ -250,7 +252,7 @@ def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tenso
 
 def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
     """Sum over wavelengths by their weights, with the moments of the sum of the distributions; None keeps each."""
-    window_moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
+    moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
     waves = kernels.ray_centroid is not None
     kernel, energy, residual, arrived = kernels.kernel, kernels.energy, kernels.residual, kernels.arrived
     if weights is not None:
@@ -259,44 +261,28 @@ def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
         residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
         rays = mixture(torch.where(kernels.dark, 0.0, share), *rays)
         # The light inside a window counts by its energy there.
-        window_moments = mixture(share * energy, *window_moments) if waves else rays
+        moments = mixture(share * energy, *moments) if waves else rays
         energy = kernel.sum((-2, -1))
     centre = kernels.grid.centre if kernels.grid.centre.dim() == 1 else kernels.grid.centre[..., 0]
-    return Psf(
-        kernel=kernel,
-        grid=dataclasses.replace(kernels.grid, centre=centre),
-        energy=energy,
-        error=torch.full_like(energy.detach(), torch.nan),
-        centroid=window_moments[0],
-        covariance=window_moments[1],
-        ray_centroid=rays[0],
-        ray_covariance=rays[1],
-        residual=residual,
-        arrived=arrived,
-        model=model,
-        waves=waves,
-        rays=kernels.rays,
-    )
+    grid, error = dataclasses.replace(kernels.grid, centre=centre), torch.full_like(energy.detach(), torch.nan)
+    light = {"residual": residual, "arrived": arrived, "model": model, "waves": waves, "rays": kernels.rays}
+    return Psf(kernel, grid, energy, error, *moments, *rays, **light)
 
 
 def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
     """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
-    rays = psfs.ray_centroid, psfs.ray_covariance
-    dark = _is_dark(psfs.kernel, *rays, psfs.rays, of_waves=psfs.waves)
+    moments = {"centroid": psfs.centroid, "covariance": psfs.covariance}
+    moments |= {"ray_centroid": psfs.ray_centroid, "ray_covariance": psfs.ray_covariance}
+    dark = _is_dark(psfs, psfs.ray_centroid, psfs.ray_covariance, of_waves=psfs.waves)
     if empty == "error" and bool(dark.any()):
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
-        raise EmptyPsf(
-            f"no ray reaches the sensor in {int(dark.sum())} of {dark.numel()} PSFs, those of index {places}"
-        )
-    names = "centroid", "covariance", "ray_centroid", "ray_covariance"
-    lit = where_lit(~dark, *(getattr(psfs, name) for name in names), empty=empty)
-    return dataclasses.replace(psfs, **dict(zip(names, lit, strict=True)))
+        dark_of_all = f"{int(dark.sum())} of {dark.numel()}"
+        raise EmptyPsf(f"no ray reaches the sensor in {dark_of_all} PSFs, those of index {places}")
+    lit = where_lit(~dark, *moments.values(), empty=empty)
+    return dataclasses.replace(psfs, **dict(zip(moments, lit, strict=True)))
 
 
-def _is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
-    """Which kernels (..., rows, columns) no ray reaches: their light and the moments of their rays are all exactly 0.
-
-    Light outside the window has a centroid. of_waves: whose reference, the chief ray, has one in any case.
-    """
-    empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
-    return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)
+def _is_dark(light: Kernels | Psf, centroid: Tensor, covariance: Tensor, *, of_waves: bool) -> Tensor:
+    """Which kernels no ray reaches: light and moments of rays are exactly 0, but the reference of waves, a centroid."""
+    empty = (light.kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
+    return empty & (of_waves | (centroid == 0).all(0)) & (light.rays > 0)

@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
@@ -41,8 +42,7 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
         if math.prod(cut) == 1:
             return kernels(scene, grid, **options)
         # Processes beyond the number of blocks repeat a block, so that all take part in all decisions.
-        block = _block(scene.shape, cut, share.rank % math.prod(cut))
-        distances, fields, wavelengths = block
+        distances, fields, wavelengths = block = _block(scene.shape, cut, share.rank % math.prod(cut))
         part = dataclasses.replace(
             scene,
             lens=with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[distances]),
@@ -99,8 +99,5 @@ def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int,
 
 def _block(shape: Sequence[int], cut: Sequence[int], number: int) -> tuple[slice, ...]:
     """Block `number` of the axes of `shape` divided into `cut` parts."""
-    slices = []
-    for count, parts in zip(reversed(shape), reversed(cut), strict=True):
-        number, part = divmod(number, parts)
-        slices.append(Share(part, parts).part(count))
-    return tuple(reversed(slices))
+    axes = zip(np.unravel_index(number, cut), cut, shape, strict=True)
+    return tuple(Share(int(part), parts).part(count) for part, parts, count in axes)

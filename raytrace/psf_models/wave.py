@@ -22,20 +22,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.psf_models.dft import (
-    afford_rings,
-    afford_sensor,
-    disc_rule,
-    integrate,
-    nodes_per_pixel,
-    phasor,
-    rings_and_arms,
-    rings_to_grid,
-    sub_pixels,
-    to_grid,
-    to_grid_mirrored,
-    window_moments,
-)
+from raytrace.psf_models import dft
 from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves
 from raytrace.psf_models.result import Kernels, combined
@@ -45,6 +32,7 @@ from raytrace.tracing.wavefront import Wavefront, wavefront_of
 _MOST_RAYS = 400_000  # rays of one kernel; beyond, the phase is refused
 _DEGREE = 10  # of the map from the pupil to directions
 _TERMS = (_DEGREE + 1) * (_DEGREE + 2) // 2  # its Zernike terms
+_ORDERS = [zernike.noll(j) for j in range(1, _TERMS + 1)]
 _PROBE = 8, 32  # rings and arms of the rays that find the map and the sampling
 _RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
 
@@ -65,22 +53,30 @@ class Waves:
 def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
     """Kernels of the wave model; a kernel whose light is vignetted altogether is 0 with gradient 0.
 
-    order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error. centroid and covariance
-    are those of the light inside the window, ray_centroid and ray_covariance those of the rays: the mean of the whole
-    wave is theirs (Ehrenfest), its second moment does not exist behind a hard edge. residual: size of the terms that
-    Debye's integral neglects. Raises ValueError where the window or the blur would need too many rays.
+    order: from -2 on; each one adds rays and pixel nodes. centroid and covariance are those of the light inside the
+    window, ray_centroid and ray_covariance those of the rays: the mean of the whole wave is theirs (Ehrenfest), its
+    second moment does not exist behind a hard edge. residual: size of the terms that Debye's integral neglects. Raises
+    ValueError where the window or the blur would need too many rays.
     """
-    return by_field(scene, grid, lambda part, window: _field_kernels(part, window, order))
+
+    def of_field(part: Scene, window: Grid) -> Kernels:
+        probe = probe_of(part)
+        points = sensor_points(part, probe, window, order, is_round=symmetry(part) == "round")
+        light = waves(part, points.corner, order=order, probe=probe)
+        kernel, centroid, covariance = points.integrated(light, probe)
+        residual = _debye_residual(light.wavefront, probe, points.corner)
+        rays = light.amplitude.shape[-1]
+        return Kernels(kernel, window, centroid, covariance, rays, residual, *_moments(light))
+
+    return by_field(scene, grid, of_field)
 
 
 def by_field(scene: Scene, grid: Grid, compute: Callable[[Scene, Grid], Kernels]) -> Kernels:
     """Kernels field by field, in double precision: in single precision the OPD itself is known to 1/400 wave only."""
-    fields = []
+    fields, centre = [], grid.centre
     for f in range(scene.shape[1]):
-        centre = grid.centre
-        if centre.dim() > 1 and centre.shape[2] > 1:
-            centre = centre[:, :, f : f + 1]
-        window = to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)
+        at = centre[:, :, f : f + 1] if centre.dim() > 1 and centre.shape[2] > 1 else centre
+        window = to(dataclasses.replace(grid, centre=at), dtype=torch.float64)
         fields.append(compute(one_field(scene, f), window))
     merged = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
     return dataclasses.replace(to(merged, dtype=grid.pitch.dtype), grid=grid)
@@ -105,14 +101,14 @@ def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
     front = waves.wavefront
     wavelength = 1e-3 * front.wavelength
     L, M, _ = front.direction
-    field = waves.amplitude * phasor(front.opd / wavelength[:, None])
+    field = waves.amplitude * dft.phasor(front.opd / wavelength[:, None])
     inside = (wavelength / front.index).expand(field.shape[:-1])
     if waves.symmetry == "round":
-        U = rings_to_grid(field, safe_sqrt(L * L + M * M), x, y, inside)
+        U = dft.rings_to_grid(field, safe_sqrt(L * L + M * M), x, y, inside)
     elif waves.symmetry == "mirror":
-        U = to_grid_mirrored(0.5 * field, L, M, x, y, inside)
+        U = dft.to_grid_mirrored(0.5 * field, L, M, x, y, inside)
     else:
-        U = to_grid(field, L, M, x, y, inside)
+        U = dft.to_grid(field, L, M, x, y, inside)
     return U / inside[..., None, None]
 
 
@@ -122,8 +118,27 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient: to first order the
     value does not depend on it. 0 where no light arrives.
     """
-    ratios = [_strehl(one_field(scene, f), order) for f in range(scene.shape[1])]
-    return torch.cat(ratios, 1).to(scene.wavelengths.dtype)
+    return torch.cat([_strehl(one_field(scene, f), order) for f in range(scene.shape[1])], 1).to(scene.wavelengths)
+
+
+def _strehl(scene: Scene, order: int) -> Tensor:
+    probe = probe_of(scene)
+    spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
+    light = waves(scene, 20 * spacing.max(), order=order + 1, probe=probe)
+    front = light.wavefront
+    with torch.no_grad():
+        x, y = _moments(light)[0] - front.centre[:2]
+        offsets = torch.arange(-16, 17, dtype=x.dtype, device=x.device)
+        for _ in range(8):
+            near_x, near_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
+            U = amplitude(light, near_x, near_y)
+            best = (U.real**2 + U.imag**2).flatten(-2).argmax(-1, keepdim=True)
+            x = torch.gather(near_x, -1, best % len(offsets))[..., 0]
+            y = torch.gather(near_y, -1, best // len(offsets))[..., 0]
+            spacing = spacing / 8
+    U = amplitude(light, x[..., None], y[..., None])[..., 0, 0]
+    peak = light.amplitude.sum(-1) / (1e-3 * front.wavelength / front.index)
+    return safe_divide(U.real**2 + U.imag**2, peak**2)
 
 
 def phase_along_radius(
@@ -139,16 +154,6 @@ def phase_along_radius(
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1, keepdim=True)
         phase = 2e3 * math.pi * (probe.index / probe.wavelength)[:, None] * spread * (blur + reach)
         return float(largest(phase.max()))
-
-
-def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
-    """Kernels (D, 1, W, rows, columns) of one field."""
-    probe = probe_of(scene)
-    points = sensor_points(scene, probe, grid, order, is_round=symmetry(scene) == "round")
-    light = waves(scene, points.corner, order=order, probe=probe)
-    kernel, centroid, covariance = points.integrated(light, probe)
-    residual = _debye_residual(light.wavefront, probe, points.corner)
-    return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1], residual, *_moments(light))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,8 +177,8 @@ class SensorPoints:
         intensity = U.real**2 + U.imag**2
         if self.weight is None:
             return light_of_radii(self.grid, self.cutoff, self.order, intensity[..., 0, :])
-        kernel = integrate(intensity, self.weight, self.grid.pitch)
-        centroid, covariance = window_moments(intensity, self.x, self.y, self.weight, self.grid.pitch)
+        kernel = dft.integrate(intensity, self.weight, self.grid.pitch)
+        centroid, covariance = dft.window_moments(intensity, self.x, self.y, self.weight, self.grid.pitch)
         return kernel, centroid + probe.centre[:2], covariance
 
 
@@ -184,9 +189,9 @@ def sensor_points(scene: Scene, probe: Wavefront, grid: Grid, order: int, *, is_
         x, _ = radii_of_waves(grid, cutoff, order)
         return SensorPoints(grid, cutoff, order, x, torch.zeros_like(x[:1]), None, x.detach().max())
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
-    nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
-    afford_sensor("the wave PSF", scene, grid, nodes)
-    x, y, weight = sub_pixels(Grid(grid.pitch, grid.rows, grid.columns, centre), nodes)
+    nodes = dft.nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
+    dft.afford_sensor("the wave PSF", scene, grid, nodes)
+    x, y, weight = dft.sub_pixels(Grid(grid.pitch, grid.rows, grid.columns, centre), nodes)
     corner = scene.largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
     return SensorPoints(grid, cutoff, order, x, y, weight, corner)
 
@@ -202,29 +207,26 @@ def _moments(light: Waves) -> tuple[Tensor, Tensor]:
     front = light.wavefront
     share = safe_divide(front.energy, front.energy.sum(-1, keepdim=True))
     x, y = torch.where(front.valid, front.landing, 0.0)
+    zero = torch.zeros_like(share[..., 0])
     if light.symmetry == "round":
-        variance, zero = 0.5 * (share * (x * x + y * y)).sum(-1), torch.zeros_like(share[..., 0])
+        variance = 0.5 * (share * (x * x + y * y)).sum(-1)
         return front.centre[:2], torch.stack([variance, zero, variance])
-    mean_x, mean_y = (share * x).sum(-1), (share * y).sum(-1)
-    if light.symmetry == "mirror":
-        mean_x = torch.zeros_like(mean_x)
+    is_mirrored = light.symmetry == "mirror"
+    mean_x, mean_y = zero if is_mirrored else (share * x).sum(-1), (share * y).sum(-1)
     x, y = x - mean_x[..., None], y - mean_y[..., None]
-    xy = torch.zeros_like(mean_x) if light.symmetry == "mirror" else (share * x * y).sum(-1)
+    xy = zero if is_mirrored else (share * x * y).sum(-1)
     covariance = torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
     return front.centre[:2] + torch.stack([mean_x, mean_y]), covariance
 
 
 def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tensor:
-    """Relative L1 error (...) of neglecting in |q - p| - R the term beyond L x + M y, π n (s·p)²/(|R| λ) of phase.
-
-    Over the window or the blur b, and directions up to s, the mean of (s·p)² is b² s²/8; a fifth allows for light that
-    gathers at the rim. Where the phase is large it only moves rays, by up to b² s/|R|, which changes densities by
-    up to 6 b s/|R|. Against sums of wavelets on the exit pupil it is 1 to 10 times the true error out of focus.
-    """
+    """Relative L1 error (...) of neglecting in |q - p| - R the term beyond L x + M y, π n (s·p)²/(|R| λ) of phase."""
     with torch.no_grad():
         spread = half_spread(probe)
         wavelength = 1e-3 * front.wavelength / front.index
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
+        # Over the window or the blur b, and directions up to s, the mean of (s·p)² is b² s²/8; a fifth allows for light
+        # at the rim. Where the phase is large it only moves rays, by up to b² s/|R|: densities by up to 6 b s/|R|.
         b = torch.minimum(corner, blur + wavelength / spread.clamp_min(1e-30))
         stretch = b * spread / front.radius.abs()
         return torch.minimum(0.2 * math.pi * b * spread / wavelength, torch.full_like(b, 6.0)) * stretch
@@ -238,13 +240,9 @@ def half_spread(front: Wavefront) -> Tensor:
     return torch.where(front.usable, torch.hypot(dL, dM), 0.0).amax(-1)
 
 
-def _orders() -> list[tuple[int, int]]:
-    return [zernike.noll(j) for j in range(1, _TERMS + 1)]
-
-
 def _direction_map(probe: Wavefront) -> Tensor:
     """Zernike coefficients (2, ..., J) of L and M over the pupil; 0 where too few rays come through."""
-    basis = zernike.polynomials(_orders(), *probe.pupil)
+    basis = zernike.polynomials(_ORDERS, *probe.pupil)
     enough = probe.usable.sum(-1, keepdim=True) >= 2 * _TERMS
     weights = torch.where(probe.usable | ~enough, probe.weights, 0.0)
     directions = torch.where(probe.usable & enough, probe.direction[:2], 0.0)
@@ -270,20 +268,19 @@ def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     i, j = np.array([(n - k, k) for n in range(_DEGREE + 1) for k in range(n + 1)]).T
     points, _ = gauss_rings(2 * _DEGREE, 4 * _DEGREE)
     x, y = points.numpy()[:, :, None]
-    values = zernike.polynomials(_orders(), *points).numpy()
+    values = zernike.polynomials(_ORDERS, *points).numpy()
     return np.linalg.lstsq(x**i * y**j, values.T, rcond=None)[0].T, i, j
 
 
 def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -> tuple[Tensor, Tensor]:
-    """Pupil points (2, P) and weights (P,): Gauss rings; where light is lost, (2, D, F, W, P) and (D, F, W, P) over the
-    clear part of every arm."""
+    """Pupil points (2, P) and weights (P,), or (2, D, F, W, P) and (D, F, W, P) over the clear part of every arm."""
     like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
-    rings, arms = rings_and_arms(phase, order)
+    rings, arms = dft.rings_and_arms(phase, order)
     if fold == "round":
-        afford_rings("the wave PSF", scene, rings, phase)
+        dft.afford_rings("the wave PSF", scene, rings, phase)
         arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
     else:
-        points, weights = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
+        points, weights = dft.disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
     unit = points[:, :arms] / torch.hypot(*points[:, :arms])
     if fold == "mirror":
         right = points[0] > 0
@@ -292,26 +289,6 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
         if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
     return between(*clear_arms(scene, unit), unit, rings=rings)
-
-
-def _strehl(scene: Scene, order: int) -> Tensor:
-    probe = probe_of(scene)
-    spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
-    light = waves(scene, 20 * spacing.max(), order=order + 1, probe=probe)
-    front = light.wavefront
-    with torch.no_grad():
-        x, y = _moments(light)[0] - front.centre[:2]
-        offsets = torch.arange(-16, 17, dtype=x.dtype, device=x.device)
-        for _ in range(8):
-            near_x, near_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
-            U = amplitude(light, near_x, near_y)
-            best = (U.real**2 + U.imag**2).flatten(-2).argmax(-1, keepdim=True)
-            x = torch.gather(near_x, -1, best % len(offsets))[..., 0]
-            y = torch.gather(near_y, -1, best // len(offsets))[..., 0]
-            spacing = spacing / 8
-    U = amplitude(light, x[..., None], y[..., None])[..., 0, 0]
-    peak = light.amplitude.sum(-1) / (1e-3 * front.wavelength / front.index)
-    return safe_divide(U.real**2 + U.imag**2, peak**2)
 
 
 def one_field(scene: Scene, f: int) -> Scene:

@@ -60,15 +60,12 @@ class Edge(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A shape of apertures; its numbers are sizes in mm, and have no derivatives: an edge is hard.
+    """A shape of apertures; its numbers are sizes in mm, without derivatives: an edge is hard.
 
-    edges: x, y (...) mm from its centre and its sizes -> the edges, within all of which it lies.
-    reach: sizes -> from which to which |y| it extends in the cross section.
-    symmetry: "round", "mirror" (in x and y) or "none".
-    zemax: keywords of a .zmx file for it as an aperture and as an obscuration.
-    code: of tracing/cpp/apertures.h; None: clipped by torch alone.
-    sizes: how many numbers it has, of 0 or more; None: points x, y, as many as there are, from 3 on.
-    is_hollow: sizes -> whether light may be stopped within it.
+    edges: x, y (...) mm from its centre, and sizes -> its edges; reach: sizes -> range of |y| in the cross section;
+    symmetry: "round", "mirror" (in x and y) or "none"; zemax: keywords of a .zmx file as aperture and obscuration;
+    code: of tracing/cpp/apertures.h, None: clipped by torch alone; sizes: count of sizes, each at least 0, None: three
+    or more points x, y; is_hollow: sizes -> whether light may be blocked inside it.
     """
 
     edges: Callable[[Tensor, Tensor, Sequence[float]], list[Edge]]

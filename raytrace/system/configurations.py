@@ -30,14 +30,14 @@ class ScaledPath(NamedTuple):
 
 @value
 class Operand:
-    """A number, glass or word of a lens that differs from one configuration to the next.
+    """A number, glass or word of a lens that differs between configurations.
 
-    name, number, parameter: as OpticStudio has it, "THIC" of surface `number`, "PRAM" of a surface and a parameter,
-        "YFIE" of a field point; 0 where the operand has none.
-    paths: where the lens holds it; none of an operand that says nothing about rays, as the weight of a configuration.
-    numbers: (C,) as the lens holds them, mm or degrees, a value a configuration; or
-    media: a glass each; or words: for each configuration what stands in every place.
-    refusal: why it is not followed; a configuration in which it differs is refused.
+    name, number, parameter: of OpticStudio, "THIC" of surface `number`, "PRAM" of a surface and a parameter, "YFIE" of
+        a field point; 0 where the operand has none.
+    paths: where the lens holds it; empty if it does not affect rays, as the weight of a configuration.
+    numbers: (C,) as the lens holds them, mm or degrees, one per configuration; or media: a glass each; or words: for
+        each configuration the contents of every path.
+    refusal: why the operand is not supported; configurations in which it differs are refused.
     """
 
     name: str
@@ -57,21 +57,21 @@ class Operand:
         return f"{self.name} {numbered}".strip()
 
     def values(self) -> list:
-        """What it is in every configuration, to be shown: numbers, names of glasses or words."""
+        """Its numbers, names of glasses or words in every configuration, for display."""
         if self.numbers is not None:
             return self.numbers.detach().tolist()
         return [label(glass) for glass in self.media] or [words[0] if words else "" for words in self.words]
 
 
 def count(operands: Sequence[Operand]) -> int:
-    """How many configurations there are."""
+    """Number of configurations."""
     return max((len(operand) for operand in operands), default=1)
 
 
 def chosen(lens: Whole, number: int) -> Whole:
-    """The lens in one of its configurations, 1 to `len(lens.configurations)`, each operand at its value there.
+    """The lens in one of its configurations, 1 to `len(lens.configurations)`.
 
-    Raises ValueError for a configuration that there is not, or that differs in what is not followed.
+    Raises ValueError for a number out of range, and where an operand that is not supported differs.
     """
     last = count(lens.operands)
     if not 1 <= number <= last:
@@ -85,28 +85,35 @@ def chosen(lens: Whole, number: int) -> Whole:
 
 
 def with_operands(lens: Whole, number: int) -> Whole:
-    """The lens with every operand at its value in a configuration that there is, those aside that are not followed."""
+    """The lens with every supported operand at its value in a configuration."""
+    k = number - 1
     for operand in lens.operands:
-        lens = _with_operand(lens, operand, number - 1)
+        for position, (path, factor, offset) in enumerate(operand.paths):
+            if operand.numbers is not None:
+                plain = (factor, offset) == (1.0, 0.0)
+                part = operand.numbers[k] if plain else factor * operand.numbers[k] + offset
+            else:
+                part = operand.media[k] if operand.media else operand.words[k][position]
+            lens = with_part(lens, path, part)
     return dataclasses.replace(lens, current_configuration=number)
 
 
 def every(lens: Whole) -> tuple[Whole, ...]:
-    """The lens in all its configurations, one after the other; itself alone where it has one."""
+    """The lens in all its configurations; itself if it has one."""
     if not lens.operands:
         return (lens,)
     return tuple(chosen(lens, number) for number in range(1, count(lens.operands) + 1))
 
 
-#: Operands of OpticStudio by the number of a surface that they name.
+#: Operands of OpticStudio by the field of a surface.
 _NAMES = {"thickness": "THIC", "curvature": "CRVT", "conic": "CONN"}
 
 
 def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
     """The lens with configurations, in the first of them: `thickness={6: [12.4, 16.0]}` differs behind surface 6.
 
-    varied: by name (thickness, curvature, conic) and surface the values in mm, 1/mm, one a configuration. Raises
-    ValueError for what a lens does not have, and for numbers of values that differ.
+    varied: by name (thickness, curvature, conic) and surface the values in mm, 1/mm, one per configuration. Raises
+    ValueError for unknown names and surfaces, and for lists of different lengths.
     """
     operands = []
     for name, by_surface in varied.items():
@@ -116,34 +123,21 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
             if not 0 <= surface < len(lens.surfaces):
                 raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
             numbers = torch.as_tensor(values, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-            place = ScaledPath(("surfaces", surface, name))
-            operands.append(Operand(_NAMES[name], surface, paths=(place,), numbers=numbers))
-    if len({operand.numbers.shape for operand in operands}) > 1 or any(one.numbers.ndim != 1 for one in operands):
-        raise ValueError("expected lists of values of one length, a value a configuration")
+            path = ScaledPath(("surfaces", surface, name))
+            operands.append(Operand(_NAMES[name], surface, paths=(path,), numbers=numbers))
+    if len({operand.numbers.shape for operand in operands}) > 1 or any(row.numbers.ndim != 1 for row in operands):
+        raise ValueError("expected lists of values of one length, a value per configuration")
     return with_operands(dataclasses.replace(lens, operands=tuple(operands)), 1)
 
 
 def kept(lens: Whole) -> Whole:
-    """The lens whose operands say of its current configuration what it now holds."""
+    """The lens whose operands have, for its current configuration, the numbers that it holds."""
     operands = tuple(taken(operand, lens, lens.current_configuration - 1) for operand in lens.operands)
     return dataclasses.replace(lens, operands=operands)
 
 
 def freed(lens: Whole, **conditions) -> Whole:
     """The lens without operands for what conditions of `Lens.at` set: a condition holds in every configuration."""
-    if not lens.operands:
-        return lens
-    starts = [path for name, given in conditions.items() if given is not None for path in _set_by(name, lens)]
-
-    def is_set(operand: Operand) -> bool:
-        return any(place.path[: len(start)] == start for place in operand.paths for start in starts)
-
-    operands = (_unused(len(operand)) if is_set(operand) else operand for operand in lens.operands)
-    return dataclasses.replace(lens, operands=tuple(operands))
-
-
-def _set_by(condition: str, lens) -> tuple[Path, ...]:
-    """The paths to what a condition of `Lens.at` sets."""
     paths = {
         "object_distance": (("surfaces", 0, "thickness"),),
         "sensor_distance": (("surfaces", len(lens.surfaces) - 2, "thickness"),),
@@ -152,43 +146,34 @@ def _set_by(condition: str, lens) -> tuple[Path, ...]:
         **{name: (("environment", name),) for name in ("temperature", "pressure")},
         "wavelengths": (("wavelengths",), ("wavelength_weights",), ("primary_wavelength",)),
     }
-    return paths.get(condition, ((condition,),))
+    names = [name for name, condition in conditions.items() if condition is not None]
+    starts = [path for name in names for path in paths.get(name, ((name,),))]
 
+    def is_set(operand: Operand) -> bool:
+        return any(scaled.path[: len(start)] == start for scaled in operand.paths for start in starts)
 
-def _unused(configurations: int) -> Operand:
-    return Operand("MOFF", words=(("",),) * configurations)
-
-
-def _with_operand(lens: Whole, operand: Operand, k: int) -> Whole:
-    """The lens with an operand at its value of configuration k, from 0."""
-    for position, (path, factor, offset) in enumerate(operand.paths):
-        if operand.numbers is not None:
-            plain = (factor, offset) == (1.0, 0.0)
-            part = operand.numbers[k] if plain else factor * operand.numbers[k] + offset
-        else:
-            part = operand.media[k] if operand.media else operand.words[k][position]
-        lens = with_part(lens, path, part)
-    return lens
+    unused = (Operand("MOFF", words=(("",),) * len(row)) if is_set(row) else row for row in lens.operands)
+    return dataclasses.replace(lens, operands=tuple(unused))
 
 
 def taken(operand: Operand, lens: Whole, k: int) -> Operand:
-    """The operand that has for configuration k what the lens holds in its paths."""
+    """The operand with, for configuration k from 0, the values that the lens holds at its paths."""
     if not operand.paths or operand.refusal:
         return operand
-    held = [part(lens, place.path) for place in operand.paths]
+    parts = tuple(part(lens, scaled.path) for scaled in operand.paths)
     if operand.numbers is not None:
-        number = torch.zeros_like(operand.numbers[k]) if held[0] is None else held[0]
+        number = torch.zeros_like(operand.numbers[k]) if parts[0] is None else parts[0]
         return dataclasses.replace(operand, numbers=_with_entry(operand.numbers, (k,), number))
     if operand.media:
-        return dataclasses.replace(operand, media=(*operand.media[:k], held[0], *operand.media[k + 1 :]))
-    return dataclasses.replace(operand, words=(*operand.words[:k], tuple(held), *operand.words[k + 1 :]))
+        return dataclasses.replace(operand, media=(*operand.media[:k], parts[0], *operand.media[k + 1 :]))
+    return dataclasses.replace(operand, words=(*operand.words[:k], parts, *operand.words[k + 1 :]))
 
 
 # -- parts of a value by their paths ----------------------------------------------------------------------------------
 
 
 def part(whole, path: Path):
-    """What a value holds at the end of a path; None where the way there is not modelled."""
+    """The part of a value at the end of a path; None where a part on the path is not modelled."""
     for step in path:
         if not _leads_on(whole, step):
             return None
@@ -197,12 +182,13 @@ def part(whole, path: Path):
 
 
 def with_part(whole: Whole, path: Path, new, *, like=None) -> Whole:
-    """The value with something else at the end of a path; where the way there is not modelled it is that of `like`."""
+    """The value with another part at the end of a path; parts on the path that are not modelled are those of `like`."""
     if not path:
         return new
     step, *rest = path
     if not _leads_on(whole, step):
-        whole = _padded(whole, like) if isinstance(whole, Tensor) else like
+        is_short = isinstance(whole, Tensor)
+        whole = torch.cat([whole, whole.new_zeros(len(like) - len(whole))]) if is_short else like
     if isinstance(whole, Tensor):
         return _with_entry(whole, step, new)
     inner = with_part(part(whole, (step,)), tuple(rest), new, like=part(like, (step,)))
@@ -217,13 +203,8 @@ def _leads_on(whole, step: str | int | tuple[int, ...]) -> bool:
     return step < len(whole) if isinstance(whole, tuple) else whole is not None
 
 
-def _padded(numbers: Tensor, like: Tensor) -> Tensor:
-    """(n,) numbers with zeros up to as many as others have."""
-    return torch.cat([numbers, numbers.new_zeros(len(like) - len(numbers))])
-
-
 def differences(one, other, path: Path = ()) -> Iterator[Path]:
-    """The paths to where two values differ, as far down as both go; a glass is not gone into."""
+    """The paths at which two values differ, as deep as both have parts; a glass is compared as a whole."""
     if one is other:
         return
     if type(one) is not type(other) or isinstance(one, Glass):
@@ -242,7 +223,7 @@ def differences(one, other, path: Path = ()) -> Iterator[Path]:
 
 
 def same(one, other) -> bool:
-    """Whether two parts of a value are alike, number for number."""
+    """Whether two parts of a value are equal, number by number."""
     if isinstance(one, Tensor):
         return isinstance(other, Tensor) and torch.equal(one, other)
     if dataclasses.is_dataclass(one) and type(one) is type(other):
@@ -252,7 +233,7 @@ def same(one, other) -> bool:
 
 
 def _with_entry(numbers: Tensor, entry: tuple[int, ...], number: Tensor) -> Tensor:
-    """A tensor with another number in one place, without writing into it."""
+    """A copy of a tensor with another number at one entry."""
     is_there = torch.zeros(numbers.shape, dtype=torch.bool, device=numbers.device)
     is_there[entry] = True
     return torch.where(is_there, number, numbers)

@@ -1,12 +1,11 @@
 """Intersection of rays with a surface: point, normal and exact derivatives, and the first crossing of an asphere.
 
-Planes and conics have closed forms. A strong asphere may be crossed several times (gull wings), and Newton's method
-alone may settle on a wrong crossing or on none: `first_crossing` runs it from the base conic, accepts by a residual
-relative to the size of the terms, and passes the few rays that fail to a bracketed search. Roots are found outside the
-graph and in float64, also of float32 rays: within 1e-7 of the edge of a surface rounding would decide between a hit and
-a miss. Derivatives are attached by one step: see `_step`.
-
-Functions take and return components, triples of (...), in the frame of the surface's vertex.
+Planes and conics have closed forms. A strong asphere may be crossed several times (gull wings), and Newton's method may
+settle on a wrong crossing or on none: `first_crossing` starts it at the base conic, accepts by a residual relative to
+the size of the terms, and passes the few rays that fail to a bracketed search. Roots are found outside the graph and in
+float64, also of float32 rays: within 1e-7 of the edge of a surface rounding would decide between a hit and a miss.
+Derivatives are attached by one step: see `_step`. Functions take and return components, triples of (...), in the frame
+of the surface's vertex.
 """
 
 from collections.abc import Sequence
@@ -41,9 +40,8 @@ class Meeting(NamedTuple):
     hit: (x, y, z) mm, each (...); where a ray misses, finite and at the vertex, or on the vertex plane of a plane.
     cosine: (...) n·d with the normal n of `normal`, n_z > 0 at the vertex; finite where a ray misses.
     met: (...) bool, whether there is a crossing.
-    normal: that of `normal` and its squared length where they are known already, else None.
-    exact: of rays in float32 the hit and the direction in float64, each a triple, from which it is decided whether
-        light passes: within 1e-7 of the critical angle rounding would. None of rays in float64.
+    normal: that of `normal` and its squared length if computed, else None.
+    exact: of float32 rays hit and direction in float64, triples that decide on total reflection; None of float64 rays.
     """
 
     hit: tuple[Tensor, Tensor, Tensor]
@@ -57,7 +55,7 @@ def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tenso
     """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
     if surface.phase is not None and kind_of(surface.phase).flat:
         meeting = _meet_plane(position, direction)
-        return meeting._replace(met=meeting.met & _within(surface, *meeting.hit[:2]))
+        return meeting._replace(met=meeting.met & _has_facet(surface, *meeting.hit[:2]))
     if surface.is_plane:
         return _meet_plane(position, direction)
     if is_searched(surface):
@@ -72,7 +70,7 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     """
     x, y, z = hit
     if surface.phase is not None and kind_of(surface.phase).flat:
-        within = _within(surface, x, y)
+        within = _has_facet(surface, x, y)
         return _sloped_normal(surface, torch.where(within, x, 0.0), torch.where(within, y, 0.0), None)
     if surface.is_plane:
         return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
@@ -86,8 +84,8 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
 
 
-def _within(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-    """Whether there is a facet: one above the edge of a closed conic has no slope."""
+def _has_facet(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+    """Whether points lie within the edge of the conic that facets have the slopes of."""
     c = x.new_zeros(()) if surface.curvature is None else surface.curvature
     shape = 1.0 if surface.conic is None else 1 + surface.conic
     return (shape * c * c * (x * x + y * y)).detach() < 1
@@ -188,12 +186,12 @@ def _sloped_normal(surface: Surface, x: Tensor, y: Tensor, bumps: Relief | None)
 
 
 def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
-    """One step of Chebyshev's method from a root t found outside the graph: it carries its derivatives and polishes t.
+    """One step of Chebyshev's method from a root t found outside the graph: it attaches derivatives and polishes t.
 
     With F(t, p) = 0 and δ = F/F', the step t - δ - (F''/2F') δ² has, at δ = 0, the first derivative -F_p/F_t of the
     implicit function and, because δ² has no first but a second derivative, also its second derivative: the last term
-    supplies -(F_tt/F_t) t_p t_q, which one Newton step lacks. F'' itself need not be differentiated. The value of F at
-    the root is rounding: it polishes t (unless polish is False), but must not leak into derivatives through F'.
+    supplies -(F_tt/F_t) t_p t_q. F'' itself need not be differentiated. The value of F at the root is rounding: it
+    polishes t (if `polish`), but must not leak into derivatives through F'.
     """
     if not differentiating():
         return F / dF if polish else F.new_zeros(())
@@ -212,10 +210,9 @@ def foot_of(position, direction) -> tuple[list[Tensor], Tensor]:
 
 
 class Way(NamedTuple):
-    """Where a root is looked for, detached and in float64 also for float32 rays.
+    """The ray on which a root is sought, detached and in float64.
 
-    foot, direction: triples; lag: of float32 rays how much longer the exact slide is than theirs, else None; dtype:
-    theirs.
+    foot, direction: triples; lag: of float32 rays the exact slide less theirs, else None; dtype: theirs.
     """
 
     foot: Sequence[Tensor]
@@ -224,7 +221,7 @@ class Way(NamedTuple):
     dtype: torch.dtype
 
     def back(self, root: Tensor, met: Tensor) -> tuple[Tensor, tuple | None]:
-        """The path from the rays' own foot, in their dtype; and of float32 rays `Meeting.exact`."""
+        """The path from the foot of the rays, in their dtype; and `Meeting.exact`."""
         if self.lag is None:
             return root, None
         hit = [torch.addcmul(p, root, d) for p, d in zip(self.foot, self.direction, strict=True)]
@@ -232,7 +229,6 @@ class Way(NamedTuple):
 
 
 def way_of(position, direction, foot, slide) -> Way:
-    """The way of rays whose foot and slide are known already, as `foot_of` gives them."""
     if slide.dtype == torch.float64:
         return Way([p.detach() for p in foot], [d.detach() for d in direction], None, slide.dtype)
     position, direction = doubles(position), doubles(direction)
@@ -241,7 +237,6 @@ def way_of(position, direction, foot, slide) -> Way:
 
 
 def doubles(vector: Sequence[Tensor]) -> list[Tensor]:
-    """Components in float64, outside the graph."""
     return [double(component) for component in vector]
 
 
@@ -257,8 +252,7 @@ def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor
         F = c (p_x² + p_y² + (1+k) p_z²) - 2 p_z
 
     in the algebraic form that does not cancel (Kahan 2004), regular at c = 0 and at k = -1. For a sphere (shape None)
-    A = c and G = N, and G never cancels against the root. Asked for in float64 also of float32 rays: within 1e-7 of the
-    edge of a surface rounding would decide between a hit and a miss.
+    A = c and G = N, and G never cancels against the root.
     """
     L, M, N = direction
     x, y, z = foot
@@ -283,10 +277,10 @@ def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
 _SAMPLES = 96
-_CANDIDATES = 4  # sign changes and edges of the domain that are looked into, on one ray
+_CANDIDATES = 4  # sign changes and edges of the domain that are examined on one ray
 _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 
-# An operator by the lower door of torch.library: `torch.library.custom_op` would load the compiler at its first call.
+# `torch.library.custom_op` would load the compiler at its first call.
 torch.library.define(
     "raytrace::first_crossing",
     "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, str kind, Tensor[] numbers,"
@@ -307,9 +301,9 @@ def first_crossing(
 ) -> tuple[Tensor, Tensor]:
     """Path t (...) from `foot` to the first crossing with the surface, and whether there is one (...).
 
-    foot, direction: (3, ...); curvature, conic: (...); coefficients: (m, ...) of this kind; rim: mm, semi-diameter
-    within which the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is
-    none in it. Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
+    foot, direction: (3, ...); curvature, conic: (...); coefficients: (m, ...) of this kind; rim: semi-diameter in mm
+    (inf: the whole sag); a crossing outside the rim is taken only if there is none in it. In float64; not
+    differentiated: pass detached tensors.
     """
     numbers, sag_terms = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
     find = torch.ops.raytrace.first_crossing
@@ -324,20 +318,20 @@ def _(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms,
 
 @torch.library.register_vmap("raytrace::first_crossing")
 def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
-    """Move the mapped axis in front of the batch axes; sag terms that differ are taken one by one."""
+    """The mapped axis goes in front of the batch axes; sag terms that differ are searched one by one."""
     tensors, find = (foot, direction, curvature, conic, coefficients), torch.ops.raytrace.first_crossing
     dims = in_dims[6] if sag_terms else []
     if all(dim is None for dim in dims):
         return find(*_aligned(tensors, in_dims[:5]), kind, numbers, sag_terms, rim), (0, 0)
 
-    def part(given, dims, i: int) -> list[Tensor]:
-        return [x if dim is None else x.select(dim, i) for x, dim in zip(given, dims, strict=True)]
+    def part(inputs, dims, i: int) -> list[Tensor]:
+        return [x if dim is None else x.select(dim, i) for x, dim in zip(inputs, dims, strict=True)]
 
     each = [
         find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), sag_terms, rim)
         for i in range(info.batch_size)
     ]
-    return tuple(torch.stack(found) for found in zip(*each, strict=True)), (0, 0)
+    return tuple(map(torch.stack, zip(*each, strict=True))), (0, 0)
 
 
 def search(
@@ -351,7 +345,7 @@ def search(
     sag_terms: str,
     rim: float,
 ) -> tuple[Tensor, Tensor]:
-    """What the operator does, outside of transforms."""
+    """The operator outside of transforms."""
     relief = Relief(sag_terms, numbers) if sag_terms else None
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
@@ -390,35 +384,34 @@ def _searched(rays: "_Rays", t: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reads_are_free(tensor: Tensor) -> bool:
-    """Whether the host may ask what is in a tensor without waiting for a device.
+    """Whether the host may read a tensor without waiting for a device.
 
-    Elsewhere every ray goes through every step and through the bracketed search: rays once arrived stay as they are, so
-    that the results are the same, bit for bit.
+    Elsewhere every ray takes all steps and the bracketed search, with bit-identical results: converged rays are frozen.
     """
     return tensor.device.type == "cpu"
 
 
 def _expand(x: Tensor, batch: torch.Size) -> Tensor:
-    """(m, ...) to (m, *batch): batch axes align from the right, the leading axis stays in front."""
+    """(m, ...) to (m, *batch)."""
     return with_batch_axes(x, len(batch)).expand(x.shape[0], *batch)
 
 
 def _aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Tensor]:
-    """Foot, direction, curvature, conic, coefficients with the mapped axis in front of all batch axes."""
+    """Foot, direction, curvature, conic and coefficients with the mapped axis in front of all batch axes."""
     leading = (1, 1, 0, 0, 1)  # component or term axis before the batch axes
     mapped = [dim is not None for dim in in_dims]
     ranks = [x.dim() - lead - m for x, lead, m in zip(tensors, leading, mapped, strict=True)]
-    found = []
+    aligned = []
     for x, lead, dim, rank in zip(tensors, leading, in_dims, ranks, strict=True):
         if dim is not None:
             x = x.movedim(dim, lead)
             x = x.reshape(*x.shape[: lead + 1], *(1,) * (max(ranks) - rank), *x.shape[lead + 1 :])
-        found.append(x)
-    return found
+        aligned.append(x)
+    return aligned
 
 
 class _Rays(NamedTuple):
-    """Rays (n,) in float64 and the surface they look for: foot, direction, c, k, a (m, n or 1), rim, kind, D."""
+    """Rays (n,) in float64 and their surface: foot, direction, c, k, a (m, n or 1), rim, kind, D."""
 
     p: Tensor
     d: Tensor
@@ -431,16 +424,13 @@ class _Rays(NamedTuple):
 
     @property
     def form(self) -> Form | None:
-        """The sag of a kind that is not round."""
         return KINDS[self.kind].form
 
     def of(self, few: Tensor) -> "_Rays":
-        """Some of them."""
         a = self.a if self.a.shape[1] == 1 else self.a[:, few]
         return self._replace(p=self.p[:, few], d=self.d[:, few], c=self.c[few], k=self.k[few], a=a)
 
     def sag(self, u: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The sag without D at r² (..., n)."""
         return sag_and_derivatives(u, self.c, self.k, self.a, highest, kind=self.kind)
 
 
@@ -456,7 +446,15 @@ def _start(rays: _Rays) -> Tensor:
         G = N - c * (p[0] * d[0] + p[1] * d[1] + shape * p[2] * N)
         F = c * (p[0] ** 2 + p[1] ** 2 + shape * p[2] ** 2) - 2 * p[2]
     else:
-        A, G, F = _quadric(rays)
+        # c_x x² + c_y y² + c_z z² = 2 z osculates at the vertex; c_z is that of c_x, c_y which contributes more at the
+        # foot: a toroid is exactly such a quadric in either of its sections.
+        (x, y, z), (L, M, _), zero = p, d, torch.zeros_like(p[0])
+        vertex = rays.form.sag(c, k, rays.a, zero, zero, 2)
+        c_x, c_y = vertex.xx, vertex.yy
+        c_z = torch.where((c_x * x * x).abs() > (c_y * y * y).abs(), c_x, c_y)
+        A = c_x * L * L + c_y * M * M + c_z * N * N
+        G = N - (c_x * x * L + c_y * y * M + c_z * z * N)
+        F = c_x * x * x + c_y * y * y + c_z * z * z - 2 * z
     discriminant = G * G - A * F
     s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
     denominator = G + s * torch.sqrt(discriminant.clamp_min(0.0))
@@ -466,23 +464,8 @@ def _start(rays: _Rays) -> Tensor:
     return torch.where(usable & (radius <= rim), t, plane)
 
 
-def _quadric(rays: _Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """A, G, F of A t² - 2 G t + F = 0 for c_x x² + c_y y² + c_z z² = 2 z, which osculates at the vertex.
-
-    c_z is whichever of the two does more at the foot: a toroid is exactly that in either of its sections.
-    """
-    (x, y, z), (L, M, N) = rays.p, rays.d
-    zero = torch.zeros_like(x)
-    bend = rays.form.sag(rays.c, rays.k, rays.a, zero, zero, 2)
-    c_x, c_y = bend.xx, bend.yy
-    c_z = torch.where((c_x * x * x).abs() > (c_y * y * y).abs(), c_x, c_y)
-    A = c_x * L * L + c_y * M * M + c_z * N * N
-    G = N - (c_x * x * L + c_y * y * M + c_z * z * N)
-    return A, G, c_x * x * x + c_y * y * y + c_z * z * z - 2 * z
-
-
 def _residual(rays: _Rays, t: Tensor):
-    """F = z - S, F' = dF/dt, the rounding scale of F, r² at t, and whether the surface reaches there."""
+    """F = z - S, F' = dF/dt, the rounding scale of F, r² at t, and whether there is a surface."""
     p, d, c, k, a, _, kind, relief = rays
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     u = x * x + y * y
@@ -526,17 +509,17 @@ def _newton(rays: _Rays, t: Tensor):
 
 
 def _bracketed(rays: _Rays):
-    """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch).
+    """First crossing in the direction of propagation within rim and sag range (1-D batch).
 
-    A sign change counts only between points on the surface: an end outside the domain has no F, so that the bisection
-    ends at a crossing or at the edge of the domain, and the residual tells them apart.
+    A sign change counts only between points on the surface: beyond the domain F does not exist, so the bisection ends
+    at a crossing or at the edge of the domain, told apart by the residual.
     """
     first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
     width = (last - first) / _SAMPLES
     sides = [_side(rays, first + i * width) for i in range(_SAMPLES + 1)]
     before, behind = (torch.stack(side) for side in zip(*sides, strict=True))
     leaves = before[:-1] & ~before[1:]
-    steps = (leaves | ~(before[:-1] | behind[:-1]) & behind[1:]) & possible  # that may hold a crossing
+    steps = (leaves | ~(before[:-1] | behind[:-1]) & behind[1:]) & possible  # that may contain a crossing
     found, t = torch.zeros_like(possible), first
     for _ in range(_CANDIDATES):
         few = (steps.any(0) & ~found).nonzero()[:, 0] if _reads_are_free(t) else torch.arange(len(t), device=t.device)
@@ -547,10 +530,8 @@ def _bracketed(rays: _Rays):
         t_few, is_crossing = _bisected(rays.of(few), right - width[few], right, leaves[at, few])
         is_crossing = is_crossing & steps[at, few] & ~found[few]
         steps[at, few] = False
-        t, found = (
-            t.index_put((few,), torch.where(is_crossing, t_few, t[few])),
-            found.index_put((few,), found[few] | is_crossing),
-        )
+        t = t.index_put((few,), torch.where(is_crossing, t_few, t[few]))
+        found = found.index_put((few,), found[few] | is_crossing)
     return t, found
 
 
@@ -569,7 +550,7 @@ def _bisected(rays: _Rays, left: Tensor, right: Tensor, leaves: Tensor) -> tuple
 
 
 def _side(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether light at t is before the surface, and whether it is behind it: neither where there is none."""
+    """Whether the point at t is before the surface, and whether it is behind it: neither where there is none."""
     F, _, _, _, inside = _residual(rays, t)
     below = torch.where(rays.d[2] < 0, -F, F) <= 0
     return inside & below, inside & ~below
@@ -581,7 +562,7 @@ def _is_small(F: Tensor, dF: Tensor, scale: Tensor, u: Tensor, inside: Tensor) -
 
 
 def _stretch_round(rays: _Rays):
-    """Where on the rays a crossing may lie, from … to …, and whether it may at all."""
+    """First and last t of a possible crossing, and whether there can be one."""
     p, (L, M, _), c, k, a, rim, *_ = rays
     big = _big(p)
     closed = (1 + k) * c * c
@@ -608,7 +589,7 @@ def _stretch_round(rays: _Rays):
 
 
 def _stretch_freeform(rays: _Rays):
-    """The same inside the box that the sheet of the vertex fills."""
+    """The same inside the box about the sheet of the vertex."""
     p, d, c, k, a, rim, *_ = rays
     big = _big(p)
     limit = torch.full_like(p[0], rim) if rim < big else _reach(rays)
@@ -629,17 +610,17 @@ def _stretch_freeform(rays: _Rays):
 
 
 def _big(of: Tensor) -> float:
-    """A length whose square is a number."""
+    """A length whose square is finite."""
     return torch.finfo(of.dtype).max ** 0.48
 
 
 def _reach(rays: _Rays) -> Tensor:
-    """Where a surface has neither rim nor edge: about the foot."""
+    """Radius of the search about the foot, of a surface without rim and edge."""
     return 4 * (torch.sqrt(rays.p[0] ** 2 + rays.p[1] ** 2) + rays.p[2].abs())
 
 
 def _between(rays: _Rays, heights: Tensor, share: float, radius: Tensor, first, last, possible):
-    """A stretch cut to where the ray is between the heights (k, n) mm, widened by a share of their range."""
+    """The range of t between the heights (k, n) mm, widened by a share of their range."""
     margin = (heights.amax(0) - heights.amin(0)) * share + torch.finfo(heights.dtype).tiny
     margin = margin if rays.relief is None else margin + rays.relief.size(radius)
     low, high = heights.amin(0) - margin, heights.amax(0) + margin

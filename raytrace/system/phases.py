@@ -189,10 +189,6 @@ def _scaled(terms: Tensor, radius: Tensor, orders: list[int], scale: Tensor) -> 
     return torch.stack([c * scale / radius**n for c, n in zip(terms.unbind(0), orders, strict=True)])
 
 
-def _hologram(phase: Hologram, wavelength: Tensor) -> HologramPath:
-    return HologramPath(phase.first, phase.second, -phase.order * wavelength / phase.wavelength)
-
-
 def _hologram_added(hologram: HologramPath, x: Tensor, y: Tensor) -> Added:
     scale = hologram.scale
     path = slope_x = slope_y = torch.zeros_like(x)
@@ -205,14 +201,15 @@ def _hologram_added(hologram: HologramPath, x: Tensor, y: Tensor) -> Added:
 
 
 def _hologram_power(phase: Hologram | HologramPath, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    path, powers = path_of(phase, wavelength), []
-    for axis in (0, 1):
-        total = torch.zeros_like(path.scale)
+    def power_along(axis: int) -> Tensor:
+        total = torch.zeros_like(scale)
         for point in (phase.first, phase.second):
             squared = dot(point, point)
             total = total + (squared - point[axis] ** 2) / squared**1.5
-        powers.append(-path.scale * total)
-    return powers[0], powers[1]
+        return -scale * total
+
+    scale = path_of(phase, wavelength).scale
+    return power_along(0), power_along(1)
 
 
 #: Kinds of phase, by the name of their class.
@@ -221,7 +218,10 @@ PHASES = {
     "RadialPhase": PhaseKind(path=_radial, is_round=True),
     "PolynomialPhase": PhaseKind(path=_polynomial),
     "FringePhase": PhaseKind(path=_fringe),
-    "Hologram": PhaseKind(path=_hologram, power=_hologram_power),
+    "Hologram": PhaseKind(
+        path=lambda phase, wl: HologramPath(phase.first, phase.second, -phase.order * wl / phase.wavelength),
+        power=_hologram_power,
+    ),
     "IdealLens": PhaseKind(power=lambda lens, _: (lens.power_x, lens.power_y), slopes=True, chromatic=False),
     "Facets": PhaseKind(flat=True, is_round=True, chromatic=False),
     "PolynomialPath": PhaseKind(path=lambda path, _: path, chromatic=False),
@@ -249,16 +249,12 @@ def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) ->
     if isinstance(path, HologramPath):
         return _hologram_added(path, x, y)
     if isinstance(path, RadialPath):
-        return _radial_added(path.coefficients, x, y)
+        a, u = path.coefficients, x * x + y * y
+        order = torch.arange(1, len(a) + 1, dtype=a.dtype, device=a.device).reshape(-1, *(1,) * (a.dim() - 1))
+        twice = 2 * polynomial(order * a, u)
+        return Added(u * polynomial(a, u), twice * x, twice * y)
     z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)
     return Added(z if path.constant is None else z + path.constant, slope_x, slope_y)
-
-
-def _radial_added(a: Tensor, x: Tensor, y: Tensor) -> Added:
-    u = x * x + y * y
-    order = torch.arange(1, len(a) + 1, dtype=a.dtype, device=a.device).reshape(-1, *(1,) * (a.dim() - 1))
-    twice = 2 * polynomial(order * a, u)
-    return Added(u * polynomial(a, u), twice * x, twice * y)
 
 
 def power_of(phase: Phase, wavelength: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,7 +33,7 @@ class Pose:
 
 @value
 class Gap:
-    """What lies between a surface and the next: its pose behind it, then a thickness (...) mm along the new axis."""
+    """The gap to the next surface: the pose behind this one, then a thickness (...) mm along the new axis."""
 
     pose: Pose
     thickness: Tensor
@@ -41,9 +41,9 @@ class Gap:
 
 @value
 class Turn:
-    """A passage by its numbers, as the compiled trace takes it: new = rotation · old + shift.
+    """A passage of the compiled trace: new = rotation · old + shift.
 
-    rotation: (3, 3, ...); shift: (3, ...) mm; path: (...) mm, that of the axial ray along the way, which drops out.
+    rotation: (3, 3, ...); shift: (3, ...) mm; path: (...) mm of the axial ray, which is subtracted.
     """
 
     rotation: Tensor
@@ -51,7 +51,7 @@ class Turn:
     path: Tensor
 
 
-#: About which of the axes a tilt turns, and between which: from the first of the two to the second.
+#: The plane of each tilt, from its first axis to its second.
 _TURNS = {"tilt_x": (1, 2), "tilt_y": (2, 0), "tilt_z": (0, 1)}
 
 Vector = Sequence[Tensor]
@@ -73,7 +73,10 @@ def direction_in(pose: Pose | Turn, direction: Vector) -> Vector:
     for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
         tilt = getattr(pose, name)
         if tilt is not None:
-            direction = _turned(direction, tilt, _TURNS[name])
+            cosine, sine = cos_sin(torch.as_tensor(tilt))
+            (i, j), old, direction = _TURNS[name], direction, list(direction)
+            direction[i] = cosine * old[i] + sine * old[j]
+            direction[j] = cosine * old[j] - sine * old[i]
     return direction
 
 
@@ -89,24 +92,13 @@ def direction_out(pose: Pose, direction: Vector) -> Vector:
 
 def undone(pose: Pose) -> Pose:
     """The pose that leads back."""
-    numbers = {name: getattr(pose, name) for name in ("x", "y", "z", *_TURNS)}
-    back = {name: None if number is None else -number for name, number in numbers.items()}
-    return Pose(**back, tilts_first=not pose.tilts_first)
+    numbers = (pose.x, pose.y, pose.z, pose.tilt_x, pose.tilt_y, pose.tilt_z)
+    return Pose(*(None if number is None else -number for number in numbers), tilts_first=not pose.tilts_first)
 
 
 def _moved(pose: Pose, point: Vector) -> Vector:
     steps = (pose.x, pose.y, pose.z)
     return [at if step is None else at - step for at, step in zip(point, steps, strict=True)]
-
-
-def _turned(vector: Vector, degrees: Tensor, plane: tuple[int, int]) -> Vector:
-    """The vector in axes that are turned in a plane, from its first axis to its second."""
-    cosine, sine = cos_sin(torch.as_tensor(degrees))
-    i, j = plane
-    found = list(vector)
-    found[i] = cosine * vector[i] + sine * vector[j]
-    found[j] = cosine * vector[j] - sine * vector[i]
-    return found
 
 
 def cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,14 +110,14 @@ def cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
     return cosine, sine - torch.where(quarter == 0, sine, 0.0).detach()
 
 
-#: A number that is known for good, or a tensor.
+#: A constant or a tensor.
 Number = float | Tensor
 
 
 def passage(gap: Tensor | Gap | None, before: Pose | None) -> list[list[Number]]:
-    """What `point_in` does along a gap and a pose, as the rows of rotation and shift (3, 4): [x, y, z, 1] -> new.
+    """`point_in` along a gap and a pose as the rows of rotation and shift (3, 4): [x, y, z, 1] -> new.
 
-    Entries that are 0 or 1 whatever the angles are stay such numbers, and no operator is spent on them.
+    Entries that are 0 or 1 for all angles stay constants, without operators.
     """
     rows: list[list[Number]] = [[1.0 if i == j else 0.0 for j in range(4)] for i in range(3)]
     if isinstance(gap, Gap):
@@ -137,25 +129,20 @@ def passage(gap: Tensor | Gap | None, before: Pose | None) -> list[list[Number]]
 
 
 def _through(pose: Pose, rows: list[list[Number]]) -> list[list[Number]]:
-    steps = [0.0 if step is None else -step for step in (pose.x, pose.y, pose.z)]
-    if not pose.tilts_first:
-        rows = [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
+    def shifted(rows: list[list[Number]]) -> list[list[Number]]:
+        steps = [0.0 if step is None else -step for step in (pose.x, pose.y, pose.z)]
+        return [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
+
+    rows = rows if pose.tilts_first else shifted(rows)
     for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
         tilt = getattr(pose, name)
         if tilt is not None:
-            rows = _rows_turned(rows, tilt, _TURNS[name])
-    if pose.tilts_first:
-        rows = [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
-    return rows
-
-
-def _rows_turned(rows: list[list[Number]], degrees: Tensor, plane: tuple[int, int]) -> list[list[Number]]:
-    cosine, sine = cos_sin(torch.as_tensor(degrees))
-    back, (i, j) = -sine, plane
-    found = list(rows)
-    found[i] = [_sum(_product(cosine, a), _product(sine, b)) for a, b in zip(rows[i], rows[j], strict=True)]
-    found[j] = [_sum(_product(cosine, b), _product(back, a)) for a, b in zip(rows[i], rows[j], strict=True)]
-    return found
+            cosine, sine = cos_sin(torch.as_tensor(tilt))
+            back, (i, j), old, rows = -sine, _TURNS[name], rows, list(rows)
+            pairs = list(zip(old[i], old[j], strict=True))
+            rows[i] = [_sum(_product(cosine, a), _product(sine, b)) for a, b in pairs]
+            rows[j] = [_sum(_product(cosine, b), _product(back, a)) for a, b in pairs]
+    return shifted(rows) if pose.tilts_first else rows
 
 
 def _product(factor: Tensor, number: Number) -> Number:

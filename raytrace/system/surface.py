@@ -123,37 +123,27 @@ def vertex_curvature(surface: Surface) -> Tensor:
     Of a toroid or a biconic it is that of the section along y, as in other programs. The curvatures of sag terms along
     x and y are averaged. Slopes at the vertex, of sag terms or of an odd asphere, are ignored.
     """
-    curvature = _vertex(surface)[1]
-    if surface.sag_terms is None:
-        return curvature
-    added = _sag_terms_at_vertex(surface)
-    return curvature + 0.5 * (added.xx + added.yy)
+    along_y, added = _vertex(surface)[1:]
+    return along_y if added is None else along_y + 0.5 * (added.xx + added.yy)
 
 
 def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
     """The curvatures in 1/mm of the sections along x and along y at the vertex, sag terms included."""
-    along_x, along_y = _vertex(surface)
-    if surface.sag_terms is None:
-        return along_x, along_y
-    added = _sag_terms_at_vertex(surface)
-    return along_x + added.xx, along_y + added.yy
+    along_x, along_y, added = _vertex(surface)
+    return (along_x, along_y) if added is None else (along_x + added.xx, along_y + added.yy)
 
 
-def _vertex(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The curvatures at the vertex without sag terms, along x and along y."""
+def _vertex(surface: Surface) -> tuple[Tensor, Tensor, Sag | None]:
+    """The curvatures at the vertex along x and y without sag terms, and the sag terms there."""
     centre = torch.zeros_like(surface.thickness)
+    added = None if surface.sag_terms is None else relief(surface.sag_terms).sag(centre, centre)
     if is_freeform(surface):
         base = freeform_sag(surface, centre, centre, 2)
-        return base.xx, base.yy
+        return base.xx, base.yy, added
     total = centre if surface.curvature is None else surface.curvature
     if surface.coefficients is not None:
         total = total + 2 * KINDS[surface.kind].terms(centre, surface.coefficients, 1, 1.0)[1]
-    return total, total
-
-
-def _sag_terms_at_vertex(surface: Surface) -> Sag:
-    centre = torch.zeros_like(surface.thickness)
-    return relief(surface.sag_terms).sag(centre, centre)
+    return total, total, added
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:

@@ -215,12 +215,8 @@ def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> t
         jacobian = pull(units.reshape(count, count, *(1,) * (point.dim() - 1)).expand_as(value).contiguous())
         return value[:, 0], list(jacobian.unbind(1)), arrives[0]
     value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), point)
-    rows = []
-    for i in range(count):
-        unit = torch.zeros_like(value)
-        unit[i] = 1.0
-        rows.append(pull(unit))
-    return value, rows, arrives
+    units = torch.eye(count, dtype=value.dtype, device=value.device).reshape(count, count, *(1,) * (value.dim() - 1))
+    return value, [pull(unit.expand_as(value)) for unit in units], arrives
 
 
 def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:

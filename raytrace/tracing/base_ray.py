@@ -33,20 +33,19 @@ _FIGURES = 8  # of the ray: two coordinates on the stop, three on the image, thr
 class BaseRay:
     """The axial chief ray on the image, and first-order data about it at one wavelength; mm.
 
-    valid: (...) whether it gets there. position, direction: (3, ...) on the image and in front of it, in its frame.
-    Entries (2, ...) are those of the tangential section, of rays turned about the local x of the start, and of the
-    sagittal one across it. Distances count along the base ray, positive the way light travels.
+    valid: (...) whether it reaches the image. position, direction: (3, ...) on the image and in front of it, in its
+    frame. Entries (2, ...) are those of the tangential section, of rays turned about the local x of the start, and of
+    the sagittal section. Distances count along the base ray, positive in the direction of light. The others:
 
     focal_length: of a parallel beam, -y/u′ with u′ behind the lens, in its medium: positive where it converges; its
         sign follows the section through mirrors and turned axes.
-    way_to_image: (...) from where the ray meets the last surface before the image that is no coordinate break.
-    back_focal_distance, image_distance: from there to where rays beside it, from infinity or from the object, come
-        closest to it.
+    way_to_image: (...) from the last surface before the image that is not a coordinate break.
+    back_focal_distance, image_distance: from there to the focus of neighbouring rays from infinity or the object.
     entrance_pupil_position: from the plane of the vertex of surface 1 to the image of the stop in object space.
     exit_pupil_position: from the image surface to that in image space; diameters > 0.
     paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
     magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
-    A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
+    A quantity that does not exist (the focal length of an afocal lens, say) is infinite.
     """
 
     valid: Tensor
@@ -66,12 +65,11 @@ class BaseRay:
 
 @value
 class Entrance:
-    """Where rays go in that fill the stop, to first order about the base ray.
+    """The plane at which rays that fill the stop are aimed, to first order about the base ray.
 
-    position: (...) mm, of the plane that they are aimed at, along z from the vertex of surface 1; centre: (2, ...) mm,
-    the base ray's point of it; spread: (2, 2, ...) mm, from pupil points to those of the plane; turn: (2, 2, ...), from
-    pupil points to those of the stop that they stand for: turned, or mirrored, as the stop's image is; radius: (...) mm
-    of the stop.
+    position: (...) mm along z from the vertex of surface 1; centre: (2, ...) mm, the base ray's point of it; spread:
+    (2, 2, ...) mm, from pupil points to its points; turn: (2, 2, ...), from pupil points to those of the stop, turned
+    or mirrored as the image of the stop is; radius: (...) mm of the stop.
     """
 
     position: Tensor
@@ -84,8 +82,8 @@ class Entrance:
 def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     """The axial chief ray and first-order data about it; wavelength: (...) µm, the primary one by default.
 
-    `first_order` has the straightened figures, as OpticStudio prints them; the two agree in a lens with an axis.
-    First derivatives by every number of the lens are exact; second ones lack the third derivatives of the trace.
+    `first_order` has the figures of the straightened lens, as OpticStudio; the two agree in a lens with an axis. First
+    derivatives are exact; second ones lack the third derivatives of the trace.
     """
     wavelength = lens.primary if wavelength is None else wavelength
     near = _near(lens, wavelength)
@@ -93,11 +91,16 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     parallel = near.behind(one, 0 * one)
     fan = near.behind(one, kappa * one)
     chief = near.behind(-near.E, one)
-    # Moved at the start so that the ray meets the rim of the stop, from the axial object point.
+    # From the axial object point to the rim of the stop.
     move = near.radius[..., None, None] * _inverse(near.A + kappa * near.B) @ near.Q
     rim = near.behind(move, kappa * move)
     exit_pupil, image = _closest(chief), _closest(fan)
     across = _at(rim, exit_pupil)
+    magnification = torch.zeros_like(image)
+    if bool((kappa != 0).any()):  # by chief rays of object points 1 mm off the base ray
+        turn = -kappa * _inverse(one + kappa * near.E)
+        height = _at(near.behind(-near.E @ turn, turn), image)
+        magnification = _sign(near.carried, height) * _length(height)
     return BaseRay(
         valid=near.valid,
         position=near.position,
@@ -111,23 +114,12 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
         exit_pupil_diameter=_first(2 * _length(across)),
         image_distance=_first(image + near.last[..., None]),
         paraxial_working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
-        magnification=_first(_magnification(near, image)),
+        magnification=_first(magnification),
     )
 
 
-def _magnification(near: "_Near", image: Tensor) -> Tensor:
-    """Of chief rays of object points 1 mm off the base ray, (..., 2)."""
-    kappa = near.vergence[..., None, None]
-    if not bool((kappa != 0).any()):
-        return torch.zeros_like(image)
-    one = torch.eye(2, dtype=near.X.dtype, device=near.X.device)
-    turn = -kappa * _inverse(one + kappa * near.E)
-    height = _at(near.behind(-near.E @ turn, turn), image)
-    return _sign(near.carried, height) * _length(height)
-
-
 def entrance_of(lens: Lens) -> Entrance:
-    """Where rays of the primary wavelength go in that fill the stop of a bent lens."""
+    """The entrance of a bent lens for rays of the primary wavelength that fill the stop."""
     near = _near(lens, lens.primary)
     kappa = near.vergence
     first, second = torch.diagonal(near.E, dim1=-2, dim2=-1).unbind(-1)
@@ -141,17 +133,16 @@ def entrance_of(lens: Lens) -> Entrance:
 
 
 class _Near(NamedTuple):
-    """The base ray, and the derivatives of the rays near it by how they start: matrices (..., rows, columns).
+    """The base ray, and derivatives of neighbouring rays by their start: matrices (..., rows, columns).
 
-    Columns are tangential and sagittal: of rays moved across the base ray along the local y and x of the start, mm, or
-    turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop; X: (..., 3, 4)
-    from both to the way across the base ray where it meets the image, D: to the direction in front of it.
-    E: a ray turned by u meets the middle of the stop if it is moved by -E u. Q, H_inverse: A = Q H (polar).
-    aim: (2, ...) mm, where the base ray meets the plane of the vertex of surface 1, begun: (3, ...) its
-    direction there; position, direction: (3, ...), valid: (...) of it on the image; last: (...) mm, its way there from
-    the last real surface before; carried: (..., 3, 2) the local y and x of the start as mirrors and turned axes leave
-    them.
-    vergence: (...) 1/mm, of the object from that plane along the ray; radius: (...) mm of the stop; index: (...) n′.
+    Columns are tangential and sagittal: rays moved across the base ray along the local y and x of the start, mm, or
+    turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop; X: (..., 3, 4) from
+    both to the displacement across the base ray at the image, D: to the direction in front of it. E: a ray turned by u
+    and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm and begun: (3, ...)
+    of the base ray in the plane of the vertex of surface 1; position, direction: (3, ...) and valid: (...) on the
+    image; last: (...) mm to it from the last real surface; carried: (..., 3, 2) the local y and x of the start behind
+    mirrors and turned axes; vergence: (...) 1/mm of the object from that plane; radius: (...) mm of the stop; index:
+    (...) n′.
     """
 
     A: Tensor
@@ -292,8 +283,8 @@ def _in_axes(how: Callable, pose: Pose, vector: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _carried(lens: Lens, begun: Tensor, axes: Sequence[Tensor], ways: Sequence[Tensor]) -> Tensor:
-    """The axes (..., 3, 2) across the base ray as it carries them to the image: reflected by every mirror, elsewhere
-    turned by the least angle. ways: its direction (3, ...) behind every surface."""
+    """The axes (..., 3, 2) behind all surfaces: reflected by mirrors, else turned by the least angle; ways: directions
+    (3, ...) of the base ray behind every surface."""
     d, gap, axes = begun, None, list(axes)
     for surface, after in zip(lens.surfaces[1:], ways, strict=True):
         for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
@@ -310,20 +301,20 @@ def _carried(lens: Lens, begun: Tensor, axes: Sequence[Tensor], ways: Sequence[T
 
 
 def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
-    """Radius (...) of the stop: that of the file, of the paraxial marginal ray where rays are aimed by it; or such that
-    the tangential rays of the object's cone, of_turn (..., 2) mm from the middle at 1 rad, meet its rim, or that its
-    tangential image is as wide as the entrance pupil."""
+    """Radius (...) of the stop: of the file; of the paraxial marginal ray with paraxial aiming; or such that tangential
+    rays of the object's cone, of_turn (..., 2) mm at 1 rad, meet its rim, or its tangential image fills the pupil."""
     batch = H_inverse[..., 0, 0]
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value + 0 * batch
     straight = first_order(lens)
     if lens.aperture.kind in ("object_na", "object_cone_angle"):
-        found = torch.tan(cone_angle(lens, media(lens, lens.primary)[0]))
-        found = found * _length(of_turn, -1)
+        radius = torch.tan(cone_angle(lens, media(lens, lens.primary)[0])) * _length(of_turn, -1)
     else:
-        found = _over(0.5 * straight.entrance_pupil_diameter, _length(H_inverse)[..., 0])
+        radius = _over(0.5 * straight.entrance_pupil_diameter, _length(H_inverse)[..., 0])
+    if lens.ray_aiming != "paraxial":
+        return radius
     straightened = straight.stop_height.abs() + 0 * batch
-    return torch.where(torch.isfinite(straightened), straightened, found) if lens.ray_aiming == "paraxial" else found
+    return torch.where(torch.isfinite(straightened), straightened, radius)
 
 
 def _inverse(m: Tensor) -> Tensor:
@@ -375,5 +366,5 @@ def _over(numerator: Tensor | float, denominator: Tensor) -> Tensor:
 
 def _first(figures: Tensor) -> Tensor:
     """(2, ...) of (..., 2); infinite what is not a number."""
-    found = torch.movedim(figures, -1, 0)
-    return torch.where(torch.isnan(found), torch.inf, found)
+    figures = torch.movedim(figures, -1, 0)
+    return torch.where(torch.isnan(figures), torch.inf, figures)

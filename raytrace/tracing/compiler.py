@@ -1,7 +1,7 @@
-"""The C++ of `cpp/`, compiled once for this machine and kept on disk for every later process.
+"""The C++ of `cpp/`, compiled once for this machine and stored on disk for later processes.
 
-The name of the kept file is a digest of the sources, the flags, the compiler and the processor, so that none of them
-can change unnoticed. Nothing else is compiled, whatever the lens: its structure is data to the compiled trace.
+The name of the file is a digest of the sources, the flags, the compiler and the processor. The structure of a lens is
+data to the compiled trace: no lens needs another compilation.
 
 Only files that this user or root alone can have written are executed. A folder is reached from the root step by step,
 each step checked on the opened folder and links followed by hand, so that nobody can exchange one meanwhile: as ssh's
@@ -166,8 +166,14 @@ def library() -> ctypes.CDLL:
     if os.name != "posix":
         raise NoCompiler("the compiled trace is for POSIX systems")
     if not _is_kept():
+        folder = cache_folder()
         try:
-            _keep(cache_folder())
+            os.close(open_folder(folder, make=True))
+            if (folder / _file_name()).exists():
+                _say(f"{folder / _file_name()} can be another user's: compiled anew")
+            with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
+                os.replace(_build(Path(private)), folder / _file_name())
+            _remove_old(folder)
         except OSError as error:
             reason = _reason(error)
             _say(f"{reason}; compiling in a private folder for this process alone (RAYTRACE_CACHE sets another)")
@@ -178,7 +184,7 @@ def library() -> ctypes.CDLL:
                 raise NoCompiler(f"the trace cannot be compiled: {_reason(error)}") from None
     path = cache_folder() / _file_name()
     with suppress(OSError):
-        os.utime(path)  # when it was used last, for `_remove_old`
+        os.utime(path)  # the time of the last use, for `_remove_old`
     return _loaded(path)
 
 
@@ -266,17 +272,6 @@ def _is_kept() -> bool:
     finally:
         os.close(folder)
     return True
-
-
-def _keep(folder: Path) -> None:
-    """Compile into the cache folder. Raises OSError where that is not safe or cannot be written, NoCompiler."""
-    os.close(open_folder(folder, make=True))
-    path = folder / _file_name()
-    if path.exists():
-        _say(f"{path} can be another user's: compiled anew")
-    with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
-        os.replace(_build(Path(private)), path)
-    _remove_old(folder)
 
 
 def _reason(error: OSError) -> str:

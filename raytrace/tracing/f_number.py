@@ -17,15 +17,18 @@ def working_f_number(lens: Lens) -> Tensor:
     light depend on. `FirstOrder.paraxial_working_f_number` has the slope of the paraxial ray. inf where it runs along
     the axis, nan where it is lost. Where the axis bends θ′ is half the angle between two rays of opposite rims.
     """
-    if is_bent(lens):
-        return _between_rims(lens)
-    rim = lens.wavelengths.new_tensor([[0.0], [1.0]])
     wavelength = lens.primary[None]
-    rays = image_rays(lens, rim, fields=torch.zeros_like(rim), wavelengths=wavelength)
     n_image = media(lens, wavelength)[-2]
+    if is_bent(lens):
+        rims = lens.wavelengths.new_tensor([[0.0, 0.0], [1.0, -1.0]])
+        rays = image_rays(lens, rims, fields=torch.zeros_like(rims[:, :1]), wavelengths=wavelength)
+        step = rays.direction[:, 0, 0, 0] - rays.direction[:, 0, 0, 1]
+        number = 1 / (n_image[0] * torch.linalg.vector_norm(step))
+        return torch.where(rays.valid.all(), number, torch.nan)
+    rim = lens.wavelengths.new_tensor([[0.0], [1.0]])
+    rays = image_rays(lens, rim, fields=torch.zeros_like(rim), wavelengths=wavelength)
     L, M, _ = rays.direction[:, 0, 0, 0]
-    found = 0.5 / (n_image * torch.hypot(L, M))[0]
-    return torch.where(rays.valid[0, 0, 0], found, torch.nan)
+    return torch.where(rays.valid[0, 0, 0], 0.5 / (n_image * torch.hypot(L, M))[0], torch.nan)
 
 
 def axial_f_number(lens: Lens) -> Tensor:
@@ -40,12 +43,3 @@ def axial_f_number(lens: Lens) -> Tensor:
     both = torch.isfinite(tangential) & torch.isfinite(sagittal)
     mean = torch.sqrt(torch.where(both, tangential * sagittal, 1.0))
     return torch.where(both, mean, torch.minimum(tangential, sagittal))
-
-
-def _between_rims(lens: Lens) -> Tensor:
-    rims = lens.wavelengths.new_tensor([[0.0, 0.0], [1.0, -1.0]])
-    wavelength = lens.primary[None]
-    rays = image_rays(lens, rims, fields=torch.zeros_like(rims[:, :1]), wavelengths=wavelength)
-    step = rays.direction[:, 0, 0, 0] - rays.direction[:, 0, 0, 1]
-    found = 1 / (media(lens, wavelength)[-2][0] * torch.linalg.vector_norm(step))
-    return torch.where(rays.valid.all(), found, torch.nan)

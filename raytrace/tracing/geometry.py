@@ -53,18 +53,25 @@ class Defect:
 def defects(lens: Lens) -> tuple[Defect, ...]:
     """Everything of a lens, in its configuration, that cannot be made."""
     lens = detached(lens)
-    heights = _semi_diameters(lens)
-    found = [_closed(k, surface, heights[k]) for k, surface in enumerate(lens.surfaces) if k]
+    heights, found = _semi_diameters(lens), []
+    for k, (surface, height) in enumerate(zip(lens.surfaces, heights, strict=True)):
+        edge = math.inf if k == 0 or surface.is_break else _edge_radius(surface)
+        if math.isfinite(edge) and height >= edge:
+            words = (
+                f"surface {k} does not reach its semi-diameter of {height:.6g} mm: it closes at {edge:.6g} mm "
+                f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
+            )
+            found.append(Defect(k, "reach", height - edge, words))
     for k, end, side in _gaps(lens):
         found += _of_gap(lens, k, end, side, heights)
-    return tuple(one for one in found if one is not None)
+    return tuple(found)
 
 
 def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
     """`defects`, each with a warning Unbuildable."""
     found = defects(lens)
-    for one in found:
-        warnings.warn(one.words, Unbuildable, stacklevel=calling_level())
+    for defect in found:
+        warnings.warn(defect.words, Unbuildable, stacklevel=calling_level())
     return found
 
 
@@ -98,20 +105,6 @@ def _reaches(lens: Lens) -> list[float]:
     return found
 
 
-def _closed(k: int, surface: Surface, height: float) -> Defect | None:
-    """The defect of a surface that does not reach its semi-diameter."""
-    if surface.is_break or math.isnan(height):
-        return None
-    edge = _edge_radius(surface)
-    if not height >= edge:
-        return None
-    words = (
-        f"surface {k} does not reach its semi-diameter of {height:.6g} mm: it closes at {edge:.6g} mm "
-        f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
-    )
-    return Defect(k, "reach", height - edge, words)
-
-
 def edge_radius(surface: Surface) -> float:
     """Largest radius in mm at which the conic of a surface exists: 1/(|c| √(1+k)) where it closes, else inf.
 
@@ -136,21 +129,18 @@ def _edge_radius(surface: Surface) -> float:
 def _gaps(lens: Lens) -> list[tuple[int, int, float]]:
     """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
     indices = media(lens, lens.primary)
-    surfaces, found, before, side = lens.surfaces, [], None, 1.0
-    for k, surface in enumerate(surfaces[:-1]):
-        if k == 0:
-            continue
-        posed = surface.is_break or surface.before is not None
-        if posed:
+    gaps, before, side = [], None, 1.0
+    for k, surface in enumerate(lens.surfaces[1:-1], 1):
+        if surface.is_break or surface.before is not None:
             before = None
         if surface.is_mirror or surface.phase is not None or not torch.equal(indices[k], indices[k - 1]):
             if before is not None:
-                found.append((before, k, side))
+                gaps.append((before, k, side))
             before = k
         side = -side if surface.is_mirror else side
         if surface.after is not None:
             before = None
-    return found
+    return gaps
 
 
 def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> list[Defect]:
@@ -173,8 +163,8 @@ def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> 
                 f"surfaces {k} and {end} cross {at:.4g} mm from the axis: {medium} of {least:.4g} mm within the edge"
             )
             return [Defect(k, "crossing", least, words)]
-        own = [r.new_tensor(heights[one]) for one in (k, end)]
-        edge = gap + side * float(_sag(back, x * own[1], y * own[1]) - _sag(front, x * own[0], y * own[0]))
+        h, h_end = r.new_tensor(heights[k]), r.new_tensor(heights[end])
+        edge = gap + side * float(_sag(back, x * h_end, y * h_end) - _sag(front, x * h, y * h))
         if medium == "glass" and edge < -_LEAST:
             words = f"the glass between surfaces {k} and {end} is {edge:.4g} mm thick at its edge: negative"
             return [Defect(k, "edge", edge, words)]

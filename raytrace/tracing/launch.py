@@ -264,8 +264,12 @@ def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) ->
     estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
     if lens.ray_aiming == "paraxial":
         return estimate, None
-    height, arrives = _marginal_height(lens, paraxial, entrance)
-    return torch.where(arrives, height.abs(), estimate), arrives
+    edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
+    index = index_behind(lens, 0, lens.primary).to(edge.dtype)
+    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
+    position, arrives = at_stop(lens, rays, lens.primary)
+    height = position[1].abs() if entrance is None else safe_sqrt(dot_2(position, position))
+    return torch.where(arrives, height, estimate), arrives
 
 
 def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
@@ -282,21 +286,10 @@ def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -
     return _signed(radius, paraxial, entrance)
 
 
-def _marginal_height(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor]:
-    """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
-    wavelength = lens.primary
-    edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
-    index = index_behind(lens, 0, wavelength).to(edge.dtype)
-    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
-    position, arrives = at_stop(lens, rays, wavelength)
-    return (position[1] if entrance is None else safe_sqrt(dot_2(position, position))), arrives
-
-
 def _through_entrance_pupil(
     lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor, entrance: Entrance | None
 ) -> Rays:
-    """Rays from a slope or object height (2, ...) to the entrance pupil, the paraxial one if there is no other, at
-    fractions (2, ...)."""
+    """Rays from a slope or object height (2, ...) to fractions (2, ...) of the entrance pupil, by default paraxial."""
     distance = lens.surfaces[0].thickness
     at_infinity = is_at_infinity(lens)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
@@ -319,16 +312,9 @@ def _through_entrance_pupil(
     aim = torch.stack([aim_x, aim_y, depth])
     if at_infinity:
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
-    z = sag(lens.surfaces[0], x * x + y * y) - distance
-    return _towards_the_lens(torch.stack([x, y, z]), aim, index)
-
-
-def _towards_the_lens(point: Tensor, aim: Tensor, index: Tensor) -> Rays:
-    """Rays of an object point O through pupil points A that travel towards +z, started at the nearer of O and A.
-
-    A virtual object lies behind surface 1, and an entrance pupil may lie before the object (a stop behind the focus
-    of what is before it): then light runs from A to O on the same line.
-    """
+    point = torch.stack([x, y, sag(lens.surfaces[0], x * x + y * y) - distance])
+    # Rays travel towards +z and start at the nearer of object point O and pupil point A. A virtual object lies behind
+    # surface 1, and an entrance pupil may lie before the object: then light runs from A to O on the same line.
     rays = rays_from_point(point, aim, index=index)
     backward, nearer = aim[2] < point[2], point[2].abs() < aim[2].abs()
     far = index * dot(point, unit(point))
@@ -387,7 +373,7 @@ def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
 
 
 def _between(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
-    """Maps (5, ...) by one of the three rules; listed: (2, F, ...), maps: (5, F, ...), field: (2, 1, ...)."""
+    """Maps (5, ...) by the rule that applies; listed: (2, F, ...), maps: (5, F, ...), field: (2, 1, ...)."""
     radius = safe_sqrt(dot_2(listed, listed))
     largest, place = radius.max(0, keepdim=True)
     x, y = (safe_divide(torch.gather(part, 0, place), largest) for part in listed)
@@ -397,7 +383,11 @@ def _between(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
     one_sided = (along >= -_OFF_LINE * largest).all(0)
     by_radius = _by_radius(radius, maps, line, field)
     by_line = _linear(along, maps, dot_2(line, field))
-    return torch.where(on_line, torch.where(one_sided, by_radius, by_line), _by_distance(listed, maps, field))
+    # Weights 1/distance², relative to the nearest so that none overflows.
+    distance = dot_2(listed - field, listed - field)
+    weight = safe_divide(distance.amin(0).expand_as(distance), distance)
+    by_distance = safe_divide((weight * maps).sum(1), weight.sum(0))
+    return torch.where(on_line, torch.where(one_sided, by_radius, by_line), by_distance)
 
 
 def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Tensor:
@@ -408,13 +398,6 @@ def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Ten
     interpolated = _linear(torch.cat([axis, radius]), torch.cat([whole.expand(5, *axis.shape), maps], 1), size)
     cosine = torch.where(size > 0, safe_divide(dot_2(line, field), size), 1.0)
     return _rotated(interpolated, cosine[0], safe_divide(_cross(line, field), size)[0])
-
-
-def _by_distance(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
-    """Weights 1/distance², taken against the nearest so that none overflows."""
-    distance = dot_2(listed - field, listed - field)
-    weight = safe_divide(distance.amin(0).expand_as(distance), distance)
-    return safe_divide((weight * maps).sum(1), weight.sum(0))
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

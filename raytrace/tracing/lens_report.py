@@ -1,7 +1,4 @@
-"""Views of a lens as it stands: first-order data and prescription, and the cross section.
-
-Remarks: what a surface is beside a conic, in words for a table and by name for a document.
-"""
+"""Lens report: first-order data and the prescription of a lens, as text, table and document."""
 
 import dataclasses
 import math
@@ -27,7 +24,7 @@ from raytrace.tracing.geometry import defects, warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 
-#: What phases and departures are called, with their own numbers; of others their kind stands alone.
+#: Descriptions of phases and sag terms with their numbers; others are described by their class alone.
 _WORDS = {
     "Grating": "grating of {frequency:.6g} lines/µm, order {order:g}",
     "RadialPhase": "binary 2 over {radius:.6g} mm, order {order:g}",
@@ -46,79 +43,65 @@ _WORDS = {
 
 
 def remarks(surface: Surface) -> list[str]:
-    """What a surface is beside a conic: its kind of sag, its departure, its phase, and how it stands."""
-    found = [*_kind(surface), *(_part(part) for part in (surface.sag_terms, surface.phase) if part is not None)]
+    """Descriptions of the kind of sag, the sag terms, the phase and the poses of a surface."""
+    parts: list[str] = []
+    if surface.coefficients is not None:
+        parts.append(surface.kind)
+        for name, number_of in zip(KINDS[surface.kind].heads, surface.coefficients.tolist(), strict=False):
+            if name == "curvature_x":
+                name, number_of = "radius x", 1 / number_of if number_of else math.inf
+            parts.append(f"{name.replace('_', ' ')} {number_of:.6g}")
+    for part in (surface.sag_terms, surface.phase):
+        if isinstance(part, IdealLens):
+            x, y = (1 / power if power else math.inf for power in (float(part.power_x), float(part.power_y)))
+            parts.append(f"ideal lens, f {x:.6g} mm" + ("" if x == y else f" in x, {y:.6g} mm in y"))
+        elif part is not None:
+            scalars = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+            scalars = {name: float(n) for name, n in scalars.items() if isinstance(n, Tensor) and n.dim() == 0}
+            parts.append(_WORDS.get(type(part).__name__, type(part).__name__).format(**scalars))
     if surface.is_break:
-        return [*found, "coordinate break", *_pose(surface.before)]
+        return [*parts, "coordinate break", *_pose(surface.before)]
     for where, pose in (("before", surface.before), ("behind", surface.after)):
         if words := _pose(pose):
-            found += [f"{where}: {words[0]}", *words[1:]]
-    return found
+            parts += [f"{where}: {words[0]}", *words[1:]]
+    return parts
 
 
 def entries(surface: Surface) -> dict:
     """The same for a document: keys that only such surfaces have."""
-    found: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
-    for name in ("sag_terms", "phase"):
-        part = getattr(surface, name)
+    document: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
+    for name, part in (("sag_terms", surface.sag_terms), ("phase", surface.phase)):
         if part is not None:
-            found[name] = {"kind": type(part).__name__, **_fields(part)}
-    for name in ("before", "after"):
-        if getattr(surface, name) is not None:
-            found[name] = _fields(getattr(surface, name))
-    return found | ({"is_break": True} if surface.is_break else {})
-
-
-def _kind(surface: Surface) -> list[str]:
-    """The kind of sag, with the numbers that stand before its terms."""
-    if surface.coefficients is None:
-        return []
-    heads = zip(KINDS[surface.kind].heads, surface.coefficients.tolist(), strict=False)
-    return [surface.kind, *(_head(name, value) for name, value in heads)]
-
-
-def _head(name: str, value: float) -> str:
-    if name != "curvature_x":
-        return f"{name.replace('_', ' ')} {value:.6g}"
-    return f"radius x {1 / value:.6g}" if value else "radius x inf"
-
-
-def _part(part) -> str:
-    if isinstance(part, IdealLens):
-        return f"ideal lens, f {_focal_lengths(float(part.power_x), float(part.power_y))}"
-    scalars = {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}
-    scalars = {name: float(one) for name, one in scalars.items() if isinstance(one, Tensor) and one.dim() == 0}
-    name = type(part).__name__
-    return _WORDS.get(name, name).format(**scalars)
-
-
-def _focal_lengths(power_x: float, power_y: float) -> str:
-    x, y = (1 / power if power else math.inf for power in (power_x, power_y))
-    return f"{x:.6g} mm" if x == y else f"{x:.6g} mm in x, {y:.6g} mm in y"
+            document[name] = {"kind": type(part).__name__, **_fields(part)}
+    for name, pose in (("before", surface.before), ("after", surface.after)):
+        if pose is not None:
+            document[name] = _fields(pose)
+    return document | ({"is_break": True} if surface.is_break else {})
 
 
 def _pose(pose: Pose | None) -> list[str]:
     if pose is None:
         return []
-    decentres = [f"{axis} {float(at):.6g}" for axis in "xyz" if (at := getattr(pose, axis)) is not None]
-    tilts = [f"{axis} {float(at):.6g}°" for axis in "xyz" if (at := getattr(pose, f"tilt_{axis}")) is not None]
-    parts = [f"decentre {' '.join(decentres)} mm"] if decentres else []
-    parts += [f"tilt {' '.join(tilts)}"] if tilts else []
-    return [*(reversed(parts) if pose.tilts_first else parts)]
+    shifts, tilts = {"x": pose.x, "y": pose.y, "z": pose.z}, {"x": pose.tilt_x, "y": pose.tilt_y, "z": pose.tilt_z}
+    decentre = " ".join(f"{axis} {float(shift):.6g}" for axis, shift in shifts.items() if shift is not None)
+    tilt = " ".join(f"{axis} {float(angle):.6g}°" for axis, angle in tilts.items() if angle is not None)
+    parts = [*([f"decentre {decentre} mm"] if decentre else []), *([f"tilt {tilt}"] if tilt else [])]
+    return parts[::-1] if pose.tilts_first else parts
 
 
 def _fields(part) -> dict:
-    found = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-    return {name: _plain(one) for name, one in found.items() if one is not None}
+    """The fields of a value that are not None, tensors as numbers."""
+    document = {}
+    for field in dataclasses.fields(part):
+        entry = getattr(part, field.name)
+        if isinstance(entry, Tensor):
+            document[field.name] = number(entry) if entry.dim() == 0 else numbers(entry)
+        elif entry is not None:
+            document[field.name] = entry
+    return document
 
 
-def _plain(one):
-    if not isinstance(one, Tensor):
-        return one
-    return number(one) if one.dim() == 0 else numbers(one)
-
-
-#: Lines of `raytrace info`: words, entry of FirstOrder (and the working F/# of real light), unit.
+#: Lines of `raytrace info`: text, entry of FirstOrder (or the real working F/#), unit.
 FIRST_ORDER_LINES = (
     ("effective focal length", "effective_focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
@@ -139,7 +122,7 @@ FIRST_ORDER_LINES = (
     ("Petzval radius", "petzval_radius", "mm"),
 )
 
-#: Lines of a lens whose axis bends, or whose sections differ: words, entry of BaseRay, unit.
+#: Lines of a lens whose axis bends, or whose sections differ: text, entry of BaseRay, unit.
 BASE_RAY_LINES = (
     ("focal length", "focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm along the base ray, from the last surface that is no break"),
@@ -155,39 +138,33 @@ BASE_RAY_LINES = (
 
 @value
 class Info(Result):
-    """First-order data and the prescription of a lens; the table has a row a surface: mm, the index at the primary
-    wavelength."""
+    """First-order data and prescription of a lens; the table has a row per surface, with the primary index; mm."""
 
     lens: Lens
 
     def columns(self) -> dict[str, Tensor]:
         lens = detached(self.lens)
         surfaces, like = lens.surfaces, lens.wavelengths
-        number_of = torch.arange(len(surfaces))
         rows = [
             (_radius(s), float(s.thickness), math.nan if s.semi_diameter is None else s.semi_diameter) for s in surfaces
         ]
         radius, thickness, size = like.new_tensor(rows).T
-        return {
-            "surface": number_of, "radius": radius, "thickness": thickness, "glass": number_of,
-            "index": like.new_tensor(_indices(lens)), "semi_diameter": size, "note": number_of,
-        }  # fmt: skip
+        surface, index = torch.arange(len(surfaces)), like.new_tensor(_indices(lens))
+        shape = {"surface": surface, "radius": radius, "thickness": thickness, "glass": surface, "index": index}
+        return shape | {"semi_diameter": size, "note": surface}
 
     def words(self) -> dict[str, Sequence[str]]:
         lens = detached(self.lens)
-        surfaces = lens.surfaces
-        return {
-            "glass": [label(s.glass) for s in surfaces],
-            "note": [_remarks(lens, k) for k in range(len(surfaces))],
-        }
+        notes = [_remarks(lens, k) for k in range(len(lens.surfaces))]
+        return {"glass": [label(surface.glass) for surface in lens.surfaces], "note": notes}
 
     def document(self) -> dict:
         lens = detached(self.lens)
-        indices, found = media(lens, lens.wavelengths), defects(lens)
+        indices, geometry = media(lens, lens.wavelengths), [defect.document() for defect in defects(lens)]
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
-            **_about_base_ray(lens),
+            **_base_ray_document(lens),
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
@@ -219,7 +196,7 @@ class Info(Result):
                 }
                 for k, surface in enumerate(lens.surfaces)
             ],
-            **({"geometry": [one.document() for one in found]} if found else {}),
+            **({"geometry": geometry} if geometry else {}),
         }
 
     def __str__(self) -> str:
@@ -230,6 +207,7 @@ class Info(Result):
         lines += _base_ray_lines(lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several, which = len(lens.wavelengths) > 1, _configuration(lens)
+        aiming = lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
         shown = [
             f"{w:g}" + ("*" if i == lens.primary_wavelength - 1 and several else "")
             for i, w in enumerate(lens.wavelengths.tolist())
@@ -237,7 +215,7 @@ class Info(Result):
         lines += [
             f"  {'wavelengths':<24} {', '.join(shown)} µm"
             + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
-            f"  {'ray aiming':<24} {_aiming(lens)}",
+            f"  {'ray aiming':<24} {aiming}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
             *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
@@ -245,9 +223,10 @@ class Info(Result):
             f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
         for k, (surface, index) in enumerate(zip(lens.surfaces, _indices(lens), strict=True)):
-            size = surface.semi_diameter
+            size, radius = surface.semi_diameter, _radius(surface)
+            shown = "-" if surface.is_break else "inf" if math.isinf(radius) else f"{radius:.6g}"
             lines.append(
-                f"  {k:>7} {_radius_in_words(surface):>13} {float(surface.thickness):>12.7g} "
+                f"  {k:>7} {shown:>13} {float(surface.thickness):>12.7g} "
                 f"{label(surface.glass):<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
                 f"{_remarks(lens, k)}".rstrip()
             )
@@ -255,15 +234,14 @@ class Info(Result):
 
 
 def info(lens: Lens) -> Info:
-    """First-order data and prescription; what `print(lens)` shows. Warns UnfilledStop, and Unbuildable of a lens that
-    cannot be made."""
+    """First-order data and prescription, the text of `print(lens)`. Warns UnfilledStop, and Unbuildable."""
     warn_of_defects(lens)
     warn_of_filling(lens, field_points(None, like=lens))
     return Info(lens)
 
 
 def text(lens: Lens) -> str:
-    """What `print(lens)` shows: the lens as `info` tells it, or its bare numbers where it cannot be traced."""
+    """The text of `print(lens)`: that of `info`, or the bare numbers of a lens that cannot be traced."""
     try:
         return str(Info(lens))
     except (ValueError, RuntimeError):
@@ -271,34 +249,21 @@ def text(lens: Lens) -> str:
 
 
 def _configuration(lens: Lens) -> dict[str, int]:
-    """Which of its configurations a lens is in, and how many there are; nothing of a lens with one."""
     several = count(lens.operands)
     return {"configuration": lens.current_configuration, "configurations": several} if several > 1 else {}
 
 
-def _aiming(lens: Lens) -> str:
-    """The ray aiming of a lens, and what "auto" comes to."""
-    return lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
-
-
-def _radius(surface) -> float:
+def _radius(surface: Surface) -> float:
     """mm, of the vertex where the surface has no curvature of its own; inf of a plane."""
     curvature = float(vertex_curvature(surface)) if surface.curvature is None else float(surface.curvature)
     return math.inf if curvature == 0 else 1 / curvature
 
 
-def _radius_in_words(surface: Surface) -> str:
-    """The radius as the table shows it; - for a coordinate break, which has none."""
-    radius = _radius(surface)
-    return "-" if surface.is_break else "inf" if math.isinf(radius) else f"{radius:.6g}"
-
-
 def _environment(holder: Lens | Surface) -> dict:
-    """The entry of a document for an environment, where there is one."""
     place = holder.environment
-    return (
-        {"environment": {"temperature": number(place.temperature), "pressure": number(place.pressure)}} if place else {}
-    )
+    if not place:
+        return {}
+    return {"environment": {"temperature": number(place.temperature), "pressure": number(place.pressure)}}
 
 
 def _indices(lens: Lens) -> list[float]:
@@ -306,7 +271,6 @@ def _indices(lens: Lens) -> list[float]:
 
 
 def _quantity(value: float) -> str:
-    """A number, "infinite", which has no sign, or - for one that does not exist."""
     if math.isnan(value):
         return "-"
     return "infinite" if math.isinf(value) else f"{value + 0.0:.9g}"
@@ -319,12 +283,12 @@ def _figures(lens: Lens) -> list[float]:
 
 
 def _has_sections(lens: Lens) -> bool:
-    """Whether first-order data about the base ray say more than the straightened ones."""
+    """Whether first-order data about the base ray differ from the straightened ones."""
     return not all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
 
 
-def _about_base_ray(lens: Lens) -> dict:
-    """What JSON says of the base ray: (tangential, sagittal) of every figure, null for what does not exist."""
+def _base_ray_document(lens: Lens) -> dict:
+    """(tangential, sagittal) of every figure, null for those that do not exist."""
     if not _has_sections(lens):
         return {}
     base = base_ray(lens)

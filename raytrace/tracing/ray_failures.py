@@ -41,10 +41,10 @@ class OutOfReach(ValueError):
 
 @value
 class Losses:
-    """How many rays end at every surface, each counted where it was lost first.
+    """Number of rays that end at every surface, by their first failure.
 
-    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) never set out, for no
-    ray through their pupil point was found; launched: how many there were of each field and wavelength.
+    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) not launched, for no
+    ray through their pupil point was found; launched: number of each field and wavelength.
     """
 
     lost: Tensor
@@ -53,11 +53,11 @@ class Losses:
 
     @property
     def arrived(self) -> Tensor:
-        """How many rays (F, W) reach the image."""
+        """Number of rays (F, W) that reach the image."""
         return self.launched - self.lost.sum((0, 1)) - self.unaimed
 
     def words(self, field: int, wavelength: int) -> str:
-        """What became of the rays of one field and wavelength, as "all 648 rays lost: 648 vignetted at surface 6"."""
+        """The rays of one field and wavelength as text, "all 648 rays lost: 648 vignetted at surface 6"."""
         arrived = int(self.arrived[field, wavelength])
         parts = [f"{n} {FATES['unaimed']}"] if (n := int(self.unaimed[field, wavelength])) else []
         for k, of_surface in enumerate(self.lost[:, :, field, wavelength].T.tolist(), 1):
@@ -69,9 +69,9 @@ class Losses:
 
 
 def ray_status(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing, Tensor]]:
-    """What happens at each surface in turn, as `trace.steps` tells it, and the status (...) of every ray behind it.
+    """The crossing of each surface in turn, as of `trace.steps`, and the status (...) of every ray behind it.
 
-    wavelength: (...) µm; status: place in STATUS of what befell the ray first.
+    wavelength: (...) µm; status: index in STATUS of the first failure.
     """
     status = torch.where(rays.valid, _OK, STATUS.index("unaimed"))
     for crossing in lens_steps(lens, rays, wavelength):
@@ -89,7 +89,7 @@ def ray_failures(
     wavelengths: Tensor | None = None,
     ray_aiming: str | None = None,
 ) -> Losses:
-    """Where rays are lost on their way to the image; arguments as for `launch`."""
+    """Where rays fail or are vignetted; arguments as for `launch`."""
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
     codes = [STATUS.index(name) for name in LOST]
@@ -133,10 +133,9 @@ def warn_of_failures(
 
 
 def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> None:
-    """Tell of fields (2, F) of which no ray reaches the sensor at the primary wavelength, why, and what helps.
+    """Report fields (2, F), by default the lens's, whose rays all fail at the primary wavelength, with a remedy.
 
-    fields: by default the lens's own. Raises OutOfReach if there is one and every field is needed, else if no field is
-    left; else warns LostRays.
+    Raises OutOfReach if there is one and every field is needed, or if no field is left; else warns LostRays.
     """
     tried = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
@@ -158,7 +157,6 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
 
 
 def _help(lens: Lens, fields: Tensor | None) -> str:
-    """What to do about a field out of reach."""
     if hint := beam_hint(lens):
         return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
     if fields is not None:
@@ -168,7 +166,7 @@ def _help(lens: Lens, fields: Tensor | None) -> str:
 
 
 def beam_hint(lens: Lens) -> str:
-    """What to do about a beam that grows with the object distance, "" where the aperture is no cone at the object."""
+    """The remedy for a beam that grows with the object distance, "" unless the aperture is a cone at the object."""
     if lens.aperture.kind not in ("object_na", "object_cone_angle"):
         return ""
     number = float(lens.aperture.value)

@@ -39,8 +39,8 @@ Bundle = tuple[Lens, Tensor, Tensor, Tensor]
 class _Front:
     """Rays behind the first `count` surfaces after the object, in the frame of the last of them (of surface 1 if 0).
 
-    crossings: those on the way, if recorded; indices: of all media, None if one depends on a variable; smooth: whether
-    polynomials through its object distances give the rays of those between.
+    crossings: of these surfaces, if recorded; indices: of all media, None if one depends on a variable; smooth: whether
+    polynomials in 1/distance reproduce the rays.
     """
 
     count: int
@@ -73,12 +73,11 @@ class Memo:
     """Results reused between calls, as in `psf(..., memo=memo)` of an optimisation loop.
 
     Of a lens these are rays. Numbers of the lens, fields and wavelengths that require a gradient are variables; the
-    others are compared at each call, and rays are retraced after a change, so that a memo changes no result. Of a wave
-    scene it is everything that does not depend on the heights of its elements. most: bundles stored, the oldest being
-    dropped first; made: bundles made so far; crossed: surfaces traced through. Inside transforms of `torch.func`, which
-    hide the variables, a memo is ignored.
-    object_distances: smallest and largest, mm, of scenes that draw their distances at random at every call. Rays of
-    such a scene are a polynomial in 1/distance through ten traced ones, if its error is below 1e-9 mm, else traced.
+    others are compared at each call, and rays are retraced after a change: a memo changes no result. Of a wave scene
+    it is everything that does not depend on the heights of its elements. Inside transforms of `torch.func`, which hide
+    the variables, a memo is ignored. most: bundles stored, the oldest being dropped first; made: bundles made so far;
+    crossed: surfaces traced through. object_distances: range in mm of scenes with random distances: their rays are a
+    polynomial in 1/distance through ten traced ones if its error is below 1e-9 mm, else traced.
     """
 
     def __init__(self, most: int = 64, *, object_distances: tuple[float, float] | None = None):
@@ -129,17 +128,15 @@ class Memo:
 
 def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:
     """The rays of field and pupil points at the image surface; everything broadcasts."""
-    lens, _, wavelength, _ = bundle
     if memo is None or torch._C._are_functorch_transforms_active():
-        return trace_lens(lens, _launched(bundle), wavelength)
+        return trace_lens(bundle[0], _launched(bundle), bundle[2])
     return trace_surfaces(**_rest(bundle, memo.front(bundle, recorded=False), memo))
 
 
 def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
     """The crossings of the rays with every surface after the object."""
-    lens, _, wavelength, _ = bundle
     if memo is None or torch._C._are_functorch_transforms_active():
-        return list(lens_steps(lens, _launched(bundle), wavelength))
+        return list(lens_steps(bundle[0], _launched(bundle), bundle[2]))
     front = memo.front(bundle, recorded=True)
     return [*front.crossings, *steps(**_rest(bundle, front, memo))]
 
@@ -151,8 +148,7 @@ def _launched(bundle: Bundle) -> Rays:
 
 def _rest(bundle: Bundle, front: _Front, memo: Memo) -> dict:
     """Arguments of `steps` that resume from a front."""
-    lens, _, wavelength, _ = bundle
-    done = front.count
+    (lens, _, wavelength, _), done = bundle, front.count
     indices = media(lens, wavelength) if front.indices is None else front.indices
     memo.crossed += len(lens.surfaces) - 1 - done
     return {
@@ -173,8 +169,16 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
     constant_indices = None if any(index.requires_grad for index in indices) else indices
     if any(t is not None and t.requires_grad for t in (rays.position, rays.direction, rays.opl)):
         return _Front(0, None, [], constant_indices)
-    surfaces = sequence_of(lens)
-    count, crossings = _first_varied(lens, surfaces, indices, wavelength), []
+    surfaces, crossings = sequence_of(lens), []
+    for count, surface in enumerate(surfaces):  # up to a surface whose position, shape or media depend on a variable
+        gap = gap_behind(lens.surfaces[count]) if count else None
+        shape = [getattr(surface, name) for name in (*SHAPE, "phase", "before")]
+        phased = (wavelength,) if surface.phase is not None else ()
+        numbers = pytree.tree_leaves((gap, shape, *phased, *indices[count : count + 2]))
+        if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
+            break
+    else:
+        count = len(surfaces)
     with torch.enable_grad():
         if recorded:
             crossings = list(steps(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength))
@@ -182,18 +186,6 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
         else:
             rays = trace_surfaces(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength)
     return _Front(count, rays, crossings, constant_indices)
-
-
-def _first_varied(lens: Lens, surfaces, indices: Sequence[Tensor], wavelength: Tensor) -> int:
-    """Number of surfaces after the object in front of the first whose position, shape or media depend on a variable."""
-    for count, surface in enumerate(surfaces):
-        gap = gap_behind(lens.surfaces[count]) if count else None
-        shape = [getattr(surface, name) for name in (*SHAPE, "phase", "before")]
-        phased = (wavelength,) if surface.phase is not None else ()
-        numbers = pytree.tree_leaves((gap, shape, *phased, *indices[count : count + 2]))
-        if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
-            return count
-    return len(surfaces)
 
 
 # -- interpolation in object distance ---------------------------------------------------------------------------------
@@ -241,16 +233,11 @@ def _is_smooth(front: _Front) -> bool:
 def _at_distances(front: _Front, weights: Tensor) -> _Front:
     """The front of a range of object distances at those of the weights (D, K)."""
 
-    def one_for_all(flag: Tensor) -> Tensor:
-        return flag[:1].expand(len(weights), *flag.shape[1:])
-
-    crossings = [
-        Crossing(
-            _combined(crossing.rays, weights),
-            *map(one_for_all, (crossing.missed, crossing.totally_reflected, crossing.clipped)),
-        )
-        for crossing in front.crossings
-    ]
+    crossings = []
+    for crossing in front.crossings:
+        flags = (crossing.missed, crossing.totally_reflected, crossing.clipped)
+        flags = (flag[:1].expand(len(weights), *flag.shape[1:]) for flag in flags)
+        crossings.append(Crossing(_combined(crossing.rays, weights), *flags))
     return dataclasses.replace(front, rays=_combined(front.rays, weights), crossings=crossings)
 
 

@@ -4,14 +4,13 @@ Arrivals: where every ray of a spot meets the sensor, from which field, colour a
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
@@ -29,9 +28,9 @@ class Spot:
     mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
     points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
 
-    A spot that no ray of any weight reaches is nan, with gradient 0: it spoils the sum that it is added to, and no
-    derivative of the others. A merit that leaves it out (`nansum`, a mask by `rays`) is rewarded for losing it: keep
-    the lens where `rays` does not fall, add what a lost spot is to cost, or ask for an error (`empty`).
+    A spot that no weighted ray reaches is nan, with gradient 0: the sum with it is nan, the derivatives of the others
+    are not. A merit that ignores it (`nansum`, a mask by `rays`) rewards the loss: constrain `rays`, add a penalty, or
+    request an error (`empty`).
     """
 
     centroid: Tensor
@@ -50,10 +49,9 @@ class EmptySpot(ValueError):
 def spot_of(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan") -> Spot:
     """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default.
 
-    about: (2, ...) mm, from where radii count, the centroid by default. Equally weighted hexapolar rays about the
-    primary wavelength's chief ray are the default of OpticStudio; by the area that a ray stands for, about the
-    centroid, a spot has the moments of the light.
-    empty: what a spot without rays is: "nan", or "error", which raises EmptySpot and looks at the numbers to do so.
+    about: (2, ...) mm, reference of radii, the centroid by default. OpticStudio's default is equally weighted hexapolar
+    rays about the primary chief ray; weighted by pupil area, about the centroid, a spot has the moments of the light.
+    empty: the result of a spot without rays: "nan", or "error", which raises EmptySpot and reads the numbers to do so.
     """
     return spot_of_points(rays.position[:2], rays.valid, weights, about=about, empty=empty)
 
@@ -138,13 +136,12 @@ _KEPT_BYTES = 100  # of a ray on the sensor, with its status
 class Arrivals(Result):
     """Rays (3, F, W, P) on the sensor, every ray of the pupil for every field and wavelength.
 
-    status: (F, W, P), place in STATUS of what befell it first; reached: (F, W, P), whether it has a place on the
-    sensor, as a vignetted ray that goes on may have. weight: (W, P), 1 in all for a field.
-    pupil: (2, P); fields: (2, F); wavelengths: (W,) µm.
-    The table has a row a ray, its status in words; x and y are empty where it is not on the sensor.
+    status: (F, W, P), index in STATUS of the first failure; reached: (F, W, P), whether the ray has a point on the
+    sensor, as a vignetted ray may. weight: (W, P), sum 1 for a field. pupil: (2, P); fields: (2, F); wavelengths: (W,)
+    µm. The table has a row per ray; x and y are empty for rays that are not on the sensor.
     """
 
-    UNITS: ClassVar = {"field_x": "", "field_y": ""}  # of the lens, which is not stored
+    COLUMNS = Column("field_x"), Column("field_y")  # in the unit of the lens, which is not stored
 
     rays: Rays
     status: Tensor
@@ -197,7 +194,7 @@ def arrivals(
     )
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     weight = shares[:, None] * weights / weights.sum()
-    status, reached = (torch.cat(found) for found in zip(*(rest for _, *rest in each), strict=True))
+    status, reached = (torch.cat(parts) for parts in zip(*(rest for _, *rest in each), strict=True))
     return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
 
 
@@ -207,8 +204,8 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
     reached = rays.valid
     for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
-        found = crossing.rays, status, reached
-    return found
+        on_sensor = crossing.rays, status, reached
+    return on_sensor
 
 
 def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,13 +19,13 @@ from raytrace.budget import afford, allowed_bytes, forewarn
 from raytrace.files import write_atomically
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_table
 from raytrace.maths.grid import Grid, centres, grid
-from raytrace.maths.result import Result, number, object_text, rows
+from raytrace.maths.result import Column, Result, flat, number, rows, text_table
 from raytrace.maths.value import value
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers
+from raytrace.wave_optics.element import Element, EvenPowers, is_flat
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
 from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
@@ -45,6 +45,12 @@ class ElementPsf(Result):
     axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
     None where it is a pixel of the window.
     """
+
+    COLUMNS = (
+        Column("depth", "mm", ">12g", "object"), Column("wavelength", "µm", ">11g"),
+        Column("energy", "", ">8.4f", "energy\nwindow"), Column("peak", "", ">10.6f", "peak\npixel"),
+        Column("half_energy_radius_um", "µm", ">12.2f", "half-energy\nradius"),
+    )  # fmt: skip
 
     kernel: Tensor
     scene: WaveScene
@@ -83,17 +89,13 @@ class ElementPsf(Result):
 
     @property
     def peak(self) -> Tensor:
-        """(D, W): the most light in one pixel, of those of the window and one centred on the axis, so that windows of
-        an even and of an odd number of pixels have the same peak.
-        """
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis."""
         brightest = self.kernel.amax((-2, -1))
         return brightest if self.axial is None else torch.maximum(brightest, self.axial)
 
     @property
     def half_energy_radius(self) -> Tensor:
-        """(D, W) mm about the axis that holds half of all light through the aperture, to half a pixel; inf where the
-        window does not hold it.
-        """
+        """(D, W) mm about the axis that holds half of all light, to half a pixel; inf where the window does not."""
         x, y = centres(self.grid)
         distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
         inside = (self.kernel.flatten(-2)[..., order].cumsum(-1) < 0.5).sum(-1)
@@ -105,7 +107,7 @@ class ElementPsf(Result):
             "wavelength": self.wavelengths,
             "energy": self.energy,
             "peak": self.peak,
-            "half_energy_radius": self.half_energy_radius,
+            "half_energy_radius_um": 1e3 * self.half_energy_radius,
         }
 
     def document(self) -> dict:
@@ -129,21 +131,15 @@ class ElementPsf(Result):
     def __str__(self) -> str:
         lines = [self.title]
         for element in self.scene.elements:
-            low, high = height_range(element)
-            material = element.glass.name or "constant index"
+            (low, high), material = height_range(element), element.glass.name or "constant index"
             lines.append(f"{element.kind.words} of {material}, heights over {1e3 * (high - low):.4g} µm")
         lines += [
             f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
             f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
-            f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
-            f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
         ]
-        for row in rows(self.columns()):
-            depth, wavelength, energy, peak, radius = map(number, row.values())
-            half = "–" if radius is None else f"{1e3 * radius:.2f}"
-            place = object_text(math.inf if depth is None else depth)
-            lines.append(f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}")
-        return "\n".join(lines)
+        listed = flat(self.columns())
+        listed["depth"] = [f"{depth:g}" for depth in listed["depth"]]
+        return "\n".join([*lines, *text_table({self.column(name): values for name, values in listed.items()})])
 
     def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
         """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
@@ -163,7 +159,7 @@ class ElementPsf(Result):
         tensors |= {"depths": self.depths, "wavelengths": self.wavelengths}
         arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
         arrays |= {"pixel_pitch": float(self.pitch), "element": self.element}
-        arrays |= {name: getattr(self.plan, name) for name in ("engine", "samples", "error")}
+        arrays |= {"engine": self.plan.engine, "samples": self.plan.samples, "error": self.plan.error}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
@@ -171,8 +167,8 @@ def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None,
     """PSFs of a scene, differentiable in every number of it.
 
     sampling: engine, samples, nodes, tol, pad, band_limit as `plan.plan` takes them, and its errors. plan: of an
-    earlier call, instead of them: for loops, nothing is estimated. memo: sums that do not depend on the heights, reused
-    while the rest of the scene stays as it is.
+    earlier call, instead of them: for loops. memo: sums that do not depend on the heights, reused while the rest of the
+    scene stays as it is.
     """
     plan = planning.plan(scene, **sampling) if plan is None else plan
     engine, sums = planning.ENGINES[plan.engine], None
@@ -183,27 +179,21 @@ def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None,
 
 def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
     """`make(scene, plan)` without graph, from memory where nothing but heights and coefficients has changed."""
-    numbers, structure = _constants(scene)
+    numbers, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
+    for element in scene.elements:
+        free = element.numbers
+        # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
+        jumps = isinstance(element.profile, EvenPowers) and element.period is not None
+        pitch = element.profile.pitch if is_flat(element) else None
+        parts = [element.radius, pitch, element.period, free.detach() if jumps else None]
+        numbers += [t for t in parts if t is not None]
+        kind = (type(element.profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
+        structure = (structure, *kind)
     if torch._C._are_functorch_transforms_active() or any(n.requires_grad for n in numbers):
         memo.made += 1
         return make(scene, plan)
     with torch.no_grad():
         return memo.find(numbers, (structure, plan), lambda: make(scene, plan), most=_KEPT)
-
-
-def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
-    """All numbers of a scene that sums depend on, and its structure."""
-    leaves, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
-    for element in scene.elements:
-        profile = element.profile
-        free = element.numbers
-        # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
-        jumps = isinstance(profile, EvenPowers) and element.period is not None
-        parts = [element.radius, getattr(profile, "pitch", None), element.period, free.detach() if jumps else None]
-        leaves += [t for t in parts if t is not None]
-        kind = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
-        structure = (structure, *kind)
-    return leaves, structure
 
 
 COLOURS = (0.46, 0.55, 0.64)
@@ -252,39 +242,26 @@ def wave_psf(
     Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
     each other, budget.OverBudget where one kernel alone would take too much.
     """
-    is_made = not isinstance(element, str | os.PathLike)
-    parts = (
-        (element,)
-        if isinstance(element, Element)
-        else tuple(element)
-        if is_made
-        else elements(
-            element,
-            aperture=aperture,
-            sensor=sensor,
-            focus=focus,
-            design_wavelength=design_wavelength,
-            levels=levels,
-            exact=exact,
-            glass=glass,
-            index=index,
-            wavelengths=wavelengths,
-            pitch=pitch,
-            span=span,
-            catalog=catalog,
-        )
-    )
-    _check_colours(parts, wavelengths)
-    scene = WaveScene(
-        elements=parts,
-        sensor_distance=_double(sensor),
-        depths=_double(depths),
-        wavelengths=_double(wavelengths),
-        grid=grid(_double(pixel), size),
-        exact=exact,
-    )
+    if isinstance(element, str | os.PathLike):
+        design = {"aperture": aperture, "sensor": sensor, "focus": focus, "exact": exact}
+        material = {"glass": glass, "index": index, "pitch": pitch, "span": span, "catalog": catalog}
+        wrap = {"design_wavelength": design_wavelength, "levels": levels, "wavelengths": wavelengths}
+        parts, name = elements(element, **design, **material, **wrap), str(element)
+    else:
+        parts = (element,) if isinstance(element, Element) else tuple(element)
+        name = " + ".join(part.kind.words for part in parts)
+    for glass in {id(part.glass.coefficients): part.glass for part in parts}.values():
+        check_unit(torch.tensor(wavelengths), [glass])
+        if glass.formula == "constant":
+            continue
+        low, high = glass.wavelength_range or (0.0, math.inf)
+        if outside := ", ".join(f"{wavelength:g}" for wavelength in wavelengths if not low <= wavelength <= high):
+            name = glass.name or "the material"
+            raise ValueError(f"{name} has indices from {low:g} to {high:g} µm, none at {outside} µm")
+        check_wavelengths(glass, wavelengths)
+    distances, window = [_double(numbers) for numbers in (sensor, depths, wavelengths)], grid(_double(pixel), size)
+    scene = WaveScene(parts, *distances, window, exact)
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
-    name = " + ".join(part.kind.words for part in parts) if is_made else str(element)
     kernel, axial = _kernels(scene, chosen, progress), None
     if size % 2 == 0:  # a corner of four pixels lies on the axis
         axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
@@ -316,15 +293,14 @@ def elements(
     """
     name = str(element)
     if name in BASELINES:
-        for option, number in {"glass": glass, "index": index, "pitch": pitch, "span": span}.items():
-            if number is not None:
-                raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
+        of_maps = {"glass": glass, "index": index, "pitch": pitch, "span": span}
+        if option := next((option for option, number in of_maps.items() if number is not None), ""):
+            raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
             raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
-        made_for = aim(
-            radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=design_wavelength or _DESIGN, exact=exact
-        )
-        return baseline(name, made_for, **({"levels": levels} if levels else {}))
+        distances = {"radius": 0.5 * aperture, "sensor": sensor, "focus": focus}
+        conditions = aim(**distances, wavelength=design_wavelength or _DESIGN, exact=exact)
+        return baseline(name, conditions, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in ELEMENT_FORMATS:
         raise ValueError(
             f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
@@ -340,21 +316,6 @@ def elements(
     made_of = {"glass": glass, "pitch": pitch, "span": span, "catalog": catalog}
     wrap = {"design_wavelength": design_wavelength, "levels": levels or 0}
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
-
-
-def _check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
-    """Raise ValueError for a wavelength (µm) outside the range of a material's data: thin elements depend on n - 1."""
-    for glass in {id(element.glass.coefficients): element.glass for element in parts}.values():
-        check_unit(torch.tensor(wavelengths), [glass])
-        if glass.formula == "constant":
-            continue
-        low, high = glass.wavelength_range or (0.0, math.inf)
-        outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
-        if outside:
-            listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
-            name = glass.name or "the material"
-            raise ValueError(f"{name} has indices from {low:g} to {high:g} µm, none at {listed} µm")
-        check_wavelengths(glass, wavelengths)
 
 
 def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:

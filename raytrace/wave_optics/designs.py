@@ -8,7 +8,6 @@ the design wavelength. A wrapped lens of power φ has the power φ λ/λ₀, a s
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 import torch
@@ -54,7 +53,7 @@ def aim(
     wavelength: float | Tensor = 0.55,
     exact: bool = False,
 ) -> Aim:
-    """The Aim of these numbers, by default f/7.1 at 1 m. Raises ValueError for one that is not positive and finite."""
+    """The Aim of these numbers, by default f/7.1 at 1 m. Raises ValueError for numbers not positive and finite."""
     numbers = {"radius": radius, "sensor": sensor, "focus": focus, "wavelength": wavelength}
     for name, number in numbers.items():
         if not number > 0 or (name != "focus" and not number < math.inf):
@@ -170,11 +169,11 @@ def achromat(
     """The diffractive achromat: rings of fused silica, heights within one wave, that maximise Σ_λ log E_λ(spot).
 
     After Peng, Fu, Heide and Heidrich, ACM Trans. Graph. 35, 31 (2016), with a gradient ascent of the product of
-    encircled energies instead of their greedy search for equal spectra.
+    encircled energies instead of their greedy search for equal spectra. Starts from the rings whose phases agree best
+    with the lenses of all wavelengths; the same numbers give the same rings.
 
     wavelengths: µm; spot: radius of the circle, mm; pitch: of the rings, mm; rate: of Adam, on the logit of the height;
-    encircled: the engine that gives E, by default `encircled_energy`. Starts from the rings whose phases agree best
-    with the lenses of all wavelengths. The same numbers give the same rings.
+    encircled: the engine that gives E, by default `encircled_energy`.
     """
     glass = find_glass("F_SILICA")
     colours = torch.tensor(wavelengths, dtype=torch.float64, device=aim.radius.device)
@@ -183,16 +182,20 @@ def achromat(
     wide = torch.tensor(pitch, dtype=torch.float64, device=colours.device)
     radius = aim.radius.detach().double()
 
-    def element(fraction: Tensor) -> Element:
-        return Element(Rings(top * fraction, wide), radius, glass)
-
+    # Of 200 heights up to `top`, those whose phases agree best, by Σ cos, with the lenses of all wavelengths.
+    r2 = _middles(radius, wide) ** 2
+    lens = polynomial(converging(aim).detach().double(), r2) * r2
+    levelled = torch.linspace(0, 1, 200).to(radius) * top
+    wanted = 2 * math.pi / (1e-3 * colours)[:, None, None] * lens[:, None]
+    agreement = torch.cos(_phase(glass, colours)[..., None] * levelled - wanted).sum(0)
+    start = levelled[agreement.argmax(-1)] / top
     with torch.enable_grad():
-        start = _start(aim, colours, glass, pitch=wide, top=top) / top
         free = torch.logit(start.clamp(0.02, 0.98)).requires_grad_()
         optimizer = torch.optim.Adam([free], rate)
         for _ in range(iterations):
             optimizer.zero_grad()
-            (-torch.log(energy(element(torch.sigmoid(free)))).sum()).backward()
+            rings = Rings(top * torch.sigmoid(free), wide)
+            (-torch.log(energy(Element(rings, radius, glass))).sum()).backward()
             optimizer.step()
     heights = (top * torch.sigmoid(free.detach())).to(aim.radius)
     return (Element(Rings(heights, wide.to(aim.radius)), aim.radius, glass, top.to(aim.radius), levels),)
@@ -203,9 +206,9 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
 
         U(ρ) = (2π/λz) Σ_rings e^(ik (n - 1) h) ∫ e^(ik e(r)) J0(2πρr/λz) r dr,   E = ∫ |U|² 2πρ dρ / πR²
 
-    with e(r) the path from the point and to the sensor. The integral over a ring, in `inner` parts of constant e(r),
-    does not depend on the heights: it is done once, and E is a sum of squares of linear forms. The circle is integrated
-    by a Gauss rule of 32 points. Exact in the parabolic approximation. wavelengths: (W,) µm.
+    with e(r) the path from the point and to the sensor, constant in each of `inner` parts of a ring. These integrals do
+    not depend on the heights: E is a sum of squares of linear forms, by a Gauss rule of 32 radii ρ. Parabolic
+    approximation. wavelengths: (W,) µm.
     """
     wavelengths, radius = wavelengths.double(), aim.radius.detach().double()
     count = features(radius, torch.tensor(pitch, dtype=torch.float64))
@@ -222,26 +225,15 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
         phased = rings * torch.polar(torch.ones_like(excess), 2 * math.pi / wavelength * excess)
         scale = rate * torch.sqrt(2 * weights / rho)[:, None] / radius
         forms.append(scale * phased.reshape(len(rho), count, inner).sum(-1))
-    return partial(_energy, torch.stack(forms), wavelengths)
+    stacked = torch.stack(forms)
 
+    def energy(element: Element) -> Tensor:
+        heights = fabricated_height(element.profile.heights, element.period, element.levels).double()
+        phase = _phase(element.glass, wavelengths) * heights
+        field = (stacked @ torch.polar(torch.ones_like(phase), phase)[..., None])[..., 0]
+        return (field.real**2 + field.imag**2).sum(-1)
 
-def _energy(forms: Tensor, wavelengths: Tensor, element: Element) -> Tensor:
-    """E_λ = Σ |forms_λ · e^(ik (n - 1) h)|² (W,) of an element of rings. forms: (W, M, R)."""
-    heights = fabricated_height(element.profile.heights, element.period, element.levels).double()
-    phase = _phase(element.glass, wavelengths) * heights
-    field = (forms @ torch.polar(torch.ones_like(phase), phase)[..., None])[..., 0]
-    return (field.real**2 + field.imag**2).sum(-1)
-
-
-def _start(aim: Aim, wavelengths: Tensor, glass: Glass, *, pitch: Tensor, top: Tensor) -> Tensor:
-    """Heights (R,), of 200 up to `top`, whose phases agree best, by Σ cos, with the lenses of all wavelengths."""
-    radius = aim.radius.detach().double()
-    r2 = ((torch.arange(features(radius, pitch)).to(radius) + 0.5) * pitch) ** 2
-    lens = polynomial(converging(aim).detach().double(), r2) * r2
-    heights = torch.linspace(0, 1, 200).to(radius) * top
-    wanted = 2 * math.pi / (1e-3 * wavelengths)[:, None, None] * lens[:, None]
-    agreement = torch.cos(_phase(glass, wavelengths)[..., None] * heights - wanted).sum(0)
-    return heights[agreement.argmax(-1)]
+    return energy
 
 
 def _phase(glass: Glass, wavelengths: Tensor) -> Tensor:
@@ -249,19 +241,9 @@ def _phase(glass: Glass, wavelengths: Tensor) -> Tensor:
     return (2 * math.pi / (1e-3 * wavelengths) * (index(glass, wavelengths) - 1))[:, None]
 
 
+_DESIGNS = ideal, singlet, fresnel, multifocal, multifocal_refractive, cubic, cubic_refractive, achromat, hybrid
 #: Name -> (aim, options) -> elements in contact.
-BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {
-    "ideal": ideal,
-    "singlet": singlet,
-    "fresnel": fresnel,
-    "multifocal": multifocal,
-    "multifocal-refractive": multifocal_refractive,
-    "cubic": cubic,
-    "cubic-refractive": cubic_refractive,
-    "achromat": achromat,
-    "hybrid": hybrid,
-}
-
+BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {f.__name__.replace("_", "-"): f for f in _DESIGNS}
 
 #: Those that can have steps of a wave.
 STEPPED = tuple(name for name, design in BASELINES.items() if "levels" in inspect.signature(design).parameters)
@@ -272,9 +254,6 @@ def baseline(name: str, aim: Aim, **options) -> tuple[Element, ...]:
     if name not in BASELINES:
         raise ValueError(f"no baseline is called {name!r}; expected one of {', '.join(BASELINES)}")
     return BASELINES[name](aim, **options)
-
-
-# -- parts -----------------------------------------------------------------------------------------------------------
 
 
 def _lens(aim: Aim, glass: Glass) -> Element:
@@ -289,24 +268,26 @@ def _smooth(aim: Aim, glass: Glass, path: Tensor) -> Element:
 def _annuli(aim: Aim, foci: Sequence[float], glass: Glass, *, pitch: float, less: Tensor | None) -> Rings:
     """Rings of which annulus k of equal area is a lens for foci[k]; `less`: the focus of a lens to subtract."""
     wide = torch.tensor(pitch, dtype=torch.float64).to(aim.radius)
-    r2 = ((torch.arange(features(aim.radius, wide)).to(wide) + 0.5) * wide) ** 2
+    r2 = _middles(aim.radius, wide) ** 2
     annulus = (len(foci) * r2 / aim.radius.detach() ** 2).long().clamp(max=len(foci) - 1)
-    paths = [_path(aim, torch.tensor(focus, dtype=torch.float64), r2) for focus in foci]
-    path = torch.stack(paths).gather(0, annulus[None])[0]
+
+    def path_to(focus: Tensor) -> Tensor:
+        return polynomial(converging(aim, focus), r2) * r2
+
+    paths = torch.stack([path_to(torch.tensor(focus, dtype=torch.float64)) for focus in foci])
+    path = paths.gather(0, annulus[None])[0]
     if less is not None:
-        path = path - _path(aim, less, r2)
+        path = path - path_to(less)
     return Rings(path / (index(glass, aim.wavelength) - 1), wide)
 
 
-def _path(aim: Aim, focus: Tensor, r2: Tensor) -> Tensor:
-    return polynomial(converging(aim, focus), r2) * r2
+def _middles(radius: Tensor, pitch: Tensor) -> Tensor:
+    """Radii (R,) mm of the middles of the rings that cover an aperture."""
+    return (torch.arange(features(radius, pitch)).to(pitch) + 0.5) * pitch
 
 
 def _cubic_plate(aim: Aim, glass: Glass, strength: float) -> Element:
-    """strength · λ₀ (x³ + y³)/R³ as Zernike polynomials: with N the norms,
-
-    x³ + y³ = ½ (Z_11 + Z_1-1)/N_1 + ¼ (Z_31 + Z_3-1 + Z_33 - Z_3-3)/N_3
-    """
+    # x³ + y³ = ½ (Z_11 + Z_1-1)/N_1 + ¼ (Z_31 + Z_3-1 + Z_33 - Z_3-3)/N_3, with N the norms.
     shares = {(1, 1): 0.5, (1, -1): 0.5, (3, 1): 0.25, (3, -1): 0.25, (3, 3): 0.25, (3, -3): -0.25}
     orders = [noll(j) for j in range(1, 11)]
     numbers = [shares.get(order, 0.0) / norm(*order) for order in orders]

@@ -59,12 +59,8 @@ Profile = Pixels | Rings | Zernike | EvenPowers
 
 
 def _pixels(profile: Pixels, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
-    rows, columns = profile.heights.shape
-    return profile.heights[_place(y, profile.pitch, rows), _place(x, profile.pitch, columns)]
-
-
-def _place(position: Tensor, pitch: Tensor, count: int) -> Tensor:
-    return torch.floor((position / pitch).detach() + 0.5 * count).long().clamp(0, count - 1)
+    places = ((p / profile.pitch, n) for p, n in zip((y, x), profile.heights.shape, strict=True))
+    return profile.heights[*(torch.floor(p.detach() + 0.5 * n).long().clamp(0, n - 1) for p, n in places)]
 
 
 def _rings(profile: Rings, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from raytrace.files import read_bytes, write_json
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import FORMULAS, Glass
+from raytrace.maths.value import to
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat
 from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
@@ -93,13 +94,34 @@ def read_element(
     heights are wrapped there, in so many steps, if either is given. Raises HeightMapError for a file that cannot be
     read, ValueError for heights that do not fill the aperture or without material or design wavelength.
     """
-    label = read_label(path)
+    label, file = read_label(path), str(path)
     if isinstance(glass, str):
         glass = find_glass(glass, user=tuple(catalog))
     if Path(path).suffix.lower() == SMOOTH:
-        element = _smooth(str(path), label, aperture, glass, pitch, span)
+        if label is None or label.profile is None:
+            raise HeightMapError("is no smooth element: expected the coefficients of one", file)
+        if pitch is not None or span is not None:
+            raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
+        profile, is_fixed = label.profile, isinstance(label.profile, Zernike)
+        if aperture > label.aperture * (1 + 1e-9) or (is_fixed and aperture < label.aperture * (1 - 1e-9)):
+            raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
     else:
-        element = _flat(path, label, aperture, glass, pitch, span)
+        profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
+        profile = to(profile, dtype=torch.float64)
+        counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
+        across = min(counts) * float(profile.pitch)
+        # Heights cut to whole features may miss the rim by one feature.
+        if across + 2 * float(profile.pitch) < aperture:
+            raise ValueError(
+                f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
+                f"give `aperture={across:.6g}`"
+            )
+        if glass is None and label is None:
+            raise ValueError(
+                f"{path}: has no material (there is no {_label_of(path).name}); give `glass=NAME`, as PMMA, or "
+                "`index=N` for each wavelength"
+            )
+    element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
     if not (design_wavelength or levels):
         return element
     design = design_wavelength or (label and label.design_wavelength)
@@ -108,55 +130,30 @@ def read_element(
     return wrapped(element, design, levels=levels)
 
 
-def _smooth(file: str, label: Label | None, aperture: float, glass: Glass | None, *of_heights) -> Element:
-    if label is None or label.profile is None:
-        raise HeightMapError("is no smooth element: expected the coefficients of one", file)
-    if any(number is not None for number in of_heights):
-        raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
-    fixed = isinstance(label.profile, Zernike)
-    if aperture > label.aperture * (1 + 1e-9) or (fixed and aperture < label.aperture * (1 - 1e-9)):
-        raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
-    return Element(label.profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
-
-
-def _flat(path, label: Label | None, aperture: float, glass: Glass | None, pitch, span) -> Element:
-    profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
-    profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
-    counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
-    across = min(counts) * float(profile.pitch)
-    # Heights cut to whole features may miss the rim by one feature.
-    if across + 2 * float(profile.pitch) < aperture:
-        raise ValueError(
-            f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
-            f"give `aperture={across:.6g}`"
-        )
-    if glass is None and label is None:
-        raise ValueError(
-            f"{path}: has no material (there is no {_label_of(path).name}); give `glass=NAME`, as PMMA, or `index=N` "
-            "for each wavelength"
-        )
-    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
-
-
 def read_label(path: str | os.PathLike) -> Label | None:
     """The label of a height map, None if there is none. Raises HeightMapError for one that cannot be read."""
     file = _label_of(path)
     if not file.exists():
         return None
     try:
-        label = _label(parsed(read_bytes(file, _MOST)))
+        label = parsed(read_bytes(file, _MOST))
+        label = (_SMOOTH if isinstance(label, dict) and "profile" in label else _OF_HEIGHTS)(label)
+        count, listed_count, span = (
+            FORMULAS[label["formula"]].count,
+            len(label["coefficients"]),
+            label["wavelength_range"],
+        )
+        if listed_count != count:
+            raise Unfit(f"coefficients: found a list of {listed_count}, expected {count} of them")
+        if span is not None and not span[0] < span[1]:
+            raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
     except (OSError, Unfit) as error:
         line = error.line or None if isinstance(error, Unfit) else None
         raise HeightMapError(f"is no label of a height map ({error}); remove it", str(file), line) from error
     sizes = ("design_wavelength", "aperture", *([] if "profile" in label else ["pitch"]))
-    span = label["wavelength_range"]
-    glass = Glass(
-        label["material"],
-        label["formula"],
-        torch.tensor(label["coefficients"], dtype=torch.float64),
-        label["catalog"],
-        wavelength_range=None if span is None else tuple(span),
-    )
+    coefficients = torch.tensor(label["coefficients"], dtype=torch.float64)
+    span = None if span is None else tuple(span)
+    glass = Glass(label["material"], label["formula"], coefficients, label["catalog"], wavelength_range=span)
     profile = None
     if "profile" in label:
         coefficients = torch.tensor(label["coefficients_of_profile"], dtype=torch.float64)
@@ -178,17 +175,6 @@ _INFORMATION = {"height_range": listed(number(), 2, 2)}  # older labels have non
 _OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0}, _INFORMATION)
 _PROFILE = {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)}
 _SMOOTH = record(_GLASS | _PROFILE, _INFORMATION)
-
-
-def _label(value: object) -> dict:
-    """A label as JSON has it. Raises Unfit."""
-    label = (_SMOOTH if isinstance(value, dict) and "profile" in value else _OF_HEIGHTS)(value)
-    count, span = FORMULAS[label["formula"]].count, label["wavelength_range"]
-    if len(label["coefficients"]) != count:
-        raise Unfit(f"coefficients: found a list of {len(label['coefficients'])}, expected {count} of them")
-    if span is not None and not span[0] < span[1]:
-        raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
-    return label
 
 
 def _label_of(path: str | os.PathLike) -> Path:

@@ -121,9 +121,6 @@ def height_range(element: Element) -> tuple[float, float]:
     return float(heights.min()) + 0.0, float(heights.max()) + 0.0
 
 
-# -- etching -----------------------------------------------------------------------------------------------------------
-
-
 @value
 class Process:
     """waves: depth in waves of the design wavelength (µm); levels: equal depths, 0 for any; tolerance: ± mm."""

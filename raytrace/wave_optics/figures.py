@@ -9,18 +9,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.grid import centres
-from raytrace.plotting.style import (
-    FAINT,
-    GREY,
-    array,
-    bar_on_dark,
-    field_colour,
-    framed,
-    new_figure,
-    round_length,
-    styled,
-    wavelength_colours,
-)
+from raytrace.plotting import style
+from raytrace.plotting.style import array, framed, new_figure, styled
 from raytrace.wave_optics.element import Element, height, is_flat, is_smooth
 
 _GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
@@ -29,47 +19,56 @@ _ACROSS = 700  # points across a disc of heights
 
 
 @styled
-def psf_figure(found):
+def psf_figure(psfs):
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
     share of the light, on one scale for the row. Below each: the light inside the window and its peak.
     """
-    from matplotlib.colors import PowerNorm
+    from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
 
-    kernels, energy, peak = array(found.kernel), array(found.energy), array(found.peak)
-    wavelengths = found.wavelengths.tolist()
-    colours, together = wavelength_colours(wavelengths), len(wavelengths) > 1
-    columns = len(wavelengths) + together
+    kernels, energy, peak = array(psfs.kernel), array(psfs.energy), array(psfs.peak)
+    wavelengths = psfs.wavelengths.tolist()
+    colours, together = style.wavelength_colours(wavelengths), len(wavelengths) > 1
+    columns, order = len(wavelengths) + together, np.argsort(wavelengths)[::-1]
+    place = np.linspace(0, 2, len(order))
+    channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
+    shares = channels / channels.sum(1, keepdims=True).clip(1e-9)
+    # From black through the colour to white: the peak is white, as on film.
+    ramps = [[(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")] for colour in colours]
+    maps = [LinearSegmentedColormap.from_list("light", ramp) for ramp in ramps]
     figure = new_figure(max(3.4, 1.75 * columns + 0.6), 1.95 * len(kernels) + 0.8)
     axes = figure.subplots(len(kernels), columns, squeeze=False)
-    for row, depth in enumerate(found.depths.tolist()):
+    for row, depth in enumerate(psfs.depths.tolist()):
         for column, wavelength in enumerate(wavelengths):
             panel, kernel = axes[row][column], kernels[row, column]
             norm = PowerNorm(_GAMMA, vmin=0.0, vmax=kernel.max())
-            panel.imshow(kernel, origin="lower", cmap=_dark(colours[column]), norm=norm, interpolation="nearest")
-            panel.set_xlabel(f"{100 * energy[row, column]:.1f} %, peak {peak[row, column]:.2g}", fontsize=7, color=GREY)
+            panel.imshow(kernel, origin="lower", cmap=maps[column], norm=norm, interpolation="nearest")
+            panel.set_xlabel(
+                f"{100 * energy[row, column]:.1f} %, peak {peak[row, column]:.2g}", fontsize=7, color=style.GREY
+            )
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         if together:
-            axes[row][-1].imshow(_mixed(kernels[row], wavelengths), origin="lower", interpolation="nearest")
+            # The longest wavelengths red, the shortest blue.
+            picture = np.tensordot(shares, kernels[row][order], 1)
+            bright = np.clip(picture, 0, None) / (picture.max() if picture.max() > 0 else 1)
+            image = np.moveaxis(bright**_GAMMA, 0, -1)
+            axes[row][-1].imshow(image, origin="lower", interpolation="nearest")
             if row == 0:
                 axes[row][-1].set_title("together")
         axes[row][0].set_ylabel(_depth(depth))
     for panel in axes.flat:
         framed(panel)
-    _bar(axes[-1][0], found)
-    figure.suptitle(found.title, fontweight="bold", fontsize=10)
+    pitch = float(psfs.pitch)
+    length = style.round_length(0.35 * pitch * psfs.grid.columns)
+    style.bar_on_dark(axes[-1][0], 0.06 * psfs.grid.columns, 0.08 * psfs.grid.rows, length, unit=pitch)
+    figure.suptitle(psfs.title, fontweight="bold", fontsize=10)
     caption = (
-        f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ "
-        f"light^{_GAMMA:g}; "
+        f"{psfs.grid.columns} × {psfs.grid.rows} pixels of {1e3 * pitch:g} µm; brightness ∝ light^{_GAMMA:g}; "
         "below each: share of the light inside the window, share in the brightest pixel or one on the axis"
     )
-    figure.supxlabel(
-        textwrap.fill(caption, int(16 * figure.get_figwidth())),
-        fontsize=7.5,
-        color=GREY,
-    )
+    figure.supxlabel(textwrap.fill(caption, int(16 * figure.get_figwidth())), fontsize=7.5, color=style.GREY)
     return figure
 
 
@@ -81,10 +80,17 @@ def height_figure(elements: Sequence[Element], *, title: str = ""):
     grid = figure.add_gridspec(2 * len(elements), 2, width_ratios=(1.15, 1.6))
     for row, element in enumerate(elements):
         above, below = 2 * row, 2 * row + 1
-        disc = figure.add_subplot(grid[above : below + 1, 0])
-        _disc(disc, element)
-        disc.set_title(_kind(element), fontsize=8.5)
-        R = float(element.radius)
+        disc, R = figure.add_subplot(grid[above : below + 1, 0]), float(element.radius)
+        line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
+        y, x = torch.meshgrid(line, line, indexing="ij")
+        with torch.no_grad():
+            heights = 1e3 * array(height(element, x, y))
+        heights[np.hypot(array(x), array(y)) > R] = np.nan
+        shown = disc.imshow(heights, origin="lower", extent=(-R, R, -R, R), cmap="cividis", interpolation="nearest")
+        kind = f"{element.kind.words}, wrapped" if element.period is not None else element.kind.words
+        disc.set(xlabel="x, mm", ylabel="y, mm")
+        disc.set_title("; ".join(filter(None, (kind, element.glass.name))), fontsize=8.5)
+        figure.colorbar(shown, ax=disc, label="height, µm", shrink=0.85)
         if is_smooth(element):
             whole = figure.add_subplot(grid[above : below + 1, 1])
             _profile(whole, element, -R, R)
@@ -99,27 +105,8 @@ def height_figure(elements: Sequence[Element], *, title: str = ""):
     return figure
 
 
-def _disc(axes, element: Element) -> None:
-    """Height over the aperture as a map."""
-    R = float(element.radius)
-    line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
-    with torch.no_grad():
-        heights = 1e3 * array(height(element, line.expand(_ACROSS, -1), line[:, None].expand(-1, _ACROSS)))
-    x = array(line)
-    heights[np.hypot(x, x[:, None]) > R] = np.nan
-    shown = axes.imshow(heights, origin="lower", extent=(-R, R, -R, R), cmap="cividis", interpolation="nearest")
-    axes.set(xlabel="x, mm", ylabel="y, mm")
-    axes.figure.colorbar(shown, ax=axes, label="height, µm", shrink=0.85)
-
-
-def _kind(element: Element) -> str:
-    """What a height is, and of what."""
-    kind = f"{element.kind.words}, wrapped" if element.period is not None else element.kind.words
-    return f"{kind}; {element.glass.name}" if element.glass.name else kind
-
-
 @styled
-def caustic_figure(found, light: Tensor, distances: Tensor, half: float):
+def caustic_figure(psfs, light: Tensor, distances: Tensor, half: float):
     """Light per mm² over the distance behind the element, logarithmic; arguments: of `wave_optics.compute.caustic`.
 
     A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
@@ -127,8 +114,8 @@ def caustic_figure(found, light: Tensor, distances: Tensor, half: float):
     from matplotlib.colors import LogNorm
 
     values, z = array(light), array(distances)
-    wavelengths, depths = found.wavelengths.tolist(), found.depths.tolist()
-    colours = wavelength_colours(wavelengths)
+    wavelengths, depths = psfs.wavelengths.tolist(), psfs.depths.tolist()
+    colours = style.wavelength_colours(wavelengths)
     figure = new_figure(2.5 * len(wavelengths) + 0.9, 1.5 * len(depths) + 0.9)
     axes = figure.subplots(len(depths), len(wavelengths), squeeze=False, sharex=True, sharey=True)
     extent = (z[0], z[-1], -1e3 * half, 1e3 * half)
@@ -140,41 +127,36 @@ def caustic_figure(found, light: Tensor, distances: Tensor, half: float):
                 values[row, column].T, origin="lower", extent=extent, aspect="auto", norm=norm, cmap="magma",
                 interpolation="bilinear",
             )  # fmt: skip
-            panel.axvline(float(found.scene.sensor_distance), color="white", linewidth=0.8, linestyle=(0, (4, 3)))
+            panel.axvline(float(psfs.scene.sensor_distance), color="white", linewidth=0.8, linestyle=(0, (4, 3)))
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         axes[row][0].set_ylabel(f"{_depth(depth)}\nx, µm")
     figure.colorbar(shown, ax=axes, label="share of the light per mm²", shrink=0.9, pad=0.01)
     figure.supxlabel("distance behind the element, mm; dashes: the sensor", fontsize=8.5)
-    figure.suptitle(found.title, fontweight="bold", fontsize=10)
+    figure.suptitle(psfs.title, fontweight="bold", fontsize=10)
     return figure
 
 
 @styled
-def encircled_figure(found):
+def encircled_figure(psfs):
     """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
-    x, y = (array(line) for line in centres(found.grid))
+    x, y = (array(line) for line in centres(psfs.grid))
     radius = np.hypot(x, y[:, None]).ravel()
     order = np.argsort(radius, kind="stable")
-    edge = 1e3 * float(found.pitch) * min(found.grid.shape) / 2
-    wavelengths, depths = found.wavelengths.tolist(), found.depths.tolist()
+    edge = 1e3 * float(psfs.pitch) * min(psfs.grid.shape) / 2
+    wavelengths, depths = psfs.wavelengths.tolist(), psfs.depths.tolist()
     figure = new_figure(max(3.4, 2.2 * len(depths) + 0.6), 2.6)
     axes = figure.subplots(1, len(depths), sharey=True, squeeze=False)[0]
     for d, (panel, depth) in enumerate(zip(axes, depths, strict=True)):
-        for w, colour in enumerate(wavelength_colours(wavelengths)):
-            held = np.cumsum(array(found.kernel[d, w]).ravel()[order])
-            panel.plot(
-                np.append(0, 1e3 * radius[order]),
-                np.append(0, held),
-                color=colour,
-                linewidth=1.2,
-                label=f"{1e3 * wavelengths[w]:g} nm",
-            )
+        for w, colour in enumerate(style.wavelength_colours(wavelengths)):
+            held = np.cumsum(array(psfs.kernel[d, w]).ravel()[order])
+            line = {"color": colour, "linewidth": 1.2, "label": f"{1e3 * wavelengths[w]:g} nm"}
+            panel.plot(np.append(0, 1e3 * radius[order]), np.append(0, held), **line)
         panel.set(title=_depth(depth), xlim=(0, edge), ylim=(0, 1.02), xlabel="radius, µm")
-        panel.grid(True, color=FAINT, linewidth=0.5)
+        panel.grid(True, color=style.FAINT, linewidth=0.5)
     axes[0].set_ylabel("share of the light")
     axes[-1].legend(loc="lower right")
-    figure.suptitle(found.title, fontweight="bold", fontsize=10)
+    figure.suptitle(psfs.title, fontweight="bold", fontsize=10)
     return figure
 
 
@@ -183,34 +165,9 @@ def _profile(panel, element: Element, first: float, last: float) -> None:
     x = torch.linspace(first, last, 4001, dtype=element.radius.dtype)
     with torch.no_grad():
         values = 1e3 * array(height(element, x, torch.zeros_like(x)))
-    panel.plot(array(x), values, color=field_colour(0), linewidth=0.7)
+    panel.plot(array(x), values, color=style.field_colour(0), linewidth=0.7)
     panel.set(xlim=(first, last), ylabel="height, µm")
-    panel.grid(True, color=FAINT, linewidth=0.5)
-
-
-def _dark(colour: str | tuple[float, float, float]):
-    """From black through a colour to white: what is as bright as the peak is white, as on film."""
-    from matplotlib.colors import LinearSegmentedColormap, to_rgb
-
-    return LinearSegmentedColormap.from_list("light", [(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")])
-
-
-def _mixed(kernels: np.ndarray, wavelengths: Sequence[float]) -> np.ndarray:
-    """Kernels (W, rows, columns) as one picture (rows, columns, 3): the longest wavelengths red, the shortest blue."""
-    order = np.argsort(wavelengths)[::-1]
-    place = np.linspace(0, 2, len(order))
-    channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
-    picture = np.tensordot(channels / channels.sum(1, keepdims=True).clip(1e-9), kernels[order], 1)
-    peak = picture.max()
-    return np.moveaxis((np.clip(picture, 0, None) / (peak if peak > 0 else 1)) ** _GAMMA, 0, -1)
-
-
-def _bar(panel, found) -> None:
-    """A bar of a round length in the corner of a kernel."""
-    pitch, columns = float(found.pitch), found.grid.columns
-    length = round_length(0.35 * pitch * columns)
-    x, y = 0.06 * columns, 0.08 * found.grid.rows
-    bar_on_dark(panel, x, y, length, unit=pitch)
+    panel.grid(True, color=style.FAINT, linewidth=0.5)
 
 
 def _depth(distance: float) -> str:

@@ -17,6 +17,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,8 +69,7 @@ class Format(NamedTuple):
 def read_heights(
     path: str | os.PathLike, *, pitch: float | None = None, span: tuple[float, float] | None = None
 ) -> Map:
-    """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings of a rotationally symmetric
-    one.
+    """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings of a round one.
 
     pitch: mm, for a file without it; span: heights mm of grey 0 and 65535, for a picture without description. Raises
     HeightMapError with file and line.
@@ -105,9 +105,6 @@ def write_heights(profile: Map, path: str | os.PathLike) -> None:
         raise HeightMapError(error.strerror or str(error), file) from error
 
 
-# -- arrays -----------------------------------------------------------------------------------------------------------
-
-
 def _write_npy(profile: Map, file: str) -> bytes:
     stream = io.BytesIO()
     np.save(stream, _array(profile), allow_pickle=False)
@@ -130,28 +127,21 @@ def _read_npy(content: bytes, file: str, known: Known) -> Map:
     return _profile(heights.astype(heights.dtype.newbyteorder("=")), pitch, file)
 
 
-# -- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def _write_picture(kind: str) -> Callable[[Map, str], bytes]:
-    """The writer of a kind of picture, "PNG" or "TIFF": 16-bit grey, the largest y on top, and a description."""
-
-    def write(profile: Map, file: str) -> bytes:
-        heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
-        low, high = float(heights.min()), float(heights.max())
-        scale = (high - low) / _WHITE
-        grey = np.zeros(heights.shape) if scale == 0 else np.rint((heights - low) / (high - low) * _WHITE)
-        description = {"unit": "mm", "offset": low, "scale": scale, "pitch": float(profile.pitch)}
-        description["profile"] = "rings" if isinstance(profile, Rings) else "pixels"
-        steps = np.unique(heights)
-        if len(steps) <= _LISTED and len(np.unique(grey)) == len(steps):
-            description["heights"] = steps.tolist()
-        stream, info, text = io.BytesIO(), PngImagePlugin.PngInfo(), json.dumps(description)
-        info.add_text("Description", text)
-        Image.fromarray(grey.astype(np.uint16)).save(stream, kind, pnginfo=info, tiffinfo={_DESCRIPTION: text})
-        return stream.getvalue()
-
-    return write
+def _write_picture(profile: Map, file: str, kind: str) -> bytes:
+    """A picture of a kind, "PNG" or "TIFF": 16-bit grey, the largest y on top, and a description."""
+    heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
+    low, high = float(heights.min()), float(heights.max())
+    scale = (high - low) / _WHITE
+    grey = np.zeros(heights.shape) if scale == 0 else np.rint((heights - low) / (high - low) * _WHITE)
+    description = {"unit": "mm", "offset": low, "scale": scale, "pitch": float(profile.pitch)}
+    description["profile"] = "rings" if isinstance(profile, Rings) else "pixels"
+    steps = np.unique(heights)
+    if len(steps) <= _LISTED and len(np.unique(grey)) == len(steps):
+        description["heights"] = steps.tolist()
+    stream, info, text = io.BytesIO(), PngImagePlugin.PngInfo(), json.dumps(description)
+    info.add_text("Description", text)
+    Image.fromarray(grey.astype(np.uint16)).save(stream, kind, pnginfo=info, tiffinfo={_DESCRIPTION: text})
+    return stream.getvalue()
 
 
 def _read_picture(content: bytes, file: str, known: Known) -> Map:
@@ -189,25 +179,20 @@ def _meaning(text: str, file: str, known: Known) -> dict:
         return {"profile": description["profile"], **numbers, **listed}
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if known.span is None:
-            message = "has no description of its grey values; give span (heights in mm of black and white) and pitch"
-            raise HeightMapError(message, file) from error
+            remedy = "give span (heights in mm of black and white) and pitch"
+            raise HeightMapError(f"has no description of its grey values; {remedy}", file) from error
     low, high = known.span
     return {"profile": "pixels", "offset": low, "scale": (high - low) / _WHITE, "pitch": known.pitch}
-
-
-# -- tables -----------------------------------------------------------------------------------------------------------
 
 
 def _write_csv(profile: Map, file: str) -> bytes:
     pitch, heights = float(profile.pitch), _array(profile)
     if isinstance(profile, Rings):
         lines = ["r_mm,sag_mm", *(f"{(k + 0.5) * pitch!r},{h!r}" for k, h in enumerate(heights.tolist()))]
-        return ("\n".join(lines) + "\n").encode()
-    y, x = ([(i - 0.5 * (count - 1)) * pitch for i in range(count)] for count in heights.shape)
-    across = [repr(place) for place in x]
-    lines = ["x_mm,y_mm,sag_mm"]
-    for place, row in zip(y, heights.tolist(), strict=True):
-        lines += [f"{at},{place!r},{h!r}" for at, h in zip(across, row, strict=True)]
+    else:
+        y, x = ([repr((i - 0.5 * (count - 1)) * pitch) for i in range(count)] for count in heights.shape)
+        points = ((b, a, h) for b, row in zip(y, heights.tolist(), strict=True) for a, h in zip(x, row, strict=True))
+        lines = ["x_mm,y_mm,sag_mm", *(f"{a},{b},{h!r}" for b, a, h in points)]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -253,9 +238,6 @@ def _expect(values: np.ndarray, wanted: np.ndarray, pitch: float, name: str, fil
         raise HeightMapError(message, file, int(lines[k]))
 
 
-# -- grid sag ---------------------------------------------------------------------------------------------------------
-
-
 def _write_grid(profile: Map, file: str) -> bytes:
     """nx ny delx dely unitflag xdec ydec; then a line z dz/dx dz/dy d²z/dxdy nodata a point, from (-x, +y) on, x first.
 
@@ -281,10 +263,8 @@ def _read_grid(content: bytes, file: str, known: Known) -> Map:
     if unit not in _UNITS:
         raise HeightMapError(f"has the unit flag {unit:g}; expected 0 mm, 1 cm, 2 inch or 3 m", file, first)
     if abs(delx) != abs(dely) or any(decentre):
-        message = (
-            f"has steps of {delx:g}, {dely:g} and decentres {decentre}; only square grids around the axis are read"
-        )
-        raise HeightMapError(message, file, first)
+        steps = f"steps of {delx:g}, {dely:g} and decentres {decentre}"
+        raise HeightMapError(f"has {steps}; only square grids around the axis are read", file, first)
     if nx * ny != len(lines) - 1 or min(nx, ny) < 1 or nx % 1 or ny % 1:
         raise HeightMapError(f"announces {nx:g} × {ny:g} points, but holds {len(lines) - 1}", file, first)
     table = _numbers([line for _, line in lines[1:]], file, first=lines[1][0], counts=(1, 4, 5), separator=None)
@@ -294,18 +274,11 @@ def _read_grid(content: bytes, file: str, known: Known) -> Map:
     return _profile(heights[::-1], abs(delx) * _UNITS[unit], file)
 
 
-# -- common parts -----------------------------------------------------------------------------------------------------
-
+_PNG, _TIFF = (Format(_read_picture, partial(_write_picture, kind=kind)) for kind in ("PNG", "TIFF"))
+_GRID = Format(_read_grid, _write_grid)
 #: The formats by suffix, in lower case.
-FORMATS = {
-    ".npy": Format(_read_npy, _write_npy),
-    ".png": Format(_read_picture, _write_picture("PNG")),
-    ".tif": Format(_read_picture, _write_picture("TIFF")),
-    ".tiff": Format(_read_picture, _write_picture("TIFF")),
-    ".csv": Format(_read_csv, _write_csv),
-    ".dat": Format(_read_grid, _write_grid),
-    ".grd": Format(_read_grid, _write_grid),
-}
+FORMATS = {".npy": Format(_read_npy, _write_npy), ".png": _PNG, ".tif": _TIFF, ".tiff": _TIFF}
+FORMATS |= {".csv": Format(_read_csv, _write_csv), ".dat": _GRID, ".grd": _GRID}
 
 
 def _format(file: str) -> Format:

@@ -50,9 +50,6 @@ class TooCoarse(ValueError):
     """An element needs more rays than there can be."""
 
 
-# -- an element as a lens ----------------------------------------------------------------------------------------------
-
-
 def element_lens(
     element: Element,
     *,
@@ -94,21 +91,17 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
         kind = "rings" if element.period is None else "a wrapped height"
         raise ValueError(f"{kind} diffract, which rays do not: give whole smooth heights (pixels, Zernike, powers)")
     zero = torch.zeros_like(element.radius)
-    back = Surface(thickness=zero, semi_diameter=radius)
-    centre = zero
+    back, centre = Surface(thickness=zero, semi_diameter=radius), zero
     if isinstance(profile, EvenPowers):
         back = dataclasses.replace(back, coefficients=profile.coefficients)
-    elif isinstance(profile, Zernike):
-        sag_terms = ZernikeSag(profile.coefficients, element.radius)
-        centre = relief(sag_terms).sag(zero, zero, highest=0).z
-        piston = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1))
-        sag_terms = ZernikeSag(profile.coefficients - piston, element.radius)
-        back = dataclasses.replace(back, sag_terms=sag_terms)
     else:
-        sag_terms = spline(GridSag(profile.heights, profile.pitch))
+        is_series = isinstance(profile, Zernike)
+        grid = None if is_series else GridSag(profile.heights, profile.pitch)
+        sag_terms = ZernikeSag(profile.coefficients, element.radius) if is_series else spline(grid)
         centre = relief(sag_terms).sag(zero, zero, highest=0).z
-        # The weights of a spline sum to 1: less everywhere as at the axis. Found once, however often it is traced.
-        sag_terms = dataclasses.replace(sag_terms, coefficients=sag_terms.coefficients - centre)
+        # The piston of a series; the weights of a spline sum to 1. Found once, however often it is traced.
+        pistons = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1)) if is_series else centre
+        sag_terms = dataclasses.replace(sag_terms, coefficients=sag_terms.coefficients - pistons)
         back = dataclasses.replace(back, sag_terms=sag_terms)
     thickness = centre + torch.as_tensor(substrate, dtype=zero.dtype)
     with torch.no_grad():
@@ -117,9 +110,6 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
         least = float(torch.as_tensor(substrate)) + max(-lowest, 0.0)
         raise ValueError(f"the height lies {-lowest:.3g} mm beyond the plane: give a substrate above {least:.3g} mm")
     return Surface(thickness=thickness, glass=element.glass, semi_diameter=radius), back
-
-
-# -- elements at the stop of a lens ------------------------------------------------------------------------------------
 
 
 def hybrid_psf(
@@ -155,41 +145,40 @@ def hybrid_psf(
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
-    Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`psf_models.wave`);
-    the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
-    heights converge slowly in it, by the rays across a step. Moments are those of the light inside the window.
-    Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
-    of 5 %, in which the outermost height continues), TooCoarse where more than 400,000 rays would be needed.
+    Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`psf_models.wave`).
+    Kernels of flat pixels, rings and wrapped heights converge slowly in it, by the rays across a step. Moments are
+    those of the light inside the window. Raises ValueError for a stop between other media than air, a beam wider than
+    an element at the stop (by more than 5 %), TooCoarse where more than 400,000 rays would be needed.
     """
     elements = tuple(to(element, dtype=torch.float64) for element in elements)
     stop = scene.lens.stop
     if any(bool(((n - 1).abs() > 1e-3).any()) for n in media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]):
         raise ValueError(f"elements need air on both sides; the stop, surface {stop}, borders on another medium")
-    return by_field(scene, grid, lambda part, window: _field_kernels(part, elements, window, order))
-
-
-def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> Kernels:
-    """Kernels (D, 1, W, rows, columns) of one field; without elements those of `psf_models.wave`."""
-    probe = probe_of(scene)
     radial = all(is_radial(element) for element in elements)
-    points = sensor_points(scene, probe, grid, order, is_round=radial and symmetry(scene) == "round")
-    reach = points.corner + _reach_of_elements(scene, probe, elements)
-    rings, arms = rings_and_arms(phase_along_radius(probe, reach), order)
-    if elements and rings * arms > _MOST_RAYS:
-        raise TooCoarse(
-            f"the elements need {rings} × {arms} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a smaller "
-            "window, or the wave camera, which takes any height but no lens"
-        )
-    light = waves(scene, reach, order=order, probe=probe)
-    stop = _at_stop(scene, light.wavefront.pupil)
-    if light.symmetry != "none" and not radial:
-        light, stop = _unfolded(light, stop, arms)
-    if elements:
-        front = light.wavefront
-        added = [path(elements, *stop[:, :, :, w], colour[None])[0] for w, colour in enumerate(front.wavelength)]
-        light = dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=front.opd + torch.stack(added, 2)))
-    kernel, centroid, covariance = points.integrated(light, probe)
-    return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1])
+
+    def of_field(part: Scene, window: Grid) -> Kernels:
+        probe = probe_of(part)
+        points = sensor_points(part, probe, window, order, is_round=radial and symmetry(part) == "round")
+        reach = points.corner + _reach_of_elements(part, probe, elements)
+        rings, arms = rings_and_arms(phase_along_radius(probe, reach), order)
+        if elements and rings * arms > _MOST_RAYS:
+            raise TooCoarse(
+                f"the elements need {rings} × {arms} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a "
+                "smaller window, or the wave camera, which takes any height but no lens"
+            )
+        light = waves(part, reach, order=order, probe=probe)
+        stop = _at_stop(part, light.wavefront.pupil)
+        if light.symmetry != "none" and not radial:
+            light, stop = _unfolded(light, stop, arms)
+        if elements:
+            front = light.wavefront
+            added = [path(elements, *stop[:, :, :, w], colour[None])[0] for w, colour in enumerate(front.wavelength)]
+            opd = front.opd + torch.stack(added, 2)
+            light = dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=opd))
+        kernel, centroid, covariance = points.integrated(light, probe)
+        return Kernels(kernel, window, centroid, covariance, light.amplitude.shape[-1])
+
+    return by_field(scene, grid, of_field)
 
 
 def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
@@ -205,30 +194,26 @@ def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
 def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:
     """All rays of waves of which symmetry left out some: an element does not share it."""
     front = light.wavefront
-    L, M, N = front.direction
+    N, pairs = front.direction[2], [front.direction[:2], stop]
     if light.symmetry == "mirror":
-        rotated = [torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in ((L, M), stop)]
         copies = 2
+        L_M, stop = (torch.stack([torch.cat([a, -a], -1), torch.cat([b, b], -1)]) for a, b in pairs)
     else:
-        angle = (torch.arange(arms, dtype=L.dtype, device=L.device) + 0.5) * (2 * math.pi / arms)
-        c, s = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
-        pairs = ((a[..., None, :], b[..., None, :]) for a, b in ((L, M), stop))
-        rotated = [torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs]
         copies = arms
-    repeated = [torch.cat([t] * copies, -1) for t in (front.opd, N, light.amplitude / copies)]
-    front = dataclasses.replace(front, opd=repeated[0], direction=torch.cat([rotated[0], repeated[1][None]]))
-    return Waves(repeated[2], front, "none"), rotated[1]
-
-
-# -- sampling ----------------------------------------------------------------------------------------------------------
+        angle = (torch.arange(arms, dtype=N.dtype, device=N.device) + 0.5) * (2 * math.pi / arms)
+        c, s = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
+        pairs = ((a[..., None, :], b[..., None, :]) for a, b in pairs)
+        L_M, stop = (torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs)
+    opd, N, amplitude = (torch.cat([t] * copies, -1) for t in (front.opd, N, light.amplitude / copies))
+    front = dataclasses.replace(front, opd=opd, direction=torch.cat([L_M, N[None]]))
+    return Waves(amplitude, front, "none"), stop
 
 
 def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, ...]) -> float:
-    """By how many mm on the sensor rays spread farther with the elements, plus a distance that stands for their steps.
+    """By how many mm on the sensor rays spread farther with the elements, plus a distance that represents their steps.
 
     A slope g of path at the stop moves a ray of the lens, whose directions are (L, M) = -K s for points s of the stop,
-    by K⁻ᵀ g/n on the sensor; elements that focus make the blur smaller. `waves` samples 2πn a/λ of phase for each
-    mm between a ray and a point, a the spread of directions: steps are counted as distances of the same phase.
+    by K⁻ᵀ g/n on the sensor, with the K that fits the directions best; elements that focus make the blur smaller.
     """
     if not elements:
         return 0.0
@@ -243,11 +228,16 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
                     f"the beam at the stop has a radius of {float(beam):.4g} mm, the element of "
                     f"{float(element.radius):.4g} mm: make the element larger, or the aperture of the lens smaller"
                 )
-        shift, wave = _shift(front, stop, _slopes(elements, stop, front.wavelength)), 1e-3 * probe.wavelength
+        s, d = (t - t.mean(-1, keepdim=True) for t in (stop.movedim(0, -2), front.direction[:2].movedim(0, -2)))
+        to_stop, to_directions = s @ s.mT, -d @ s.mT
+        small = 1e-12 * torch.eye(2, dtype=s.dtype, device=s.device)
+        slopes = _slopes(elements, stop, front.wavelength).movedim(0, -2)
+        shift = torch.linalg.solve(to_directions.mT + small, to_stop @ slopes).movedim(-2, 0) / front.index[:, None]
         spread = torch.where(front.usable, torch.linalg.vector_norm(front.landing + shift, dim=0), 0.0).amax(-1)
         alone = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
-        steps = sum(phase(e, beam, probe.wavelength) for e in elements for phase in (_phase_of_steps, _phase_of_turns))
-        steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / wave)
+        # `waves` samples 2πn a/λ of phase for each mm between a ray and a point, a the spread of directions.
+        steps = sum(_phase_of_steps(element, beam, probe.wavelength) for element in elements)
+        steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / (1e-3 * probe.wavelength))
         return float((spread + steps - alone).max())
 
 
@@ -261,17 +251,8 @@ def _slopes(elements: tuple[Element, ...], stop: Tensor, wavelengths: Tensor) ->
     return total
 
 
-def _shift(front: Wavefront, stop: Tensor, slopes: Tensor) -> Tensor:
-    """K⁻ᵀ g/n, (2, D, F, W, P) mm, with the K that fits the directions best."""
-    s, d = (t - t.mean(-1, keepdim=True) for t in (stop.movedim(0, -2), front.direction[:2].movedim(0, -2)))
-    to_stop, to_directions = s @ s.mT, -d @ s.mT
-    small = 1e-12 * torch.eye(2, dtype=s.dtype, device=s.device)
-    solved = torch.linalg.solve(to_directions.mT + small, to_stop @ slopes.movedim(0, -2))
-    return solved.movedim(-2, 0) / front.index[:, None]
-
-
 def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) in radians along a radius that represents the steps of flat pixels, rings and wrapped heights."""
+    """Phase (W,) in radians along a radius that represents the steps of an element, and its periods round the pupil."""
     profile, none = element.profile, torch.zeros_like(wavelengths)
     excess = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths
     if is_flat(element):
@@ -280,20 +261,13 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
         slope = torch.stack([*steps, heights.new_zeros(())]).max() / profile.pitch
         least = torch.where(slope > 0, _PER_PIXEL * beam / profile.pitch, 0.0)
         return torch.maximum(excess * slope * beam, least + none)
-    if element.period is None:
-        return none
-    return _PER_ZONE * excess * beam * torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
-
-
-def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
-    """Phase (W,) that extends the margin of `rings_and_arms` to polynomials of more than one period round the pupil."""
-    coefficients, none = getattr(element.profile, "coefficients", None), torch.zeros_like(wavelengths)
-    if not isinstance(element.profile, Zernike) or not bool((coefficients != 0).any()):
-        return none
-    turns = max(abs(noll(int(j) + 1)[1]) for j in torch.nonzero(coefficients))
-    slope = torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
-    phase = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths * slope * beam
-    return max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
+    phase = excess * torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max() * beam
+    total = none if element.period is None else _PER_ZONE * phase
+    if isinstance(profile, Zernike) and bool((profile.coefficients != 0).any()):
+        # Extends the margin of `rings_and_arms` to polynomials of more than one period round the pupil.
+        turns = max(abs(noll(int(j) + 1)[1]) for j in torch.nonzero(profile.coefficients))
+        total = total + max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
+    return total
 
 
 def _disc(radius: Tensor) -> Tensor:

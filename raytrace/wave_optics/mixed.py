@@ -53,30 +53,29 @@ class MixedSums:
 
 def is_mixed(scene: WaveScene) -> bool:
     """Whether all steps are round, and something smooth is not."""
-    stepped = [element for element in scene.elements if not is_smooth(element)]
-    free = [element for element in scene.elements if not is_radial(element)]
+    stepped, free = [element for element in scene.elements if not is_smooth(element)], _free(scene)
     return bool(stepped and free) and all(map(is_radial, stepped)) and all(map(is_smooth, free))
 
 
 def round_part(scene: WaveScene) -> WaveScene:
     """The scene with its round elements alone, in the aperture of the scene."""
-    parts = (dataclasses.replace(one, radius=aperture(scene)) for one in scene.elements if is_radial(one))
+    parts = (dataclasses.replace(part, radius=aperture(scene)) for part in scene.elements if is_radial(part))
     return dataclasses.replace(scene, elements=tuple(parts))
 
 
-def _free_part(scene: WaveScene) -> tuple[Element, ...]:
-    return tuple(element for element in scene.elements if not is_radial(element))
+def _free(scene: WaveScene) -> list[Element]:
+    return [element for element in scene.elements if not is_radial(element)]
 
 
 @torch.no_grad()
 def deflection(scene: WaveScene, extent: float) -> float:
     """Largest shift (mm) on the sensor of light by the free part, from within `extent` apertures."""
-    R, z = aperture(scene), scene.sensor_distance
+    R = aperture(scene)
     line = torch.linspace(-1, 1, 401, dtype=R.dtype, device=R.device) * R * extent
-    W = path(_free_part(scene), line.expand(401, -1), line[:, None].expand(-1, 401), scene.wavelengths)
-    along_y, along_x = torch.gradient(W, spacing=(line, line), dim=(1, 2))
-    inside = torch.hypot(line.expand(401, -1), line[:, None]) <= R * extent
-    return float((z * torch.hypot(along_x, along_y) * inside).max())
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    along_y, along_x = torch.gradient(path(_free(scene), x, y, scene.wavelengths), spacing=(line, line), dim=(1, 2))
+    inside = torch.hypot(x, y) <= R * extent
+    return float((scene.sensor_distance * torch.hypot(along_x, along_y) * inside).max())
 
 
 def extent_of(scene: WaveScene, band: tuple[float, float]) -> float:
@@ -120,7 +119,7 @@ def intensity(scene: WaveScene, sums: MixedSums) -> Tensor:
     wavelength = millimetres(scene)[:, None]
     rays = torch.view_as_real(phasors(round_part(scene), sums.r, sums.sphere))  # (D, W, J, 2)
     tables = torch.view_as_complex((sums.back @ (sums.forward @ rays)).contiguous())
-    free = phasor(path(_free_part(scene), sums.x, sums.y, scene.wavelengths) / wavelength[..., None])
+    free = phasor(path(_free(scene), sums.x, sums.y, scene.wavelengths) / wavelength[..., None])
     return torch.stack([light_of(scene, sums, _between(table, sums.place) * free) for table in tables])
 
 

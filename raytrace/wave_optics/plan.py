@@ -25,7 +25,7 @@ from torch import Tensor
 
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms
+from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms, sub_pixels
 from raytrace.psf_models.models import NotConverged
 from raytrace.psf_models.radial import is_centred, reach
 from raytrace.wave_optics import mixed, propagation, pupil
@@ -72,21 +72,22 @@ def spread(scene: WaveScene) -> Spread:
     scene = to(scene, dtype=torch.float64)
     free = [e for e in scene.elements if is_free(e)]
     whole = [e for e in scene.elements if not is_free(e)]
-    phase = 2 * math.pi * _waves(scene, free, *_points(aperture(scene)))
+    R = aperture(scene)
+    # Random over the disc: an ordered rule would bias the distances of pairs.
+    place, turn = torch.rand(2, _RAYS, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(R)
+    r, angle = R * torch.sqrt(place), 2 * math.pi * turn
+    points = r * torch.cos(angle), r * torch.sin(angle)
+    phase = 2 * math.pi * _waves(scene, free, *points)
     coherent = torch.cos(phase).mean(-1) ** 2 + torch.sin(phase).mean(-1) ** 2 if free else phase[:, 0]
-    kept = coherent[None]
-    width = squares = light = kept.new_zeros(len(scene.depths), len(scene.wavelengths))
-    for share, elements in [(kept, whole)] * bool(free) + [(1 - kept, scene.elements)]:
-        x, y = _landings(scene, elements)
-        inside, gathered = _gathered(scene, x, y)
+    width = squares = light = coherent.new_zeros(len(scene.depths), len(scene.wavelengths))
+    for share, elements in [(coherent[None], whole)] * bool(free) + [(1 - coherent[None], scene.elements)]:
+        x, y = _landings(scene, elements, *points)
+        inside, squared = _sums_in_bins(scene, x, y)
         width = width + share * 2 * (x * x + y * y).mean(-1)
-        light, squares = light + share * inside, squares + share**2 * gathered
+        light, squares = light + share * inside, squares + share**2 * squared
     # Where no two rays meet the light is thin: an even disc.
     area = torch.where(squares > 0, light / squares.clamp(min=1e-300), math.pi * width)
-    steps = torch.zeros_like(scene.wavelengths)
-    for element in scene.elements:
-        steps = steps + _edges(element, scene, excess_index(element, scene.wavelengths, steps) / millimetres(scene))
-    return Spread(torch.sqrt(width), area, steps)
+    return Spread(torch.sqrt(width), area, sum(_steps_of(e, scene) for e in scene.elements))
 
 
 def is_free(element: Element) -> bool:
@@ -95,9 +96,7 @@ def is_free(element: Element) -> bool:
 
 
 def blur(scene: WaveScene) -> Tensor:
-    """Geometric radius (D, W) mm of the light of the smooth profiles on the sensor, without the light that steps
-    spread.
-    """
+    """Geometric radius (D, W) mm of the light of the smooth profiles on the sensor, without the light of steps."""
     R = aperture(scene).detach()
     points, _ = gauss_rings(24, dtype=R.dtype, device=R.device)
     edge = torch.linspace(0, 2 * math.pi, 97, dtype=R.dtype, device=R.device)
@@ -113,13 +112,11 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
     """
     wavelength = millimetres(scene).detach()
     r2, z = x * x + y * y, scene.sensor_distance.detach()
-    total = torch.zeros(2, len(scene.depths), len(wavelength), len(x), dtype=x.dtype, device=x.device)
+    total = x.new_zeros(2, len(scene.depths), len(wavelength), len(x))
     position = torch.stack([x, y])[:, None, None]
     for v in ((1 / scene.depths.detach())[:, None, None], 1 / z):
         total = total + position * (v / torch.sqrt(1 + r2 * v * v) if scene.exact else v)
-    for element in scene.elements:
-        if is_flat(element):
-            continue
+    for element in (element for element in scene.elements if not is_flat(element)):
         power = excess_index(element, scene.wavelengths.detach(), x)
         if diffracted and element.period is not None:
             power = wavelength / element.period.detach()
@@ -128,10 +125,7 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
 
 
 def blur_of_pixels(scene: WaveScene) -> Tensor:
-    """Radius (D, W) mm of a disc as wide, in the mean square, as the light behind a map of pixels.
-
-    Where the bare sphere is too steep to be resolved by steps between pixels, the light is as wide as without them.
-    """
+    """Radius (D, W) mm of a disc as wide, in the mean square, as the light behind a map of pixels."""
     profile, R = scene.elements[0].profile, aperture(scene).detach()
     pitch = profile.pitch.detach()
     y, x = ((torch.arange(n, dtype=R.dtype, device=R.device) - 0.5 * (n - 1)) * pitch for n in profile.heights.shape)
@@ -145,6 +139,7 @@ def blur_of_pixels(scene: WaveScene) -> Tensor:
         total = total + (((step - step.round()) ** 2) * both).sum((-2, -1)) / both.sum().clamp(min=1)
     widest = millimetres(scene).detach() * scene.sensor_distance.detach() / pitch
     bare = blur(scene)
+    # Where the bare sphere is too steep to be resolved by steps between pixels, the light is as wide as without them.
     return torch.where(bare > 0.5 * widest, bare, torch.sqrt(2 * total) * widest)
 
 
@@ -152,27 +147,15 @@ def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) 
     """Path (W, P) in waves of elements; a wrapped height counts whole, in periods: the first order."""
     total = x.new_zeros(len(scene.wavelengths), len(x))
     for element in elements:
-        h = designed_height(element, x, y)
         excess = excess_index(element, scene.wavelengths, x) / millimetres(scene)
         scale = excess if element.period is None else (1 / element.period).expand_as(excess)
-        total = total + scale[:, None] * h
+        total = total + scale[:, None] * designed_height(element, x, y)
     return total
 
 
-def _points(radius: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y (M,) mm, random over a disc: an ordered rule would bias the distances of pairs."""
-    draw = torch.Generator().manual_seed(0)
-    place, turn = torch.rand(2, _RAYS, generator=draw, dtype=torch.float64).to(radius)
-    r, angle = radius * torch.sqrt(place), 2 * math.pi * turn
-    return r * torch.cos(angle), r * torch.sin(angle)
-
-
-def _landings(scene: WaveScene, elements: Sequence[Element]) -> tuple[Tensor, Tensor]:
-    """x, y (D, W, M) mm on the sensor of rays through some of the elements; steps of rings are crossed along the
-    radius.
-    """
+def _landings(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (D, W, M) mm on the sensor of rays through some of the elements; they cross steps of rings radially."""
     R, wavelength = aperture(scene), millimetres(scene)[:, None]
-    x, y = _points(R)
     features = [e.profile.pitch for e in elements if is_flat(e)]
     step = min(features) if features else wavelength.min() * scene.sensor_distance / (8 * R)
     along = torch.ones_like(x), torch.zeros_like(x)
@@ -192,15 +175,12 @@ def _landings(scene: WaveScene, elements: Sequence[Element]) -> tuple[Tensor, Te
     return u * a + v * c, u * b + v * d
 
 
-def _gathered(scene: WaveScene, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Light in the window and ∫I² over it in 1/mm², (D, W), by rays (D, W, M) counted in square bins.
-
-    A pair of rays in a bin counts 1/bin²: fewer rays than bins are no bias. Bins are as wide as a core, or a pixel.
-    """
+def _sums_in_bins(scene: WaveScene, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Light in the window and ∫I² over it in 1/mm², (D, W), by rays (D, W, M) counted in square bins."""
     window, finest = scene.grid, _AIRY * millimetres(scene) * scene.sensor_distance / (2 * aperture(scene))
     half = [0.5 * window.pitch * n for n in window.shape[::-1]]
     light, squares = x.new_zeros(x.shape[:-1]), x.new_zeros(x.shape[:-1])
-    for w, bin in enumerate(torch.maximum(finest, window.pitch)):
+    for w, bin in enumerate(torch.maximum(finest, window.pitch)):  # as wide as a core, or a pixel
         columns = 2 * torch.ceil(half[0] / bin) + 1
         for d in range(len(x)):
             u, v = (p[d, w] - c for p, c in zip((x, y), window.centre, strict=True))
@@ -208,31 +188,30 @@ def _gathered(scene: WaveScene, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
             places = torch.round(v[inside] / bin) * columns + torch.round(u[inside] / bin)
             counts = torch.unique(places, return_counts=True)[1].to(x)
             light[d, w] = counts.sum() / _RAYS
+            # A pair of rays in a bin counts 1/bin²: fewer rays than bins are no bias.
             squares[d, w] = (counts * (counts - 1)).sum() / (_RAYS * (_RAYS - 1) * bin**2)
     return light, squares
 
 
-def _edges(element: Element, scene: WaveScene, waves: Tensor) -> Tensor:
-    """Σ |jump|² · length of the edges of an element, (W,) 1/mm, over the area of the aperture; waves: (W,) of path in 1
-    mm of height.
-    """
-    R, profile = aperture(scene), element.profile
+def _steps_of(element: Element, scene: WaveScene) -> Tensor:
+    """Σ |jump of the field|² · length of the edges of an element over the area of the aperture, (W,) 1/mm."""
+    R, profile, none = aperture(scene), element.profile, torch.zeros_like(scene.wavelengths)
+    waves = excess_index(element, scene.wavelengths, none) / millimetres(scene)  # of path in 1 mm of height
 
     def squares(jumps: Tensor) -> Tensor:
         return 2 - 2 * torch.cos(2 * math.pi * waves.reshape(-1, *[1] * jumps.dim()) * jumps)
 
+    if is_flat(element):
+        heights = fabricated_height(profile.heights, element.period, element.levels)
     if isinstance(profile, Pixels):
-        heights = fabricated_height(profile.heights, element.period, element.levels)
         pairs = [heights.diff(dim=dim) for dim in (0, 1) if heights.shape[dim] > 1]
-        return sum((squares(pair).mean((-2, -1)) / profile.pitch for pair in pairs), torch.zeros_like(waves))
+        return sum((squares(pair).mean((-2, -1)) / profile.pitch for pair in pairs), none)
     if isinstance(profile, Rings):
-        heights = fabricated_height(profile.heights, element.period, element.levels)
         r = profile.pitch * torch.arange(1, len(heights), dtype=heights.dtype, device=heights.device)
         return (squares(heights.diff()) * r * (r < R)).sum(-1) * 2 / R**2
     if element.period is None:
-        return torch.zeros_like(waves)
-    alone = WaveScene((element,), *(getattr(scene, n) for n in ("sensor_distance", "depths", "wavelengths", "grid")))
-    r = propagation.edges(alone)[1:-1]
+        return none
+    r = propagation.edges(replace(scene, elements=(element,)))[1:-1]
     before, behind = (height(element, r + s * 1e-6 * R, torch.zeros_like(r)) for s in (-1, 1))
     return (squares(behind - before) * r).sum(-1) * 2 / R**2
 
@@ -263,7 +242,7 @@ class Setting:
     @property
     def airy(self) -> float:
         """λz/D, mm."""
-        return self.shortest * self.distance / self.diameter
+        return self.period(1)
 
     def period(self, samples: float) -> float:
         """Distance mm of the copies of the image that so many cells across the aperture make."""
@@ -301,16 +280,43 @@ def setting_of(scene: WaveScene) -> Setting:
     )
 
 
+def _tail(s: Setting, samples: int) -> float:
+    """Of the light diffracted at the edge of the copies next to the window, which falls as the square of the gap."""
+    gap = s.period(samples) - s.blur - s.reach
+    return 0.3 * (s.airy / gap) ** 2 if gap > s.airy else 1.0
+
+
 def edge_error(s: Setting, samples: int, width: float | None = None) -> float:
     """Of N cells with weights of sixth order at the rim: fitted over blurs and windows.
 
-    The edge counts for more where the blur is few waves of defocus, or much wider than the window. width: radius mm of
-    the light; by default that of its farthest rays, which is enough for any shape.
+    width: radius mm of the light; by default that of its farthest rays, which is enough for any shape.
     """
     period, width = s.period(samples), s.blur if width is None else width
+    # The edge counts for more where the blur is few waves of defocus, or much wider than the window.
     waves = max(0.5, 0.25 * width / s.airy)
     share = 0.016 * (1 + 4 / waves) * max(1.0, width / s.reach) ** 0.6
     return min(1.0, share * (2 * width / period) ** 3.7 + 2e-4 * (s.reach / period) ** 2 + _tail(s, samples))
+
+
+def _area_error(s: Setting, samples: float) -> float:
+    """Of N cells that count at the rim by their area inside, fitted likewise."""
+    period = s.period(samples)
+    return min(1.0, 0.2 * (2 * s.core / period) ** 2 + 5e-4 * (s.reach / period) ** 2 + _tail(s, samples))
+
+
+def cut_error(s: Setting, samples: int, bare: float) -> float:
+    """Of cells of flat pixels cut by the rim, across which the phase of the bare sphere varies; bare: its blur, mm."""
+    return min(1.0, 0.8 * (s.core + 0.1 * s.airy) * bare / s.period(samples) ** 2 + _tail(s, samples))
+
+
+def _scattered(s: Setting, samples: float) -> float:
+    """Of light scattered evenly over a period: a cell cut by an edge into f and 1 - f holds the field of one side."""
+    shares = [pitch * samples / s.diameter for pitch in s.features]
+    whole = [min(abs(n - round(n)) / n for n in (share, 1 / share) if n > 0.5) < 0.01 for share in shares]
+    if s.lattice and all(whole) and min(shares) > 0.5:
+        return 0.0
+    # |jump|²/12 in the mean over a cell; steps that repeat with the cells add up: up to four times as much.
+    return (2.0 if any(whole) else 1.1) * s.scatter * (s.diameter / samples) ** 1.5
 
 
 def step_error(s: Setting, samples: float) -> float:
@@ -319,23 +325,10 @@ def step_error(s: Setting, samples: float) -> float:
     return min(1.0, _area_error(s, samples) + (curved if s.lattice else _scattered(s, samples)))
 
 
-def _scattered(s: Setting, samples: float) -> float:
-    """A cell cut by an edge into f and 1 - f holds the field of one side: in the mean over a cell |jump|²/12 of light,
-    scattered evenly over a period. Steps that repeat with the cells add up: up to four times as much.
-    """
-    shares = [pitch * samples / s.diameter for pitch in s.features]
-    whole = [min(abs(n - round(n)) / n for n in (share, 1 / share) if n > 0.5) < 0.01 for share in shares]
-    if s.lattice and all(whole) and min(shares) > 0.5:
-        return 0.0
-    return (2.0 if any(whole) else 1.1) * s.scatter * (s.diameter / samples) ** 1.5
-
-
 def transfer_error(s: Setting, samples: int, pad: float, band_limit: bool) -> float:
-    """Of the sampled field, its interpolation beyond 3/4 of the band, and the light that wraps round or is cut off.
-
-    Edges and steps send light to a distance ρ with a density ∝ 1/ρ³: without a limit six neighbouring copies bring it
-    back, with one its sharp end rings, by the gap to the window.
-    """
+    """Of the sampled field, its interpolation beyond 3/4 of the band, and the light that wraps round or is cut off."""
+    # Edges and steps send light to a distance ρ with a density ∝ 1/ρ³: without a limit six copies bring it back, with
+    # one its sharp end rings, by the gap to the window.
     width, aside = pad * s.diameter, 0.5 * s.diameter + s.reach
     error = _area_error(s, samples) + _scattered(s, samples)
     error += 0.0025 * max(0.0, (s.diameter / (s.airy * samples) - 0.7) / 0.2) ** 5
@@ -359,25 +352,6 @@ def radius_error(half: float, samples: int) -> float:
     return 1e-7 if samples >= enough else 0.3 * min(1.0, 10 ** (7 - 10 * samples / enough))
 
 
-def _tail(s: Setting, samples: int) -> float:
-    """Of the light diffracted at the edge of the copies next to the window, which falls as the square of the gap."""
-    gap = s.period(samples) - s.blur - s.reach
-    return 0.3 * (s.airy / gap) ** 2 if gap > s.airy else 1.0
-
-
-def _area_error(s: Setting, samples: float) -> float:
-    """Of N cells that count at the rim by their area inside, fitted likewise."""
-    period = s.period(samples)
-    return min(1.0, 0.2 * (2 * s.core / period) ** 2 + 5e-4 * (s.reach / period) ** 2 + _tail(s, samples))
-
-
-def cut_error(s: Setting, samples: int, bare: float) -> float:
-    """Of cells of flat pixels cut by the rim, across which the phase of the bare sphere varies, with a blur of `bare`
-    mm.
-    """
-    return min(1.0, 0.8 * (s.core + 0.1 * s.airy) * bare / s.period(samples) ** 2 + _tail(s, samples))
-
-
 def bessel(a: float, nodes: int) -> float:
     """Error of n Gauss nodes for exp(iat) over [-1, 1], about J_2n(a) <= (a/2)^2n/(2n)!."""
     return min(1.0, math.exp(2 * nodes * math.log(max(a, 1e-9) / 2) - math.lgamma(2 * nodes + 1)))
@@ -390,8 +364,7 @@ def gauss_count(a: float, tol: float) -> int:
 
 def half_phases(scene: WaveScene, s: Setting) -> tuple[float, float]:
     """Two estimates of the largest half of the phase, radians, of the integrand of the radial engine between two steps:
-    a bound, the slope at the farther one times their distance, and the accumulated phase.
-    """
+    a bound, the slope at the farther one times their distance, and the accumulated phase."""
     edges = propagation.edges(scene).detach()
     r = torch.linspace(0, 1, 513, dtype=edges.dtype, device=edges.device) * edges[-1]
     angle = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
@@ -455,10 +428,9 @@ def plan(
 
     engine: a name of ENGINES, or "auto": `radial` for round elements and a window on the axis, else `pupil`. samples,
     nodes: to be used as they are (`Plan`). pad, band_limit: of the transfer functions; pad 1.5 without a band limit is
-    that of Sitzmann et al. (2018).
-    Raises AliasedSampling where copies of the image would lie in the window, ValueError where an engine cannot hold
-    the scene; warns `psf_models.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the
-    finest sampling does not meet tol.
+    that of Sitzmann et al. (2018). Raises AliasedSampling where copies of the image would lie in the window, ValueError
+    where an engine cannot hold the scene; warns `psf_models.dft.Aliased` where the converging field is undersampled,
+    and `NotConverged` where the finest sampling does not meet tol.
     """
     check(scene)
     round_scene = is_round(scene) and is_centred(scene.grid)
@@ -469,18 +441,24 @@ def plan(
     if engine == "radial" and not round_scene:
         raise ValueError("the radial engine needs round elements and a grid centred on the axis; use engine='pupil'")
     row, setting = ENGINES[engine], setting_of(scene)
-    sampling = row.plan(
-        scene, setting, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
-    )
+    options = {"engine": engine, "samples": samples, "nodes": nodes, "pad": pad, "band_limit": band_limit}
+    sampling = row.plan(scene, setting, tol=tol, **options)
     # An engine that samples the converging field itself is a reference: not held to a tolerance.
     if row.prepare is not None and samples is None and nodes is None and sampling.error > tol:
-        message = f"predicted error {sampling.error:.2g} above the tolerance {tol:.2g} with {sampling.samples} samples"
-        message += f"; the worst light lies within ±{setting.width:.3g} mm"
+        message = (
+            f"predicted error {sampling.error:.2g} above the tolerance {tol:.2g} with {sampling.samples} samples; "
+            f"the worst light lies within ±{setting.width:.3g} mm"
+        )
         warnings.warn(message, NotConverged, stacklevel=calling_level())
     return sampling
 
 
-# -- the engines -------------------------------------------------------------------------------------------------------
+def _least(error: Callable[[int], float], tol: float) -> int:
+    return next((n for n in range(16, _FINEST, 4) if error(n) <= tol), _FINEST)
+
+
+def _even(number: float) -> int:
+    return max(16, 2 * math.ceil(0.5 * number))
 
 
 def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
@@ -524,10 +502,9 @@ def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | No
 
 
 def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
-    """Smooth cells behind a round part that is known within a band: the reach of the free part into the window's
-    corner, and 25 Airy radii beyond, where light diffracted at the rim has faded.
-    """
+    """Smooth cells behind a round part that is known within a band."""
     longest = float(millimetres(scene).detach().max())
+    # The reach of the free part into the window's corner, and 25 Airy radii beyond: light diffracted at the rim fades.
     aside, beyond = deflection(scene, 1.0), 25 * longest * s.distance / s.diameter
     near = math.sqrt(2) * s.reach + aside + beyond
     band = near, 1.4 * near
@@ -594,17 +571,6 @@ def _aligned(scene: WaveScene, s: Setting, samples: int) -> tuple[int, float]:
     return across * math.ceil(samples * extent / across), extent
 
 
-def _least(error, tol: float) -> int:
-    return next((n for n in range(16, _FINEST, 4) if error(n) <= tol), _FINEST)
-
-
-def _even(number: float) -> int:
-    return max(16, 2 * math.ceil(0.5 * number))
-
-
-# -- the kernels -------------------------------------------------------------------------------------------------------
-
-
 def _pupil_sums(scene: WaveScene, plan: Plan) -> pupil.PupilSums | mixed.MixedSums:
     if plan.cells == "mixed":
         return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
@@ -619,9 +585,15 @@ def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
 
 
 def _transfer_kernels(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
-    options = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
-    light, weight = propagation.transfer_function_intensity(scene, samples=plan.samples, nodes=plan.nodes, **options)
-    return integrate(light, weight, scene.grid.pitch)
+    (u, v, weight), pitch, fields = sub_pixels(scene.grid, plan.nodes), 2 * aperture(scene) / plan.samples, []
+    options = {"band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
+    options["size"] = propagation.padded(plan.samples, plan.pad)
+    for k, wavelength in enumerate(millimetres(scene)):
+        field = propagation.behind(scene, k, plan.samples)
+        field = propagation.propagate(field, pitch, scene.sensor_distance, wavelength, **options)
+        fields.append(propagation.at_nodes(field, pitch, u, v))
+    U = torch.stack(fields, 1)
+    return integrate(U.real**2 + U.imag**2, weight, scene.grid.pitch)
 
 
 class Engine(NamedTuple):

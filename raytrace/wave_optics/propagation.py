@@ -27,38 +27,19 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.psf_models.dft import bessel_j0, phasor, sub_pixels
+from raytrace.psf_models.dft import bessel_j0, phasor
 from raytrace.psf_models.radial import radii_of_waves, unfold
-from raytrace.wave_optics.element import Element, Rings, designed_height, path
+from raytrace.wave_optics.element import Rings, designed_height, path
 from raytrace.wave_optics.pupil import disc_cells
 from raytrace.wave_optics.scene import WaveScene, aperture, excess, millimetres, spheres
 
 _LOBES = 24  # samples on either side in the interpolation from the field's grid to the nodes of the pixels
 
 
-def transfer_function_intensity(
-    scene: WaveScene, *, samples: int, nodes: int, pad: float, band_limit: bool, spectrum: bool
-) -> tuple[Tensor, Tensor]:
-    """Light per mm² (D, W, Y, X) at the nodes of the pixels, and the weights of the nodes.
-
-    samples: across the diameter; pad: width of the transform over the diameter. spectrum: the angular spectrum's
-    transfer function instead of Fresnel's.
-    """
-    pitch = 2 * aperture(scene) / samples
-    u, v, weight = sub_pixels(scene.grid, nodes)
-    options = {"size": padded(samples, pad), "band_limit": band_limit, "spectrum": spectrum}
-    fields = []
-    for k, wavelength in enumerate(millimetres(scene)):
-        field = propagate(behind(scene, k, samples), pitch, scene.sensor_distance, wavelength, **options)
-        fields.append(at_nodes(field, pitch, u, v))
-    U = torch.stack(fields, 1)
-    return U.real**2 + U.imag**2, weight
-
-
 def padded(samples: int, pad: float) -> int:
     """Samples of the padded transform: pad·samples or the next number of small factors, as odd or even as `samples`."""
     size = math.ceil(pad * samples - 1e-9)
-    while (size - samples) % 2 or not _has_small_factors(size):
+    while (size - samples) % 2 or pow(2 * 3 * 5 * 7, 64, size):
         size += 1
     return size
 
@@ -91,20 +72,9 @@ def propagate(
     """
     N = field.shape[-1]
     size = N if size is None else size
-    f = torch.fft.fftfreq(size, dtype=pitch.dtype, device=pitch.device) / pitch
-    H = transfer(f, distance, wavelength, size * pitch, band_limit=band_limit, spectrum=spectrum)
-    before = (size - N) // 2
-    padded = torch.nn.functional.pad(field, (before, size - N - before, before, size - N - before))
-    # Both grids are centred on the axis: the same shift on either side of H cancels.
-    return torch.fft.ifft2(torch.fft.fft2(padded) * H)
-
-
-def transfer(
-    f: Tensor, distance: Tensor, wavelength: Tensor, width: Tensor, *, band_limit: bool, spectrum: bool
-) -> Tensor:
-    """H (M, M) at frequencies f (M,) 1/mm along both axes; width: of the padded field, mm."""
-    f2 = f * f + (f * f)[:, None]
+    f, width = torch.fft.fftfreq(size, dtype=pitch.dtype, device=pitch.device) / pitch, size * pitch
     if spectrum:
+        f2 = f * f + (f * f)[:, None]
         rest = 1 - wavelength**2 * f2
         H = phasor(-wavelength * distance * f2 / (1 + safe_sqrt(rest))) * (rest > 0)
         limit = 1 / (wavelength * torch.sqrt((2 * distance / width) ** 2 + 1))
@@ -113,37 +83,31 @@ def transfer(
         along = phasor(-0.5 * wavelength * distance * f * f)
         H = along * along[:, None]
         limit = width / (2 * wavelength * distance)
-    if not band_limit:
-        return H
-    passed = (f.abs() <= limit).to(f.dtype).detach()
-    return H * (passed * passed[:, None])
+    if band_limit:
+        passed = (f.abs() <= limit).to(f.dtype).detach()
+        H = H * (passed * passed[:, None])
+    before = (size - N) // 2
+    padded = torch.nn.functional.pad(field, (before, size - N - before, before, size - N - before))
+    # Both grids are centred on the axis: the same shift on either side of H cancels.
+    return torch.fft.ifft2(torch.fft.fft2(padded) * H)
 
 
 def at_nodes(field: Tensor, pitch: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Field (..., Y, X) at points v (Y), u (X) mm from samples (..., M, M) around the axis, by a windowed sinc."""
-    along, first, last = zip(*(_interpolation(s, pitch, field.shape[-1]) for s in (v, u)), strict=True)
-    part = field[..., first[0] : last[0], first[1] : last[1]]
-    return along[0].to(field.dtype) @ part @ along[1].to(field.dtype).T
-
-
-def _interpolation(s: Tensor, pitch: Tensor, size: int) -> tuple[Tensor, int, int]:
-    """Matrix (S, last - first) from samples of one axis to points s (S); outside the samples the field is 0."""
-    place = s / pitch + 0.5 * (size - 1)
-    low, high = (int(torch.floor(extreme.detach())) for extreme in (place.min(), place.max()))
-    first, last = max(0, low - _LOBES), min(size, high + _LOBES + 2)
-    apart = place[:, None] - torch.arange(first, last, dtype=s.dtype, device=s.device)
-    # Kaiser's window, β for a field of three quarters of the band.
-    inside = (1 - (apart / (_LOBES + 1)) ** 2).clamp(min=0.0)
-    beta = 0.25 * math.pi * (_LOBES + 1)
-    window = torch.special.i0(beta * safe_sqrt(inside)) / float(np.i0(beta)) * (inside > 0)
-    return torch.sinc(apart) * window, first, last
-
-
-def _has_small_factors(number: int) -> bool:
-    for factor in (2, 3, 5, 7):
-        while number % factor == 0:
-            number //= factor
-    return number == 1
+    """Field (..., Y, X) at points v (Y), u (X) mm from samples (..., M, M) around the axis, by a windowed sinc; 0
+    outside the samples."""
+    size, along = field.shape[-1], []
+    for axis, s in ((-2, v), (-1, u)):
+        place = s / pitch + 0.5 * (size - 1)
+        low, high = (int(torch.floor(extreme.detach())) for extreme in (place.min(), place.max()))
+        first, last = max(0, low - _LOBES), min(size, high + _LOBES + 2)
+        apart = place[:, None] - torch.arange(first, last, dtype=s.dtype, device=s.device)
+        # Kaiser's window, β for a field of three quarters of the band.
+        inside = (1 - (apart / (_LOBES + 1)) ** 2).clamp(min=0.0)
+        beta = 0.25 * math.pi * (_LOBES + 1)
+        window = torch.special.i0(beta * safe_sqrt(inside)) / float(np.i0(beta)) * (inside > 0)
+        along.append((torch.sinc(apart) * window).to(field.dtype))
+        field = field.narrow(axis, first, last - first)
+    return along[0] @ field @ along[1].T
 
 
 _PROBES = 20_000  # radii where the jumps of a wrapped height are looked for
@@ -182,16 +146,11 @@ def to_radii(scene: WaveScene, rho: Tensor, nodes: int) -> tuple[Tensor, Tensor]
 
 def radial_kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
     """Energy in the pixels (D, W, rows, columns), 1 = all through the aperture."""
-    return unfold(scene.grid, radial_intensity(scene, sums) @ sums.to_pixels.T)
-
-
-def radial_intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
-    """Light per mm² (D, W, K) at the radii of the sensor."""
-    U = phasors(scene, sums.r, sums.sphere)
     # A real matrix on the columns Re U, Im U of all depths.
-    parts = torch.view_as_real(U).permute(1, 2, 0, 3).flatten(2)
+    parts = torch.view_as_real(phasors(scene, sums.r, sums.sphere)).permute(1, 2, 0, 3).flatten(2)
     parts = (sums.bessel @ parts).unflatten(-1, (-1, 2))
-    return (parts**2).sum(-1).permute(2, 0, 1)
+    intensity = (parts**2).sum(-1).permute(2, 0, 1)
+    return unfold(scene.grid, intensity @ sums.to_pixels.T)
 
 
 def radial_field(scene: WaveScene, rho: Tensor, nodes: int) -> Tensor:
@@ -233,27 +192,22 @@ def edges(scene: WaveScene) -> Tensor:
     for element in scene.elements:
         if isinstance(element.profile, Rings):
             pitch, count = element.profile.pitch, len(element.profile.heights)
-            steps = pitch * torch.arange(1, count, dtype=pitch.dtype, device=pitch.device)
-            inner.append(steps)
+            inner.append(pitch * torch.arange(1, count, dtype=pitch.dtype, device=pitch.device))
         elif element.period is not None:
-            inner.append(_jumps(element, R.detach()))
+            # Radii where a wrapped or stepped smooth height jumps: between two probes h runs straight.
+            r = R.detach() * torch.sqrt(torch.linspace(0, 1, _PROBES, dtype=R.dtype, device=R.device))
+            h = designed_height(element, r, torch.zeros_like(r)).detach()
+            step = h / (element.period.detach() / max(1, element.levels))
+            at = step.floor().diff().nonzero()[:, 0]
+            # The integer between the two, the higher one's floor.
+            level = torch.maximum(step[at], step[at + 1]).floor()
+            share = (level - step[at]) / (step[at + 1] - step[at])
+            inner.append(torch.sqrt(r[at] ** 2 + share * (r[at + 1] ** 2 - r[at] ** 2)))
     # Steps of different elements at the same radius, to rounding, count once.
     radii = torch.cat(inner).sort().values
     share = radii.detach() / R.detach()
     apart = (torch.cat([share.new_zeros(1), share]).diff() > 1e-9) & (share < 1 - 1e-9)
     return torch.cat([R.new_zeros(1), radii[apart], R.reshape(1)])
-
-
-def _jumps(element: Element, radius: Tensor) -> Tensor:
-    """Radii where a wrapped or stepped smooth height jumps: between two probes h runs straight."""
-    r = radius * torch.sqrt(torch.linspace(0, 1, _PROBES, dtype=radius.dtype, device=radius.device))
-    h = designed_height(element, r, torch.zeros_like(r)).detach()
-    step = h / (element.period.detach() / max(1, element.levels))
-    at = step.floor().diff().nonzero()[:, 0]
-    # The integer between the two, the higher one's floor.
-    level = torch.maximum(step[at], step[at + 1]).floor()
-    share = (level - step[at]) / (step[at + 1] - step[at])
-    return torch.sqrt(r[at] ** 2 + share * (r[at + 1] ** 2 - r[at] ** 2))
 
 
 def rule(edges: Tensor, nodes: int) -> tuple[Tensor, Tensor]:

@@ -76,8 +76,17 @@ def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> tuple[Tensor, Tensor, 
     """From cells at t (N,) on both axes to the nodes of the pixels: along_x, along_y, pixel and folded of the sums."""
     u, v, pixel = sub_pixels(scene.grid, nodes)
     folded = is_centred(scene.grid)
-    along_x, along_y = ((halves if folded else waves_at)(s, t, millimetres(scene)) for s in (u, v))
-    return along_x, along_y, pixel, folded
+
+    def along(s: Tensor) -> Tensor:
+        if not folded:
+            return waves_at(s, t, millimetres(scene))
+        wave = waves_at(s[len(s) // 2 :], t[len(t) // 2 :], millimetres(scene))
+        cosine = wave.real
+        if len(t) % 2:  # the point in the middle is its own image
+            cosine = torch.cat([0.5 * cosine[..., :1], cosine[..., 1:]], -1)
+        return torch.stack([cosine, -wave.imag])
+
+    return along(u), along(v), pixel, folded
 
 
 def prepare_pixels(scene: WaveScene, nodes: int, inner: int, *, parts: int = 1) -> PupilSums:
@@ -88,7 +97,8 @@ def prepare_pixels(scene: WaveScene, nodes: int, inner: int, *, parts: int = 1) 
     R, z, wavelength = aperture(scene), scene.sensor_distance, millimetres(scene)
     profile = scene.elements[0].profile
     pitch = profile.pitch / parts
-    x, y = (_cell_axis(pitch, parts * cells_across(profile.pitch, n, R)) for n in profile.heights.shape[::-1])
+    counts = (parts * cells_across(profile.pitch, n, R) for n in profile.heights.shape[::-1])
+    x, y = (pitch * (torch.arange(n, dtype=R.dtype, device=R.device) - 0.5 * (n - 1)) for n in counts)
     weight = covered(x, y, pitch, R) / (z * math.sqrt(math.pi) * R)
     u, v, pixel = sub_pixels(scene.grid, nodes)
     along = [_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v))]
@@ -108,13 +118,29 @@ def intensity(scene: WaveScene, sums: PupilSums) -> Tensor:
 def light_of(scene: WaveScene, sums, U: Tensor) -> Tensor:
     """|U|² (..., W, Y, X) at the nodes of the pixels, of light through cells (..., W, N, N).
 
-    sums: their matrices `along_x`, `along_y`, and whether they are `folded`, as of `PupilSums`.
+    sums: their matrices `along_x`, `along_y`, and whether they are `folded`, as of `PupilSums`: then the real and the
+    imaginary part are summed by real products of a quarter of the size,
+
+        exp(-i(a + b)) = cos a cos b - sin a sin b - i (sin a cos b + cos a sin b)
+
+    Cosines see the even part, sines the odd one, and the signs of a and b give the four quadrants.
     """
-    if sums.folded:
-        nodes = tuple(n * len(sums.pixel) for n in scene.grid.shape)
-        return _folded_intensity(sums, torch.stack([U.real, U.imag]), nodes)
-    U = sums.along_y @ U @ sums.along_x.mT
-    return U.real**2 + U.imag**2
+    if not sums.folded:
+        U = sums.along_y @ U @ sums.along_x.mT
+        return U.real**2 + U.imag**2
+    (cos_y, sin_y), (cos_x, sin_x) = sums.along_y, sums.along_x
+    even, odd = _fold(torch.stack([U.real, U.imag]), -2)
+    rows = [(_fold(along @ part, -1)) for along, part in ((cos_y, even), (sin_y, odd))]
+    (cc, cs), (sc, ss) = ((e @ cos_x.mT, o @ sin_x.mT) for e, o in rows)
+    quadrants = []
+    for a, b in ((cc - ss, sc + cs), (cc + ss, sc - cs)):
+        both, cross = (a * a + b * b).sum(0), 2 * (a[0] * b[1] - a[1] * b[0])
+        quadrants += [both + cross, both - cross]
+    (pp, mm), (pm, mp) = quadrants[:2], quadrants[2:]  # signs of y, x
+    counts = (n * len(sums.pixel) for n in scene.grid.shape)  # of nodes along y and x
+    skip_y, skip_x = (2 * a.shape[-2] - n for a, n in zip((sums.along_y, sums.along_x), counts, strict=True))
+    above, below = (torch.cat([m[..., skip_x:].flip(-1), p], -1) for m, p in ((pm, pp), (mm, mp)))
+    return torch.cat([below[..., skip_y:, :].flip(-2), above], -2)
 
 
 def disc_cells(samples: int, extent: float = 1.0) -> np.ndarray:
@@ -127,9 +153,8 @@ def disc_cells(samples: int, extent: float = 1.0) -> np.ndarray:
 def smooth_cells(samples: int) -> np.ndarray:
     """Weights (N + 2·margin, …) of smooth values at the centres of cells, N across the unit disc, in its integral.
 
-    w_j = ∬_disc φ(x - x_j) φ(y - y_j) dx dy, φ the cardinal function of six-point Lagrange interpolation: inside it is
-    one cell, at the edge the polynomial through the values is integrated up to the edge, where areas alone err by the
-    square of the cell (measured on a blurred spot, N = 160: 3e-4 instead of 2.5e-3).
+    w_j = ∬_disc φ(x - x_j) φ(y - y_j) dx dy, φ the cardinal function of six-point Lagrange interpolation. Areas alone
+    err by the square of the cell (measured on a blurred spot, N = 160: 3e-4 instead of 2.5e-3).
     """
     size = samples + 2 * _MARGIN
     sub = 2 * max(2, min(8, 1024 // size))
@@ -167,46 +192,12 @@ def waves_at(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
     return phasor(-u[:, None] * t / wavelength[:, None, None])
 
 
-def halves(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
-    """cos and sin of 2π u t/λ at the upper halves of symmetric points: (2, W, ⌈U/2⌉, ⌈N/2⌉)."""
-    wave = waves_at(u[len(u) // 2 :], t[len(t) // 2 :], wavelength)
-    cosine = wave.real
-    if len(t) % 2:  # the point in the middle is its own image
-        cosine = torch.cat([0.5 * cosine[..., :1], cosine[..., 1:]], -1)
-    return torch.stack([cosine, -wave.imag])
-
-
-def _folded_intensity(sums: PupilSums, U: Tensor, nodes: tuple[int, int]) -> Tensor:
-    """|F U|² for real and imaginary parts (2, D, W, N, N), by real products of a quarter of the size.
-
-    exp(-i(a + b)) = cos a cos b - sin a sin b - i (sin a cos b + cos a sin b); cosines see the even part, sines the
-    odd one, and the signs of a and b give the four quadrants. nodes: how many along y and x.
-    """
-    (cos_y, sin_y), (cos_x, sin_x) = sums.along_y, sums.along_x
-    even, odd = _fold(U, -2)
-    rows = [(_fold(along @ part, -1)) for along, part in ((cos_y, even), (sin_y, odd))]
-    (cc, cs), (sc, ss) = ((e @ cos_x.mT, o @ sin_x.mT) for e, o in rows)
-    quadrants = []
-    for a, b in ((cc - ss, sc + cs), (cc + ss, sc - cs)):
-        both, cross = (a * a + b * b).sum(0), 2 * (a[0] * b[1] - a[1] * b[0])
-        quadrants += [both + cross, both - cross]
-    (pp, mm), (pm, mp) = quadrants[:2], quadrants[2:]  # signs of y, x
-    skip_y, skip_x = (2 * a.shape[-2] - n for a, n in ((sums.along_y, nodes[0]), (sums.along_x, nodes[1])))
-    above, below = (torch.cat([m[..., skip_x:].flip(-1), p], -1) for m, p in ((pm, pp), (mm, mp)))
-    return torch.cat([below[..., skip_y:, :].flip(-2), above], -2)
-
-
 def _fold(values: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Sum and difference of the upper half of an axis and the mirrored lower half; a middle counts in both."""
     size = values.shape[dim]
     half = (size + 1) // 2
     upper, lower = values.narrow(dim, size - half, half), values.narrow(dim, 0, half).flip(dim)
     return upper + lower, upper - lower
-
-
-def _cell_axis(pitch: Tensor, count: int) -> Tensor:
-    """Centres (N,) of cells around the axis."""
-    return (torch.arange(count, dtype=pitch.dtype, device=pitch.device) - 0.5 * (count - 1)) * pitch
 
 
 def cells_across(pitch: Tensor, count: int, radius: Tensor) -> int:

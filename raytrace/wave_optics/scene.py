@@ -42,14 +42,9 @@ def check(scene: WaveScene) -> None:
         raise ValueError(f"expected depths (D,) and wavelengths (W,), found {shapes}; write a single number as a list")
     if scene.grid.centre.dim() != 1:
         raise ValueError(f"a wave scene has one window, found a grid with centres {tuple(scene.grid.centre.shape)}")
-    positive = {
-        "sensor distance (mm)": scene.sensor_distance,
-        "depths (mm; inf for a plane wave)": scene.depths,
-        "wavelengths (µm)": scene.wavelengths,
-        "aperture radius (mm)": scene.elements[0].radius,
-        "pixel pitch (mm)": scene.grid.pitch,
-    }
-    for name, numbers in positive.items():
+    positive = {"sensor distance (mm)": scene.sensor_distance, "depths (mm; inf for a plane wave)": scene.depths}
+    positive |= {"wavelengths (µm)": scene.wavelengths, "pixel pitch (mm)": scene.grid.pitch}
+    for name, numbers in (positive | {"aperture radius (mm)": aperture(scene)}).items():
         if not bool((numbers > 0).all()):
             raise ValueError(f"{name} must be greater than 0, found {numbers.detach().flatten().tolist()}")
     check_unit(scene.wavelengths, (element.glass for element in scene.elements))

@@ -1,0 +1,133 @@
+"""A number has one unit: the text of a result prints the numbers of its table, its CSV and its JSON."""
+
+import functools
+import math
+import re
+
+import pytest
+
+import raytrace as rt
+from raytrace import analysis
+from raytrace.maths.result import Result
+
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
+_POWERS = (-6, -3, -2, 2, 3, 6)  # of ten, between units: mm and µm or m, parts and per cent, 1/K and 10⁻⁶/K
+_DIGITS = 4  # a printed number with fewer may agree with another one by chance
+_UNITS_UNPRINTED = ("evaluate", "info", "trace")  # units of rows by operand; mm and degrees of a prescription, of CSV
+_WITHOUT_LENGTHS = {"Arrivals", "ImportReport"}  # rays that `spot` saves as CSV, and counts of keywords
+
+
+def results() -> dict[str, tuple]:
+    """Every public result with a table: how to compute a small one, and columns that its text prints."""
+    colours, fields = {"wavelengths": [0.5, 0.6]}, {"fields": [0, 10]}
+    double, single = rt.read_lens("double_gauss"), rt.read_lens("singlet")
+    over_field = {"samples": 3, **colours}
+    return {
+        "distortion": (lambda: rt.distortion(double, **over_field), "height f_tan_percent f_theta_percent"),
+        "field_curvature": (lambda: rt.field_curvature(double, **over_field), "tangential sagittal"),
+        "lateral_colour": (lambda: rt.lateral_colour(double, **over_field), "shift"),
+        "chromatic": (lambda: rt.chromatic_focal_shift(double, samples=5, **colours), "wavelength shift"),
+        "encircled_energy": (lambda: rt.encircled_energy(double, geometric=True, **fields), "radius share"),
+        "ray_fan": (lambda: rt.ray_fan(double, points=5, **fields), "tangential sagittal"),
+        "opd_fan": (lambda: rt.opd_fan(double, points=5, **fields), "tangential sagittal"),
+        "distortion_grid": (lambda: rt.distortion_grid(double, points=3), "distortion_percent"),
+        "illumination": (lambda: rt.relative_illumination(double, samples=3), "illumination projected_solid_angle"),
+        "incidence": (lambda: rt.incidence(double, samples=3, surfaces=True), "lower chief upper"),
+        "longitudinal": (lambda: rt.longitudinal_aberration(double, points=5), "crossing"),
+        "mtf": (lambda: rt.mtf(double, frequencies=[10, 20], geometric=True), "tangential sagittal"),
+        "through_focus": (
+            lambda: rt.mtf(double, frequencies=[10], through_focus=0.1, geometric=True),
+            "sensor_distance tangential sagittal",
+        ),
+        "rms of wavefronts": (lambda: rt.rms_over_field(double, samples=3), "rms"),
+        "rms of spots": (lambda: rt.rms_over_field(double, samples=3, spot=True), "rms_um"),
+        "seidel": (lambda: rt.seidel(double), "S1 S2 S3 S4 S5 marginal_yni chief_yni"),
+        "seidel in waves": (lambda: rt.seidel(double, kind="waves"), "W040 W131"),
+        "wavefront": (lambda: rt.wavefront(double, size=16, terms=9, **fields), "coefficient"),
+        "spot": (lambda: rt.spot(double, rings=4, **colours), "centroid_y rms_radius_um geometric_radius_um"),
+        "spot of many rays": (lambda: rt.spot(double, rays=1000), "centroid_y rms_radius_um geometric_radius_um"),
+        "focus": (lambda: rt.focus(double, object_distances=[3000]), "sensor_distance rms_radius_um"),
+        "compare": (lambda: rt.compare(single, object_distances=[10e3, 20e3]), "object_distance sigma_um difference"),
+        "abilities": (lambda: analysis.abilities(single), "conic anisotropy"),
+        "psf": (
+            lambda: rt.psf(single, "fourier", tol=1e-2),
+            "centroid_y sigma_x_um sigma_y_um ray_sigma_x_um ray_sigma_y_um energy",
+        ),
+        "psfs": (
+            lambda: rt.psf(double, "gaussian", tol=1e-2, per_wavelength=True, **colours),
+            "wavelength centroid_y sigma_x_um sigma_y_um energy",
+        ),
+        "wave_psf": (
+            lambda: rt.wave_psf("fresnel", depths=[1000, math.inf], wavelengths=[0.55], size=16),
+            "depth wavelength energy peak half_energy_radius_um",
+        ),
+        "evaluate": (lambda: rt.evaluate(double, merit="spot", each=True), "value weight contribution_percent"),
+        "optimize": (lambda: rt.optimize(double, merit="spot", vary=["curvature"], cycles=1), "before after"),
+        "search": (
+            lambda: rt.search(single, merit="spot", vary=["sensor"], starts=1, seconds=5),
+            "merit efl rms_1_um rms_2_um rms_3_um",
+        ),
+        "info": (lambda: rt.info(double), "radius thickness semi_diameter index"),
+        "trace": (lambda: rt.trace(double), "x y z opl"),
+        "glass": (lambda: rt.glass("N-BK7", temperature=40), "wavelength index dn_dt dn_dt_absolute"),
+    }
+
+
+def printed(text: str) -> list[tuple[float, float]]:
+    """Numbers of a text, and half a unit of their last digit."""
+    text = text.replace("%", " ").replace("/K", " ")
+    found = []
+    for word in _NUMBER.findall(text):
+        mantissa, _, power = word.partition("e")
+        found.append((float(word), 0.51 * 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))))
+    return found
+
+
+def is_listed(number: float, error: float, numbers: list[float]) -> bool:
+    return any(abs(abs(number) - abs(other)) <= error + 1e-9 * abs(other) for other in numbers)
+
+
+def entries(document, column: str) -> list[float]:
+    """Numbers of this name in the rows of a document, at any depth."""
+    if isinstance(document, list):
+        return [number for part in document for number in entries(part, column)]
+    if not isinstance(document, dict):
+        return []
+    numbers = [number for part in document.values() for number in entries(part, column)]
+    return numbers + [number for number in [document.get(column)] if isinstance(number, float)]
+
+
+@functools.cache
+def computed(name: str):
+    return results()[name][0]()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", results())
+def test_text_table_and_document_have_the_same_units(name):
+    result, columns = computed(name), results()[name][1].split()
+    frame, document, shown = result.to_frame(), result.document(), printed(str(result))
+    assert frame.attrs["units"].items() <= result.units().items()
+    every = [float(number) for column in frame.select_dtypes("number") for number in frame[column]]
+    every = [number for number in every if math.isfinite(number)]
+    for column in columns:
+        numbers = [float(number) for number in frame[column] if abs(number) > 1e-12]
+        assert any(number and is_listed(number, error, numbers) for number, error in shown), column
+        unit = frame.attrs["units"].get(column, "")
+        assert unit.removeprefix("1") in str(result) or name in _UNITS_UNPRINTED, f"{column}: {unit}"
+        for number in entries(document.get("results", document.get("operands", [])), column):
+            assert is_listed(number, 1e-12, [float(number) for number in frame[column]]), column
+    for number, error in shown:
+        if abs(number) > 10**_DIGITS * error and not is_listed(number, error, every):
+            for power in _POWERS:
+                scaled = [other * 10.0**power for other in every if other]
+                assert not is_listed(number, error, scaled), f"text: {number:g}, table: this times 1e{-power}"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_table_is_compared():
+    def below(kind: type) -> set[type]:
+        return {kind}.union(*map(below, kind.__subclasses__()))
+
+    tables = {kind.__name__ for kind in below(Result) - {Result} if "columns" in vars(kind)}
+    assert tables == {type(computed(name)).__name__ for name in results()} | _WITHOUT_LENGTHS
