@@ -185,11 +185,12 @@ def logs(folder: Path) -> Reader:
 
 
 def settings(folder: Path) -> Reader:
-    run = Run(folder / "run", {"a": 1, "world": {"b": [1.5, 2]}, "name": "x"})
+    values = {"a": 1, "world": {"b": [1.5, 2]}, "name": "x"}
+    run = Run(folder / "run", values)
     written = run.folder / "settings.json"
     return Reader(
         (written.read_bytes(),),
-        from_file(lambda _: Run(run.folder, run.settings), written),
+        from_file(lambda _: Run(run.folder, values), written),
         (DamagedRun, OtherSettings),
     )
 
