@@ -308,7 +308,7 @@ def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     own = camera(read_lens(LENS), settings)
     optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert own.variables.numbers()["sensor"] == pytest.approx(57.88, abs=1e-9)
-    with pytest.raises(BadVariables, match="bounds for thickness_5, not among the variables: sensor"):
+    with pytest.raises(BadVariables, match="`bounds` for thickness_5, not among the variables"):
         camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
 
 

@@ -351,10 +351,14 @@ def report(runs: Sequence[Run]) -> list[str]:
     return table(columns, runs)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lens", choices=PROBLEMS, nargs="+", default=[*PROBLEMS], help="sample lenses of Optiland")
     parser.add_argument("--steps", metavar="N", type=int, default=40, help="steps of Adam (default 40)")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    options(parser)
     arguments = parser.parse_args(argv)
     torch.set_num_threads(1)
     prepare()
