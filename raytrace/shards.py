@@ -171,7 +171,7 @@ def _begin() -> "distributed.Store":
     store.set(f"here {rank}", "")
     # Not left to the process group: it waits where no signal arrives.
     if not _wait(lambda: store.check([f"here {other}" for other in range(count)]), _PATIENCE):
-        raise ProcessLost(f"not all of {count} processes have begun after {_PATIENCE:.0f} s")
+        raise ProcessLost(f"not all of {count} processes have started after {_PATIENCE:.0f} s")
     gpus = torch.cuda.device_count()
     has_own_gpu = gpus >= int(os.environ.get("LOCAL_WORLD_SIZE", count)) > 0
     if has_own_gpu:

@@ -230,7 +230,7 @@ class Lines:
         """
         content = read_bytes(self.path, _MOST) if self.path.exists() else b""
         *lines, torn = content.split(b"\n")
-        begun, found, damaged = None, [], []
+        head, found, damaged = None, [], []
         for number, line in enumerate([*lines, torn], 1):
             is_torn = number > len(lines)
             if is_torn and not line:
@@ -247,12 +247,12 @@ class Lines:
                     damaged.append(f"line {number}: {reason}")
                 continue
             if is_head:
-                begun = value
+                head = value
             else:
                 found.append((number, value))
             self._gap = "\n" if is_torn else ""
         self._report(damaged)
-        return begun, found
+        return head, found
 
     def _report(self, damaged: list[str]) -> None:
         for words in damaged[:_REPORTED]:

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import raytrace as rt
 from raytrace.analysis.compare import abilities
-from raytrace.analysis.space import draw
+from raytrace.analysis.layout_3d import draw
 from raytrace.words import named, with_article
 
 

@@ -273,7 +273,7 @@ WRONG = {
     ),
     "depth": (["--depth", "3"], "expected an even depth"),
     "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
-    "resume": (["--resume"], "out: no run was begun here"),
+    "resume": (["--resume"], "out: no run was started here"),
     "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
     "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8,12"),
     "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables"),
@@ -325,7 +325,7 @@ def test_two_processes_find_what_one_does(run, pictures, tmp_path):
 
 def test_a_study_that_was_not_begun_is_refused(compare):
     for options in (("--report-only",), ("--resume",)):
-        with pytest.raises(codesign_run.CommandError, match="out: no study was begun here"):
+        with pytest.raises(codesign_run.CommandError, match="out: no study was started here"):
             compare("double_gauss", "-o", "out", *options)
     with pytest.raises(codesign_run.CommandError, match="give -o FOLDER"):
         compare("double_gauss")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.analysis import outline
+from raytrace.analysis import cross_section
 from raytrace.maths.pupil import fan
 from raytrace.system.surface import sag_at
 from raytrace.tracing.geometry import frames
@@ -44,7 +44,7 @@ def test_rays_in_space_are_straight_between_surfaces_and_lie_on_them(tilt_y):
     lens = folded(tilt_y)
     placed, fields = frames(lens), torch.stack([lens.fields.x, lens.fields.y])
     points = torch.cat([fan(5, axis)[0] for axis in "xy"], 1)
-    paths = outline.ray_paths(lens, points, fields=fields, wavelength=lens.wavelengths[0], z_start=-10.0)
+    paths = cross_section.ray_paths(lens, points, fields=fields, wavelength=lens.wavelengths[0], z_start=-10.0)
     found = [path for field in paths for path in field]
     assert {path.status for path in found} == {"ok"}
     for path in found:
@@ -62,7 +62,7 @@ def test_the_fold_is_drawn_upward_and_seen_from_above_edge_on():
     figure = rt.layout(lens).plot()
     sensor = next(line for line in figure.axes[0].lines if line.get_gid() == "sensor")
     assert np.abs(sensor.get_ydata() - 56).max() < 1e-9
-    from_above = outline.sections(lens, "xz")
+    from_above = cross_section.sections(lens, "xz")
     assert from_above[5].across == pytest.approx([0.0, 1.0])
     assert from_above[5].along == pytest.approx([0.0, 0.0], abs=1e-12)
     glass = [artist for artist in figure.axes[0].patches if str(artist.get_gid()).startswith("glass")]

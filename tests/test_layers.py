@@ -54,7 +54,7 @@ COMMANDS = re.compile(r"cli(\.|$)")
 #: The value of a lower layer is shown by a higher one: the only imports against the layers, inside its methods.
 SHOWN_BY = {
     "system.lens": ("tracing.lens_report", "analysis.layout"),
-    "psf_models.result": ("psf_models.figure",),
+    "psf_models.result": ("psf_models.figures",),
 }
 
 #: Libraries that are imported when they are first needed, inside functions.

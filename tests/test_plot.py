@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from problems import number
 
 import raytrace as rt
-from raytrace.analysis import outline
+from raytrace.analysis import cross_section
 from raytrace.analysis.focus_report import focus_rays
 from raytrace.analysis.spot_diagram import airy_radius, field_spots, shares_of
 from raytrace.io import read_lens
@@ -39,10 +39,10 @@ def words(figure) -> str:
     return "\n".join(text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text")))
 
 
-def fans(lens: Lens, rays: int = 5) -> list[list[outline.RayPath]]:
+def fans(lens: Lens, rays: int = 5) -> list[list[cross_section.RayPath]]:
     fields = torch.stack([lens.fields.x, lens.fields.y])
     wavelength = lens.primary
-    return outline.ray_paths(lens, fan(rays)[0], fields=fields, wavelength=wavelength, z_start=-10.0)
+    return cross_section.ray_paths(lens, fan(rays)[0], fields=fields, wavelength=wavelength, z_start=-10.0)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def double_gauss(lens) -> Lens:
 @pytest.mark.parametrize("name", ["double_gauss", "hubble", "phone", "tessar", "singlet"])
 def test_drawn_rays_bend_on_the_surfaces_and_end_on_the_image(name):
     lens = read_lens(name)
-    z = outline.vertices(lens)
+    z = cross_section.vertices(lens)
     paths = [path for field in fans(lens) for path in field]
     assert any(path.status == "ok" for path in paths)
     for path in paths:
@@ -83,7 +83,7 @@ def test_a_stop_behind_the_first_vertex_does_not_fold_the_rays():
 
 def test_the_glass_of_the_figure_is_bounded_by_the_sag(double_gauss):
     figure = rt.layout(double_gauss).plot()
-    z = outline.vertices(double_gauss)
+    z = cross_section.vertices(double_gauss)
     elements = {int(artist.get_gid().split()[1]): artist.get_xy() for artist in by_gid(figure, "glass")}
     assert set(elements) == {1, 3, 4, 7, 8, 10}
     for k, corners in elements.items():
@@ -96,7 +96,7 @@ def test_the_glass_of_the_figure_is_bounded_by_the_sag(double_gauss):
 
 
 def test_global_vertices_follow_negative_thicknesses_and_infinite_ones_are_refused(double_gauss):
-    np.testing.assert_allclose(outline.vertices(read_lens("hubble"))[1:], [0, 4906.071, 0, 6406.2])
+    np.testing.assert_allclose(cross_section.vertices(read_lens("hubble"))[1:], [0, 4906.071, 0, 6406.2])
     with pytest.raises(ValueError, match="surface 11 has a thickness of inf"):
         rt.layout(with_sensor_distance(double_gauss, math.inf)).plot()
 
@@ -106,7 +106,7 @@ def test_a_surface_without_semi_diameter_is_drawn_as_far_as_its_rays_reach(doubl
         double_gauss, surfaces=tuple(dataclasses.replace(s, semi_diameter=None) for s in double_gauss.surfaces)
     )
     fields = torch.stack([bare.fields.x, bare.fields.y])
-    radii = outline.drawn_radii(bare, bare.wavelengths[0], fields)
+    radii = cross_section.drawn_radii(bare, bare.wavelengths[0], fields)
     highest = {}
     for path in (path for field in fans(bare, 11) for path in field):
         for height, k in zip(path.y[1:], path.corners[1:], strict=True):
@@ -119,7 +119,7 @@ def test_a_surface_without_semi_diameter_is_drawn_as_far_as_its_rays_reach(doubl
 def test_flats_of_an_element_never_cut_its_other_surface():
     thin = Surface(thickness=number(1.0), curvature=number(0.05), semi_diameter=12.0)
     plane = Surface(thickness=number(1.0), semi_diameter=5.0)
-    z, y = outline.element(thin, plane, 0.0, 1.0, (12.0, 5.0), (False, False))
+    z, y = cross_section.element(thin, plane, 0.0, 1.0, (12.0, 5.0), (False, False))
     half = len(z) // 2
     assert (z[half:][::-1] - z[:half] >= 0).all()
     assert abs(np.abs(y).max() - math.sqrt(20**2 - 19**2)) < 0.2  # where a sphere of 20 mm is 1 mm deep
@@ -174,9 +174,9 @@ def test_an_obscured_telescope_loses_its_central_rays_and_its_primary_has_a_hole
     through = max(
         abs(np.interp(4906.071, path.z[-2:], path.y[-2:])) for f in paths for path in f if path.status == "ok"
     )
-    hole = outline.hole_radius(2, outline.vertices(lens), 1200.0, paths)
+    hole = cross_section.hole_radius(2, cross_section.vertices(lens), 1200.0, paths)
     assert through < hole < 396.0
-    assert outline.hole_radius(3, outline.vertices(lens), 155.0, paths) == 0.0
+    assert cross_section.hole_radius(3, cross_section.vertices(lens), 155.0, paths) == 0.0
 
 
 def test_rays_of_a_near_object_start_on_it_and_those_of_a_far_one_in_front_of_the_lens(double_gauss):
@@ -312,7 +312,7 @@ def test_focus_report_prints_the_sensor_and_the_spot_before_and_after(double_gau
         if axes.get_title().startswith("Spot ")
     }
     assert len(scales) == 1
-    assert {line.get_xdata()[-1] for line in by_gid(figure, "ray")} == {outline.vertices(found.lens)[-1]}
+    assert {line.get_xdata()[-1] for line in by_gid(figure, "ray")} == {cross_section.vertices(found.lens)[-1]}
 
 
 def test_focus_report_takes_several_objects_and_fields(double_gauss):

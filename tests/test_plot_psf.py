@@ -16,7 +16,7 @@ from raytrace.maths.grid import grid
 from raytrace.plotting import style
 from raytrace.plotting.style import fill
 from raytrace.psf_models import close_up, psf
-from raytrace.psf_models.figure import DECADES, psf_grid
+from raytrace.psf_models.figures import DECADES, psf_grid
 
 LENSES = Path(__file__).parents[1] / "lenses"
 

@@ -14,7 +14,7 @@ from problems import both_engines, field, lens, scalar, scene_of, surface, vecto
 from torch.testing import assert_close
 
 import raytrace as rt
-from raytrace.analysis.outline import depth
+from raytrace.analysis.cross_section import depth
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens, write_lens
 from raytrace.io.source import LensFileError

@@ -274,7 +274,7 @@ def compare(arguments: argparse.Namespace) -> None:
     study = Path(arguments.folder)
     stored = study / "settings.json"
     if (arguments.resume or arguments.report_only) and not stored.exists():
-        raise CommandError(f"{study}: no study was begun here")
+        raise CommandError(f"{study}: no study was started here")
     settings = recorded_settings(stored) if arguments.report_only else settings_of(arguments, stored)
     experiment = open_experiment(arguments, settings)
     steps = experiment.steps_per_epoch  # refuses pictures that do not fill a batch

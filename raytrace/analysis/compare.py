@@ -13,7 +13,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
 from raytrace.plotting.style import array, styled
-from raytrace.psf_models.figure import brightness, panels, window, worded
+from raytrace.psf_models.figures import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.analysis import outline, space
+from raytrace.analysis import cross_section, layout_3d
 from raytrace.analysis.panels import first_order_text
 from raytrace.maths.pupil import fan, hexapolar
 from raytrace.maths.result import Result, numbers
@@ -82,7 +82,9 @@ class Layout(Result):
         if self.configuration == ALL:
             return _superimposed(self, lens.configurations, fields, wavelengths.detach())
         if self.view == "3d":
-            return _finished(space.draw(lens, fields, wavelengths.detach(), self.rays), lens, fields, wavelengths, 7.5)
+            return _finished(
+                layout_3d.draw(lens, fields, wavelengths.detach(), self.rays), lens, fields, wavelengths, 7.5
+            )
         figure = style.new_figure(8.0, 4.0)
         axes, spectrum = figure.add_subplot(), None
         if len(wavelengths) > 1:
@@ -219,7 +221,7 @@ def on_one_scale(panels: Sequence) -> None:
 class _Drawn(NamedTuple):
     """What a cross section takes: the places of its surfaces, whether it is bent, its extent in z and in height, mm."""
 
-    places: list[outline.Section]
+    places: list[cross_section.Section]
     is_bent: bool
     extent: tuple[float, float]
     heights: tuple[float, float]
@@ -230,18 +232,18 @@ def _drawn(
 ) -> _Drawn:
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
-        places, radii = outline.sections(lens, view), outline.drawn_radii(lens, wavelengths, fields)
+        places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, wavelengths, fields)
         indices = [float(index) for index in media(lens, wavelengths[0])]
         right, up = _extent(lens, places, radii)
         first, last = right
         distance = float(lens.surfaces[0].thickness)
-        size = max(last - first, up[1] - up[0]) if outline.is_bent(lens) else last - first
+        size = max(last - first, up[1] - up[0]) if cross_section.is_bent(lens) else last - first
         near = math.isfinite(distance) and 0 < distance <= _NEAR * size
         start = -distance if near else _front(places, radii, lens) - _LEAD * size
         dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
         points = fan(rays, view[0], dtype=dtype, device=device)[0]
         how = {"fields": fields, "z_start": start, "view": view}
-        coloured = [outline.ray_paths(lens, points, wavelength=wavelength, **how) for wavelength in wavelengths]
+        coloured = [cross_section.ray_paths(lens, points, wavelength=wavelength, **how) for wavelength in wavelengths]
         paths = [field for fields in coloured for field in fields]
 
         _draw_glass(axes, lens, places, radii, indices)
@@ -256,7 +258,7 @@ def _drawn(
     largest, (low, high) = max(radii[1:-1]), _ray_heights(paths)
     stop = radii[lens.stop] + 0.18 * largest
     heights = min(low, -largest, -half, -stop), max(high, largest, half, stop)
-    return _Drawn(places, outline.is_bent(lens), (min(first, start), last), heights)
+    return _Drawn(places, cross_section.is_bent(lens), (min(first, start), last), heights)
 
 
 def _framed(axes, drawn: Sequence[_Drawn]) -> None:
@@ -269,29 +271,31 @@ def _framed(axes, drawn: Sequence[_Drawn]) -> None:
     _frame(axes, (min(starts), max(ends)), (min(low), max(high)))
 
 
-def _extent(lens: Lens, places: list[outline.Section], radii: list[float]) -> tuple[tuple, tuple]:
+def _extent(lens: Lens, places: list[cross_section.Section], radii: list[float]) -> tuple[tuple, tuple]:
     """How far surfaces reach, ((left, right), (low, high)) mm; the image by its vertex."""
     right, up = [places[-1].origin[0]], [places[-1].origin[1]]
     for k in range(1, len(places) - 1):
         height = np.array([-radii[k], 0.0, radii[k]])
-        z, y = places[k].at(outline.depth(lens.surfaces[k], height, places[k].direction), height)
+        z, y = places[k].at(cross_section.depth(lens.surfaces[k], height, places[k].direction), height)
         right, up = [*right, *z], [*up, *y]
     return (min(right), max(right)), (min(up), max(up))
 
 
-def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> float:
+def _front(places: list[cross_section.Section], radii: list[float], lens: Lens) -> float:
     """The leftmost point of the first surface, mm; of all surfaces if the axis is straight."""
-    if not outline.is_bent(lens):
+    if not cross_section.is_bent(lens):
         return _extent(lens, places, radii)[0][0]
     height = np.array([-radii[1], radii[1]])
-    return float(min(0.0, *places[1].at(outline.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
+    return float(min(0.0, *places[1].at(cross_section.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 
 
-def _draw_glass(axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]) -> None:
+def _draw_glass(
+    axes, lens: Lens, places: list[cross_section.Section], radii: list[float], indices: list[float]
+) -> None:
     for k in range(1, len(places) - 1):
-        if indices[k] <= outline.GLASSY or lens.surfaces[k].is_break:
+        if indices[k] <= cross_section.GLASSY or lens.surfaces[k].is_break:
             continue
-        shape = outline.glass(lens, k, places, radii, indices)
+        shape = cross_section.glass(lens, k, places, radii, indices)
         if shape is not None:
             look = {"facecolor": style.tint(indices[k]), "edgecolor": style.INK, "linewidth": 0.7}
             axes.fill(*shape, **look, zorder=2, gid=f"glass {k}")
@@ -300,10 +304,10 @@ def _draw_glass(axes, lens: Lens, places: list[outline.Section], radii: list[flo
             _draw_thin(axes, lens.surfaces[k], places[k], radii[k])
 
 
-def _draw_thin(axes, surface: Surface, place: outline.Section, radius: float) -> None:
+def _draw_thin(axes, surface: Surface, place: cross_section.Section, radius: float) -> None:
     """A thin structure: a line along the surface, with arrows at the ends of an ideal lens."""
     height = np.linspace(-radius, radius, 81)
-    line = place.at(outline.depth(surface, height, place.direction), height)
+    line = place.at(cross_section.depth(surface, height, place.direction), height)
     axes.plot(*line, color=style.INK, linewidth=1.2, zorder=3, gid="thin")
     if isinstance(surface.phase, IdealLens):
         pointed = 1 if float(surface.phase.power_y) >= 0 else -1
@@ -315,15 +319,15 @@ def _draw_thin(axes, surface: Surface, place: outline.Section, radius: float) ->
             axes.plot(*corners, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _draw_mirrors(axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
-    bent = outline.is_bent(lens)
-    for k, side in enumerate(outline.sides(lens)):
+def _draw_mirrors(axes, lens: Lens, places: list[cross_section.Section], radii: list[float], paths) -> None:
+    bent = cross_section.is_bent(lens)
+    for k, side in enumerate(cross_section.sides(lens)):
         surface = lens.surfaces[k]
         if not surface.is_mirror:
             continue
-        x, y, radius = outline.clear_part(surface, radii[k])
+        x, y, radius = cross_section.clear_part(surface, radii[k])
         hole = max([reach(a)[0] for a in surface.apertures if not a.obscures] or [0.0])
-        seen = 0.0 if bent else outline.hole_radius(k, outline.vertices(lens), radii[k], paths)
+        seen = 0.0 if bent else cross_section.hole_radius(k, cross_section.vertices(lens), radii[k], paths)
         hole = min(max(hole, seen), 0.95 * radius)
         height = np.linspace(hole, radius, 121)
         thick = side * max(0.07 * radius, 0.025 * max(radii[1:-1]))
@@ -331,14 +335,14 @@ def _draw_mirrors(axes, lens: Lens, places: list[outline.Section], radii: list[f
             middle = x * places[k].direction[0] + y * places[k].direction[1]
             height = middle + np.concatenate([-height[:0:-1], height])
         for sign in (1,) if hole == 0.0 else (1, -1):
-            face = outline.depth(surface, sign * height, places[k].direction)
+            face = cross_section.depth(surface, sign * height, places[k].direction)
             front, back = places[k].at(face, sign * height), places[k].at(face + thick, sign * height)
             corners = (np.concatenate([a, b[::-1]]) for a, b in zip(front, back, strict=True))
             axes.fill(*corners, facecolor="#f1f1f1", edgecolor="#9a9a9a", hatch="/////", linewidth=0.4, zorder=2)
             axes.plot(*front, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
 
 
-def _draw_apertures(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii: list[float]) -> None:
     """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
@@ -357,11 +361,11 @@ def _draw_apertures(axes, lens: Lens, places: list[outline.Section], radii: list
             for low, high in bars:
                 height = centre + np.linspace(low, high, 41)
                 edge = 0.9999 * edge_radius(surface)
-                depth = outline.depth(surface, np.clip(height, -edge, edge), place.direction)
+                depth = cross_section.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
+def _draw_stop(axes, lens: Lens, places: list[cross_section.Section], radii: list[float]) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
     surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
     radius = float(stop_radius(lens))
@@ -369,7 +373,7 @@ def _draw_stop(axes, lens: Lens, places: list[outline.Section], radii: list[floa
     radius = radii[lens.stop] if on_glass or not math.isfinite(radius) else radius
     length, half = 0.16 * largest, 0.035 * largest
     for sign in (1, -1):
-        tip = float(outline.depth(surface, np.array([sign * radius]), place.direction)[0])
+        tip = float(cross_section.depth(surface, np.array([sign * radius]), place.direction)[0])
         height = sign * np.array([radius, radius + length, radius + length])
         corners = place.at(np.array([tip, tip - half, tip + half]), height)
         axes.fill(*corners, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
@@ -388,26 +392,26 @@ def _draw_rays(axes, paths, colours) -> None:
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
 
-def _draw_sensor(axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
+def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[float], paths) -> float:
     """The image surface, as far as the rays need it; returns its half height in mm."""
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
     low, high = min(hits, default=0.0), max(hits, default=0.0)
     least, edge = 0.05 * max(radii[1:-1]), 0.9999 * edge_radius(surface)
-    centre = 0.5 * (low + high) if outline.is_bent(lens) else 0.0
+    centre = 0.5 * (low + high) if cross_section.is_bent(lens) else 0.0
     half = min(max(1.06 * max(high - centre, centre - low), least), edge)
     height = centre + np.linspace(-half, half, 81)
-    line = place.at(outline.depth(surface, height, place.direction), height)
+    line = place.at(cross_section.depth(surface, height, place.direction), height)
     axes.plot(*line, color=style.INK, linewidth=1.8, zorder=5, gid="sensor")
     return half
 
 
-def _draw_object(axes, lens: Lens, place: outline.Section, paths) -> None:
+def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
     heights = [abs(path.y[0]) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
         y = np.linspace(-half, half, 81)
-        depth = outline.depth(lens.surfaces[0], np.abs(y), place.direction)
+        depth = cross_section.depth(lens.surfaces[0], np.abs(y), place.direction)
         axes.plot(*place.at(depth, y), color=style.INK, linewidth=1.0, zorder=3)
 
 
@@ -432,7 +436,7 @@ def _frame(axes, extent: tuple[float, float], heights: tuple[float, float]) -> N
     axes.axis("off")
 
 
-def _frame_bent(axes, ways: Sequence[Sequence[outline.Section]]) -> None:
+def _frame_bent(axes, ways: Sequence[Sequence[cross_section.Section]]) -> None:
     """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
     axes.relim()
     for patch in axes.patches:

@@ -327,7 +327,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise CommandError("no folder to keep the run in: give -o FOLDER")
     stored = folder / STEPS[0] / "settings.json"
     if arguments.resume and not stored.exists():
-        raise CommandError(f"{folder}: no run was begun here; leave out --resume to begin one")
+        raise CommandError(f"{folder}: no run was started here; omit --resume to start one")
     experiment = open_experiment(arguments, settings_of(arguments, stored))
     settings = experiment.settings
     result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")

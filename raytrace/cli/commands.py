@@ -117,31 +117,26 @@ def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
 # -- commands that do more than call their function once
 
 
+def _reading(arguments: argparse.Namespace) -> dict:
+    """Keywords of the functions that read a lens file."""
+    from raytrace.cli.run import catalogs
+
+    names = ("strict", "configuration", "substitute")
+    return {"catalogs": catalogs(arguments), **{name: getattr(arguments, name) for name in names}}
+
+
 def _check(arguments: argparse.Namespace):
     import raytrace
-    from raytrace.cli.run import catalogs, find_lens
+    from raytrace.cli.run import find_lens
 
-    return raytrace.check(
-        find_lens(arguments.lens),
-        catalogs=catalogs(arguments),
-        strict=arguments.strict,
-        configuration=arguments.configuration,
-        substitute=arguments.substitute,
-    )
+    return raytrace.check(find_lens(arguments.lens), **_reading(arguments))
 
 
 def _convert(arguments: argparse.Namespace):
     import raytrace
-    from raytrace.cli.run import catalogs, find_lens
+    from raytrace.cli.run import find_lens
 
-    return raytrace.convert(
-        find_lens(arguments.source),
-        arguments.target,
-        catalogs=catalogs(arguments),
-        strict=arguments.strict,
-        configuration=arguments.configuration,
-        substitute=arguments.substitute,
-    )
+    return raytrace.convert(find_lens(arguments.source), arguments.target, **_reading(arguments))
 
 
 def _glass(arguments: argparse.Namespace):

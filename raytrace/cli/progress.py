@@ -79,7 +79,7 @@ class Lines:
         self.items, self.total = _parts(work)
         self.what, self.unit = what, unit
         self.n = self.initial = initial
-        self.begun, self.words = time.monotonic(), ""
+        self.start_time, self.words = time.monotonic(), ""
         _open.append(self)
 
     def update(self, n: int = 1) -> None:
@@ -107,7 +107,7 @@ class Lines:
                 self.update()
 
     def __str__(self) -> str:
-        passed, gone = time.monotonic() - self.begun, self.n - self.initial
+        passed, gone = time.monotonic() - self.start_time, self.n - self.initial
         said = [f"{self.n:,}{f'/{self.total:,}' if self.total else ''} {self.unit}s"] if self.n else []
         said.append(f"{clock(passed)} elapsed")
         if self.total and gone > 0 and self.n <= self.total:

@@ -304,7 +304,7 @@ def run_model(
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
-    folder: of this run, resumed if begun; about: whatever else decides the result (lens file, pictures); progress:
+    folder: of this run, resumed if started; about: whatever else decides the result (lens file, pictures); progress:
     wraps the batches of every test; catalogs: of glass, with which the lens was read. At the end the optimised lens is
     written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
     """
@@ -367,7 +367,7 @@ def outcome(folder: Path) -> Outcome | None:
 
 
 def usual(settings: CodesignSettings) -> dict:
-    """The defaults of all settings, for folders begun before there was one of them."""
+    """The defaults of all settings, for folders of older versions without settings."""
     return {field.name: field.default for field in dataclasses.fields(settings)}
 
 

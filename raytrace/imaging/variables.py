@@ -15,6 +15,7 @@ power is finite where the lens is afocal.
 `PhaseVariables` are the heights of a thin element as parameters.
 """
 
+import abc
 import dataclasses
 import json
 import math
@@ -145,7 +146,7 @@ class OtherLens(ValueError):
     """A state of another lens or element, or one without an identity; the message names both."""
 
 
-class Owned(nn.Module):
+class Owned(nn.Module, abc.ABC):
     """A module of offsets, which are meaningless without the lens or element that they are offsets from.
 
     Its `state_dict` has a further entry "_extra_state": the text of `identity` in JSON, as bytes (a uint8 tensor), so
@@ -154,13 +155,13 @@ class Owned(nn.Module):
     parameter is changed. Raises OtherLens.
     """
 
+    @abc.abstractmethod
     def identity(self) -> dict:
         """The lens or element of the parameters, as plain values for JSON."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def difference(self, before: dict) -> str:
         """How an identity differs from this one, "" where it does not."""
-        raise NotImplementedError
 
     def get_extra_state(self) -> Tensor:
         return torch.tensor(list(json.dumps(self.identity()).encode()), dtype=torch.uint8)

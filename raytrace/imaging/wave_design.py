@@ -200,7 +200,7 @@ def begin(
     """The camera at the start of a run, and its folder, where the initial element is stored.
 
     pictures: `digest` of the training pictures, whose spectrum is given.
-    Raises training.OtherSettings if the folder was begun with others.
+    Raises training.OtherSettings if the folder was started with others.
     """
     run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(config), "pictures": pictures})
     file = run.folder / "start.pt"
@@ -227,7 +227,7 @@ def begin(
 def learn_element(
     camera: WaveCamera, pictures: Pictures, settings: DesignSettings, run: Run, *, every: int = 20
 ) -> Iterator[tuple[int, Record]]:
-    """The steps of optimisation, one at a time; a begun run is resumed."""
+    """The steps of optimisation, one at a time; an unfinished run is resumed."""
     groups = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
     if camera.restoration == "towards":
         groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})

@@ -236,16 +236,16 @@ class View:
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
 
-        On the image rays have their direction before it: what stands behind it bends none.
+        Rays on the image have the direction in front of it: the image does not refract.
 
-        indices: (W,) of media, by the surface that tells them, in place of those of the lens.
+        indices: (W,) of media by the surface in front of each, instead of the indices of the lens.
         """
         wavelength = lens.wavelengths[:, None]
         surfaces = sequence_of(lens)[:last]
         given = indices or {}
         indices = [
-            given[told][:, None] if told in given else n
-            for told, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
+            given[surface][:, None] if surface in given else n
+            for surface, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
         ]
         indices = unbent(lens, indices)
         gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None

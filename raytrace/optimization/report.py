@@ -126,7 +126,7 @@ def _draw_history(axes, found) -> None:
 
 
 def _scale_merit(axes, merit: np.ndarray) -> None:
-    """Logarithmic over more than a factor of three; else even, about a value that is told where the change is small."""
+    """Logarithmic over more than a factor of three, else linear; a small change is drawn about a printed value."""
     least, most = float(np.min(merit)), float(np.max(merit))
     if least > 0 and most > 3 * least:
         axes.set_yscale("log")

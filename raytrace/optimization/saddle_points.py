@@ -216,16 +216,16 @@ def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
     step = _NEAR * np.sqrt(max(state.cost, 1e-30)) / scale
     slopes = _conditions(state)
     price = np.linalg.lstsq((slopes / scale)[:, moves].T, -(_slope(state) / scale)[moves], rcond=None)[0]
-    told = lambda s: _slope(s) + price @ _conditions(s, like=state)  # noqa: E731
+    gradient = lambda s: _slope(s) + price @ _conditions(s, like=state)  # noqa: E731
     free = np.nonzero(moves)[0]
     second = np.zeros((len(free), len(free)))
     for row, j in enumerate(free):
         ahead, back = (problem.state(x + sign * step * (np.arange(len(x)) == j), True) for sign in (1, -1))
-        second[row] = ((told(ahead) - told(back)) / (2 * step[j] * scale[j]) / scale)[free]
+        second[row] = ((gradient(ahead) - gradient(back)) / (2 * step[j] * scale[j]) / scale)[free]
     along = null_space((slopes / scale)[:, free]) if len(slopes) else np.eye(len(free))
     ways = np.zeros((len(x), along.shape[1]))
     ways[free] = along / scale[free, None]
-    return Saddle(ways, ways.T @ told(state), 0.5 * along.T @ (second + second.T) @ along)
+    return Saddle(ways, ways.T @ gradient(state), 0.5 * along.T @ (second + second.T) @ along)
 
 
 def _slope(state: State) -> np.ndarray:

@@ -368,9 +368,9 @@ def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[
     """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
     words = vary if isinstance(vary, str) else " ".join(one for one in vary or () if isinstance(one, str))
     kept = () if lens.optimization_data is None else lens.optimization_data.kept
-    told = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
+    marked = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
     all_meant = "glass" in words.split()
-    return (told & surfaces or surfaces) if all_meant else surfaces
+    return (marked & surfaces or surfaces) if all_meant else surfaces
 
 
 def followers(lens: Lens) -> dict[int, int]:

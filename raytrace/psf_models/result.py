@@ -121,8 +121,8 @@ class Psf(Result):
         return self.kernel.dim() == 4
 
     def draw(self, **options):
-        """The kernels over object distance and field; options: as for `psf_models.figure.psf_grid`."""
-        from raytrace.psf_models.figure import psf_grid
+        """The kernels over object distance and field; options: as for `psf_models.figures.psf_grid`."""
+        from raytrace.psf_models.figures import psf_grid
 
         return psf_grid(self, **options)
 

@@ -512,7 +512,7 @@ def _bracketed(rays: _Rays):
     """First crossing in the direction of propagation within rim and sag range (1-D batch).
 
     A sign change counts only between points on the surface: beyond the domain F does not exist, so the bisection ends
-    at a crossing or at the edge of the domain, told apart by the residual.
+    at a crossing or at the edge of the domain; the residual distinguishes them.
     """
     first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
     width = (last - first) / _SAMPLES

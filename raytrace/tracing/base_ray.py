@@ -129,7 +129,7 @@ def entrance_of(lens: Lens) -> Entrance:
     wide = (near.radius * (1 + kappa * middle))[..., None, None]
     spread = wide * _inverse(near.A + kappa[..., None, None] * near.B) @ near.Q
     spread, turn = (torch.movedim(m.flip(-1, -2), (-2, -1), (0, 1)) for m in (spread, near.Q))
-    return Entrance(middle * near.begun[2], near.aim + middle * near.begun[:2], spread, turn, near.radius)
+    return Entrance(middle * near.launched[2], near.aim + middle * near.launched[:2], spread, turn, near.radius)
 
 
 class _Near(NamedTuple):
@@ -138,7 +138,7 @@ class _Near(NamedTuple):
     Columns are tangential and sagittal: rays moved across the base ray along the local y and x of the start, mm, or
     turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop; X: (..., 3, 4) from
     both to the displacement across the base ray at the image, D: to the direction in front of it. E: a ray turned by u
-    and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm and begun: (3, ...)
+    and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm, launched: (3, ...)
     of the base ray in the plane of the vertex of surface 1; position, direction: (3, ...) and valid: (...) on the
     image; last: (...) mm to it from the last real surface; carried: (..., 3, 2) the local y and x of the start behind
     mirrors and turned axes; vergence: (...) 1/mm of the object from that plane; radius: (...) mm of the stop; index:
@@ -153,7 +153,7 @@ class _Near(NamedTuple):
     Q: Tensor
     H_inverse: Tensor
     aim: Tensor
-    begun: Tensor
+    launched: Tensor
     position: Tensor
     direction: Tensor
     valid: Tensor
@@ -171,17 +171,17 @@ class _Near(NamedTuple):
 def _near(lens: Lens, wavelength: Tensor) -> _Near:
     distance = object_distance_of(lens)
     aim = _aim(lens, wavelength)
-    begun = _begun(aim, distance)
+    launched = _start_direction(aim, distance)
     indices = media(lens, wavelength)
     indices = [*indices[:-1], indices[-2]]  # what bends rays in the image does not tell where they came from
-    axes, image = _axes(begun), len(lens.surfaces) - 1
+    axes, image = _axes(launched), len(lens.surfaces) - 1
     real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
 
     def traced(change: Tensor):
         t, s, turn_t, turn_s = change
         up, right = (axis[:, None] for axis in axes)
         position = torch.stack([*aim, torch.zeros_like(aim[0])])[:, None]
-        rays = start(position + t * up + s * right, begun[:, None] + turn_t * up + turn_s * right)
+        rays = start(position + t * up + s * right, launched[:, None] + turn_t * up + turn_s * right)
         arrives, ways = rays.valid, []
         for crossing in steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength):
             arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
@@ -202,9 +202,9 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
     valid, last, ways = valid[0], last[:, 0], [way[:, 0] for way in ways]
     return _Near(
-        A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, begun, position, direction, valid,
+        A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, launched, position, direction, valid,
         last=_way_to_image(lens.surfaces[real:], last, position, direction),
-        carried=_carried(lens, begun, axes, ways),
+        carried=_carried(lens, launched, axes, ways),
         vergence=vergence,
         radius=_stop_radius(lens, H_inverse, _over(A, vergence[..., None, None])[..., 0] + B[..., 0]),
         index=indices[-1],
@@ -223,24 +223,24 @@ def _aim(lens: Lens, wavelength: Tensor) -> Tensor:
 
     def through(aim: Tensor) -> Rays:
         position = torch.stack([*aim, torch.zeros_like(aim[0])])
-        return start(position, _begun(aim, distance))
+        return start(position, _start_direction(aim, distance))
 
     size = 0.5 * first_order(lens).entrance_pupil_diameter.detach()
     size = torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
     return aim_at_middle(lens, through, axis, wavelength, size)[0]
 
 
-def _begun(aim: Tensor, distance: Tensor) -> Tensor:
+def _start_direction(aim: Tensor, distance: Tensor) -> Tensor:
     """Direction (3, ...) of the ray of the axial object point to the aim (2, ...) in the plane z = 0."""
     x, y = aim / distance
     return unit(torch.stack([x, y, torch.ones_like(x)]))
 
 
-def _axes(begun: Tensor) -> tuple[Tensor, Tensor]:
+def _axes(launched: Tensor) -> tuple[Tensor, Tensor]:
     """Local y and x (3, ...) across a direction (3, ...)."""
-    L, M, N = begun
+    L, M, N = launched
     up = unit(torch.stack([-M * L, 1 - M * M, -M * N]))
-    return up, torch.linalg.cross(up, begun, dim=0)
+    return up, torch.linalg.cross(up, launched, dim=0)
 
 
 def _linearised(function: Callable, at: Tensor, given: object) -> tuple[Tensor, Tensor, tuple]:
@@ -282,10 +282,10 @@ def _in_axes(how: Callable, pose: Pose, vector: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _carried(lens: Lens, begun: Tensor, axes: Sequence[Tensor], ways: Sequence[Tensor]) -> Tensor:
+def _carried(lens: Lens, launched: Tensor, axes: Sequence[Tensor], ways: Sequence[Tensor]) -> Tensor:
     """The axes (..., 3, 2) behind all surfaces: reflected by mirrors, else turned by the least angle; ways: directions
     (3, ...) of the base ray behind every surface."""
-    d, gap, axes = begun, None, list(axes)
+    d, gap, axes = launched, None, list(axes)
     for surface, after in zip(lens.surfaces[1:], ways, strict=True):
         for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
             if pose is not None:

@@ -44,18 +44,18 @@ LABELS = ("object_distance", "field_x", "field_y", "wavelength", "pupil_x", "pup
 class Traced(Rays, Result):
     """Rays (3, ...) on the image, and a table with a row for every ray and surface that it reaches, or fails at.
 
-    lens, begun: the lens, and the rays in front of surface 1, with their wavelength; labels: (6, ...) LABELS of rays
+    lens, launched: the lens, and the rays in front of surface 1, with their wavelength; labels: (6, ...) LABELS of rays
     that `trace` launched. Rays that could not be launched are not in the table.
     """
 
     lens: Lens | None = None
-    begun: Rays | None = None
+    launched: Rays | None = None
     labels: Tensor | None = None
 
     @property
     def count(self) -> int:
         """Number of rays launched."""
-        return int(self.begun.valid.sum())
+        return int(self.launched.valid.sum())
 
     def columns(self) -> dict[str, Tensor]:
         parts = [*self._parts()]
@@ -117,7 +117,7 @@ class Traced(Rays, Result):
 
     def _parts(self) -> Iterator[dict[str, Tensor]]:
         """The columns of the table in chunks of _BATCH rays."""
-        valid = self.begun.valid.flatten()
+        valid = self.launched.valid.flatten()
         labels = () if self.labels is None else self.labels.reshape(len(LABELS), -1)[:, valid]
         for first, way in zip(itertools.count(0, _BATCH), self._ways(), strict=False):
             chunk, (rays, surfaces) = slice(first, first + _BATCH), way.shown.shape
@@ -129,7 +129,7 @@ class Traced(Rays, Result):
 
     def _ways(self) -> Iterator["_Way"]:
         """The surface data of the rays launched, in chunks of _BATCH rays."""
-        rays, valid = self.begun, self.begun.valid.flatten()
+        rays, valid = self.launched, self.launched.valid.flatten()
         opl = torch.zeros_like(rays.position[0]) if rays.opl is None else rays.opl
         opl, wavelength = (t.detach().expand(rays.shape).flatten()[valid] for t in (opl, rays.wavelength))
         position, direction = (t.detach().reshape(3, -1)[:, valid] for t in (rays.position, rays.direction))
@@ -158,17 +158,17 @@ def trace(
     """
     labels = None
     if rays is None:
-        begun, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
+        launched, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
             message = "`object_distances` and `fields` change nothing: a table defines where its rays start"
             warnings.warn(message, ChangesNothing, stacklevel=calling_level())
-        begun = rays if isinstance(rays, Rays) else read_rays(rays, lens)
-    if begun.wavelength is None:
+        launched = rays if isinstance(rays, Rays) else read_rays(rays, lens)
+    if launched.wavelength is None:
         given = lens.primary if wavelengths is None else wavelengths_of(lens, wavelengths)
-        begun = dataclasses.replace(begun, wavelength=given.squeeze())
-    end = trace_lens(lens, begun, begun.wavelength)
-    return Traced(end.position, end.direction, end.valid, end.opl, begun.wavelength, lens, begun, labels)
+        launched = dataclasses.replace(launched, wavelength=given.squeeze())
+    end = trace_lens(lens, launched, launched.wavelength)
+    return Traced(end.position, end.direction, end.valid, end.opl, launched.wavelength, lens, launched, labels)
 
 
 def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_aiming) -> tuple[Rays, Tensor]:

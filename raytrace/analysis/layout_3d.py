@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.analysis import outline
+from raytrace.analysis import cross_section
 from raytrace.maths.pupil import fan
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
@@ -24,7 +24,7 @@ def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
     figure = style.new_figure(7.5, 6.0)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
     with torch.no_grad():
-        places, radii = frames(lens), outline.drawn_radii(lens, wavelengths, fields)
+        places, radii = frames(lens), cross_section.drawn_radii(lens, wavelengths, fields)
         indices = [float(index) for index in media(lens, wavelengths[0])]
         corners = _draw_surfaces(axes, lens, places, radii, indices)
         size = max(np.ptp(corners, axis=1).max(), 1e-9)
@@ -44,7 +44,7 @@ def _seen(points: np.ndarray) -> np.ndarray:
 
 def _mesh(surface: Surface, frame: Frame, radius: float) -> np.ndarray:
     """Points (3, rings, arms) mm of the drawn part of a surface."""
-    centre_x, centre_y, radius = outline.clear_part(surface, radius)
+    centre_x, centre_y, radius = cross_section.clear_part(surface, radius)
     holes = [reach(aperture)[0] for aperture in surface.apertures if not aperture.obscures and surface.is_mirror]
     hole = min(max(holes or [0.0]), 0.95 * radius)
     r = np.linspace(hole, radius, _RINGS + 1)[:, None]
@@ -59,20 +59,20 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
         if surface.is_break:
             continue
-        glass = max(indices[k - 1], indices[k]) > outline.GLASSY
+        glass = max(indices[k - 1], indices[k]) > cross_section.GLASSY
         if surface.is_mirror or glass or surface.phase is not None or k == lens.stop:
             meshes[k] = _mesh(surface, places[k], radii[k])
     for k, mesh in meshes.items():
         surface = lens.surfaces[k]
         if surface.is_mirror:
             _shade(axes, mesh, _MIRROR, 0.75)
-        elif max(indices[k - 1], indices[k]) > outline.GLASSY:
+        elif max(indices[k - 1], indices[k]) > cross_section.GLASSY:
             _shade(axes, mesh, style.tint(max(indices[k - 1], indices[k])), 0.35)
         elif surface.phase is not None:
             _shade(axes, mesh, "#d9d2e9", 0.45)
         _rim(axes, mesh, style.INK if k == lens.stop else style.GREY, 1.4 if k == lens.stop else 0.7)
-        back = outline.partner(lens, k)
-        if indices[k] > outline.GLASSY and not surface.is_mirror and back in meshes:
+        back = cross_section.partner(lens, k)
+        if indices[k] > cross_section.GLASSY and not surface.is_mirror and back in meshes:
             _edge(axes, mesh, meshes[back], style.tint(indices[k]))
     return np.concatenate([mesh.reshape(3, -1) for mesh in meshes.values()], axis=1)
 
@@ -117,7 +117,7 @@ def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int,
     points = torch.cat([fan(rays, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
     colours, arrived = style.ray_colours(fields.shape[1], wavelengths.tolist()), []
     for row, wavelength in zip(colours, wavelengths, strict=True):
-        found = outline.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
+        found = cross_section.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
         for colour, paths in zip(row, found, strict=True):
             whole = [path.points for path in paths if path.status == "ok"]
             lines = [_seen(path).T for path in whole]

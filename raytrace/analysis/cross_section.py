@@ -1,4 +1,4 @@
-"""The geometry of a cross section: where surfaces and rays lie in a plane that is looked at, in one frame.
+"""The geometry of a cross section: surfaces and rays in a plane, in one frame.
 
 z counts from the vertex of surface 1, in mm, to the right; upward goes y, or x in the view from above. Nothing here
 draws.
