@@ -16,11 +16,11 @@ from raytrace.tracing.focus import along_normal, focus_of_rms
 from raytrace.tracing.scene import symmetry
 from raytrace.tracing.wavefront import rms, wavefront_of
 
-FIELDS = [0.0, 14.0]
+FIELDS = [0.0, 7.0, 14.0]
 
 
 def lens_in_focus() -> rt.Lens:
-    return rt.focus(rt.read_lens("double_gauss")).lens.at(fields=FIELDS, wavelengths=[0.5876, 0.4861])
+    return rt.focus(rt.read_lens("double_gauss")).lens.at(fields=FIELDS, wavelengths=[0.5876, 0.4861, 0.6563])
 
 
 def folds(lens: rt.Lens) -> dict[str, rt.Lens]:
