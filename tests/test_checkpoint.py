@@ -186,7 +186,7 @@ def test_a_checkpoint_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch)
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr(checkpoint, "write_json", full)
-    with pytest.warns(rt.files.NotWritten, match=r"kept.json: No space left on device; the optimisation goes on"):
+    with pytest.warns(rt.files.NotWritten, match=r"kept.json: No space left on device; the optimisation continues"):
         found = rt.optimize(TRIPLET, checkpoint=tmp_path / "kept.json", **SPOT | {"cycles": 2})
     assert found.cycles == 2
 

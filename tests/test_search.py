@@ -404,7 +404,10 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
         (["--merit", "spot"], "--vary names them"),
         (["--vary", "curvature"], "choose one by --merit spot"),
         (["--merit", "spot", "--vary", "curvature"], "--hold its focal length, as efl=50"),
-        (["--merit", "spot", "--vary", "curvature", "--hold", "efl=50", "--seconds", "1e-9"], "no lens of all light"),
+        (
+            ["--merit", "spot", "--vary", "curvature", "--hold", "efl=50", "--seconds", "1e-9"],
+            "no lens without failing rays",
+        ),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
         (["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"], "--starts goes without --insert"),

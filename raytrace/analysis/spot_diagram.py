@@ -192,8 +192,8 @@ def spot(
     so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
     and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
     weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
-    Warns LostRays for fields that lose all their rays, UnfilledStop. Raises ValueError for what is not known.
-    progress: called with (work, unit), gives what is gone through or a bar to update.
+    Warns LostRays for fields that lose all their rays, UnfilledStop. Raises ValueError for unknown options.
+    progress: called with (work, unit), returns the iterable, or a progress bar to update.
     """
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
         if word not in known:

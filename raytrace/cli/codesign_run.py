@@ -194,7 +194,7 @@ def focus_of(lens: Lens, settings: CodesignSettings) -> Callable[[float], float]
 
 
 def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, label: str) -> Outcome:
-    """Train both steps of a run, or what is left of them, with a bar and a line for every epoch."""
+    """Train both steps of a run, or their remaining epochs, with a bar and a line for every epoch."""
     per_epoch, focus = experiment.steps_per_epoch, focus_of(experiment.lens, settings)
     length, losses, bar = settings.epochs * per_epoch, [], None
 

@@ -97,7 +97,7 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     named = [_condition_text(problem, number) for number in conflict.numbers]
     values = {condition.words: condition.reached for condition in _conditions(problem, x)}
     listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
-    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change what is held, `vary` or `bounds`")
+    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
 
 
 # -- values ------------------------------------------------------------------------------------------------------------

@@ -104,7 +104,7 @@ class Checkpoint:
         try:
             write_json(self.path, document)
         except OSError as error:
-            words = f"{self.path}: {error.strerror}; the optimisation goes on, but cannot resume from here"
+            words = f"{self.path}: {error.strerror}; the optimisation continues, but cannot resume from here"
             warnings.warn(words, NotWritten, stacklevel=calling_level())
             self.path = None
         self.last = time.monotonic()

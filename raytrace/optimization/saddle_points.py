@@ -78,9 +78,9 @@ def _objection(free: Freedom, k: int) -> str:
     surface, before = lens.surfaces[k], lens.surfaces[k - 1]
     shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
     if surface.is_mirror or before.is_mirror or any(part is not None for part in shaped) or is_posed(surface):
-        return "is no centred sphere that refracts"
+        return "is not a centred refracting sphere"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
-        return "does not stand between glass and air"
+        return "is not between glass and air"
     varies = any((one.surface, one.quantity) == (k, "curvature") for one in free.variables)
     return "" if varies else "has a curvature that does not vary: name it by `vary`"
 
@@ -89,7 +89,7 @@ def _objection(free: Freedom, k: int) -> str:
 
 
 def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
-    """What is searched of a lens with a meniscus before surface k, by what is task of the lens itself."""
+    """The search problem of the lens with a meniscus in front of surface k."""
     made, free = with_meniscus(lens, k), task.free
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
     old = [_moved(one, k) for one in free.variables]

@@ -138,7 +138,7 @@ class Journal:
             self.store.append({"task": key, **numbers, "x": result.x.tolist()})
         except OSError as error:
             self.store = None
-            words = f"{self.path}: {error.strerror}; the search goes on, but cannot resume from here"
+            words = f"{self.path}: {error.strerror}; the search continues, but cannot resume from here"
             warnings.warn(words, NotWritten, stacklevel=calling_level())
 
 

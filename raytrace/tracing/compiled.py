@@ -2,7 +2,7 @@
 
 torch's own operators ("eager") or the compiled trace ("compiled") carry a batch of rays; `trace_engine` and the
 environment variable RAYTRACE_TRACE force either. The structure of a run of surfaces is a table of integers, a row each:
-its kind, what it does to light, and which of the numbers it takes. The numbers are tensors, so that autograd sees how
+its kind, its effect on rays, and the numbers that it takes. The numbers are tensors, so that autograd sees how
 they were made. The gradient is that of the compiled adjoint (cpp/adjoint.h); its gradient goes through torch.
 """
 

@@ -67,7 +67,7 @@ struct OfTurn {
   static Stands<T> stands() { return nullptr; }
 };
 
-// Calls work(Of<…>{}) for the kind of a surface, what it does to light, and whether the path is asked for.
+// Calls work(Of<…>{}) for the kind of a surface, its effect on rays, and whether the path is needed.
 template <typename T, int bend, bool path, typename Work>
 void by_kind(const Layout& at, Work work) {
   if (at.kind == kPlane) work(Of<T, kPlane, bend, path, 0>{});
