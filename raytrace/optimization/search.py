@@ -168,7 +168,7 @@ def searched(
     """The result: minima, the best first, each with its problem. Raises NoProblem without any."""
     if not each:
         raise NoProblem(
-            f"no lens without failing rays that meets `hold`, from {starts} starts: allow more by `starts`, `seconds` or "
+            f"no lens without failing rays that meets `hold`, from {starts} starts: allow more `starts`, `seconds` or "
             "wider `bounds`, or hold less"
         )
     minima, lenses, tables = each[:MOST], [], []
