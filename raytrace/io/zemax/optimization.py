@@ -352,7 +352,7 @@ def _path_of(surface: Surface, quantity: str) -> LensPath | None:
     if quantity == "thickness":
         return ("thickness",)
     place = parameter_paths(surface).get(quantity)
-    return place and (*place.path, *(() if place.entry is None else ((place.entry,),)))
+    return place and place.steps
 
 
 def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
