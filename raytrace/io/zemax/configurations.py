@@ -18,7 +18,7 @@ import dataclasses
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -75,7 +75,8 @@ from raytrace.system import configurations
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, Path, ScaledPath, part, same, taken, with_part
 from raytrace.system.lens import Lens, unknown_changes
-from raytrace.system.parameter_paths import ParameterPath
+from raytrace.system.optimization_data import Solve, Vary
+from raytrace.system.parameter_paths import ParameterPath, parameter_paths
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import IrregularSag
 from raytrace.system.surface import Surface
@@ -122,8 +123,8 @@ _REFUSED = by_word(
 class Cell(NamedTuple):
     """One line of the table: an operand's value in one configuration, as text.
 
-    covered: the surfaces that have a temperature or pressure of their own; None for the lens's.
-    rule: the words behind the value: its status (1 variable, 2 a pickup) …
+    row: of the table, from 1. covered: the surfaces that have a temperature or pressure of their own; None for the
+    lens's. rule: the words behind the value: its status (1 variable, 2 a pickup) …
     """
 
     name: str
@@ -132,63 +133,53 @@ class Cell(NamedTuple):
     configuration: int
     value: str
     record: Record
+    row: int
     covered: tuple[int, ...] | None = None
     rule: tuple[str, ...] = ()
-
-    @property
-    def key(self) -> tuple[str, int, int]:
-        return self.name, self.number, self.parameter
 
 
 _CELL = re.compile(r'\s*(-?\d{1,6})\s+(-?\d{1,6})\s+("[^"]*"|\S+)(.*)', re.ASCII)
 
 
-def cell_of(record: Record) -> Cell | None:
-    """The cell of a record after MNUM; None if it is no operand."""
-    match = _CELL.fullmatch(record.text)
-    if not match or not re.fullmatch(r"[A-Z][A-Z0-9]{3}", record.keyword):
-        return None
-    rest = match[4].split()
-    parameter = int(rest[1]) if len(rest) > 1 and re.fullmatch(r"-?\d{1,6}", rest[1]) else 0
-    if re.fullmatch(r"PAR[1-8]", record.keyword):
-        parameter = int(record.keyword[3])
-    elif record.keyword not in ("PRAM", "EDVA") and record.keyword in ROWS:
-        parameter = 0
-    number, configuration, value = int(match[1]), int(match[2]), match[3].strip('"')
-    return Cell(record.keyword, number, parameter, configuration, value, record, None, tuple(rest))
-
-
 def _cells(records: Iterable[Record], count: int, report: Draft) -> list[Cell]:
     """The cells of the lines after MNUM, every line reported."""
-    cells = []
+    cells, row, before = [], 0, (None, 0)
     for record in records:
-        cell, word = cell_of(record), record.keyword
-        if cell is None or word in _LEFT_OUT:
-            report.met(word[:40], IGNORED, record.place, _LEFT_OUT.get(word, "no multi-configuration operand"))
+        match, word = _CELL.fullmatch(record.text), record.keyword
+        if not match or not re.fullmatch(r"[A-Z][A-Z0-9]{3}", word):
+            report.met(word[:40], IGNORED, record.place, "no multi-configuration operand")
+            continue
+        number, configuration, rest = int(match[1]), int(match[2]), match[4].split()
+        parameter = int(rest[1]) if len(rest) > 1 and re.fullmatch(r"-?\d{1,6}", rest[1]) else 0
+        if re.fullmatch(r"PAR[1-8]", word):
+            parameter = int(word[3])
+        elif word not in ("PRAM", "EDVA") and word in ROWS:
+            parameter = 0
+        key = (word, number, parameter)
+        row += before[0] != key or before[1] >= configuration
+        before = key, configuration
+        if word in _LEFT_OUT:
+            report.met(word, IGNORED, record.place, _LEFT_OUT[word])
         elif word not in ROWS and word not in KEPT and word not in _REFUSED:
             report.met(word, UNKNOWN, record.place)
         else:
             report.met(word, READ, record.place)
-            if 1 <= cell.configuration <= count:
-                cells.append(cell)
+            if 1 <= configuration <= count:
+                value = match[3].strip('"')
+                cells.append(Cell(*key, configuration, value, record, row, None, tuple(rest)))
             else:
-                report.warn(f"{word} of configuration {cell.configuration}, of {count}: left out", record.place)
+                report.warn(f"{word} of configuration {configuration}, of {count}: left out", record.place)
         if len(cells) > MOST_CELLS:
             raise LensFileError(f"more than {MOST_CELLS} multi-configuration operands", record.place)
     return cells
 
 
 def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cell, ...]]:
-    """The cells of each operand, one a configuration. A missing configuration has the value of the first.
+    """The cells of each row, one a configuration. A missing configuration has the value of the first.
 
     Operands of an environment other than the lens's have the surfaces that it covers.
     """
-    groups: list[list[Cell]] = []
-    for cell in cells:
-        if groups and groups[-1][-1].key == cell.key and groups[-1][-1].configuration < cell.configuration:
-            groups[-1].append(cell)
-        else:
-            groups.append([cell])
+    groups = [[*group] for _, group in itertools.groupby(cells, key=lambda cell: cell.row)]
     operands = []
     for group in groups:
         by_number = {cell.configuration: cell for cell in group}
@@ -232,12 +223,15 @@ class PlacedOperand(NamedTuple):
     like: Lens
 
 
-def read(file: LensFile, report: Draft, configuration: int | None) -> Lens:
-    """The lens, as its surfaces are stored, with its operands, and in the requested configuration."""
+def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens, list[Vary | Solve]]:
+    """The lens, as its surfaces are stored, with its operands, and in the requested configuration.
+
+    And the variables and pickups of the numbers that its operands set.
+    """
     sections, lens = file.sections, file.lens
     head = sections.system.last("MNUM")
     if head is None:
-        return lens if configuration is None else lens.configuration(configuration)
+        return (lens if configuration is None else lens.configuration(configuration)), []
     count = head.integer(0, "number of configurations", 1)
     if not 1 <= count <= MOST_CONFIGURATIONS:
         raise LensFileError(f"MNUM is {count}, expected 1 to {MOST_CONFIGURATIONS} configurations", head.place)
@@ -271,15 +265,51 @@ def read(file: LensFile, report: Draft, configuration: int | None) -> Lens:
             if part(lens, place.path) is None:
                 lens = with_part(lens, place.path, double(0.0), like=placed.like)
     # the surfaces have more digits than the operands, where both agree
-    listed = [taken(p.operand, lens, active - 1) if _agrees(p, lens, active) else p.operand for p in operands]
-    listed = tuple(o for o in listed if o.name != "MOFF" or o.numbers is not None or any(map(any, o.words)))
+    operands = [
+        p._replace(operand=taken(p.operand, lens, active - 1)) if _agrees(p, lens, active) else p for p in operands
+    ]
+    operands = [
+        p
+        for p in operands
+        if p.operand.name != "MOFF" or p.operand.numbers is not None or any(map(any, p.operand.words))
+    ]
+    listed = tuple(placed.operand for placed in operands)
     if count > 1 and not listed:
         listed = (Operand("MOFF", words=(("",),) * count),)  # keeps the count
     lens = dataclasses.replace(lens, operands=listed, current_configuration=active)
     try:
-        return lens if configuration is None else lens.configuration(configuration)
+        chosen = lens if configuration is None else lens.configuration(configuration)
     except ValueError as error:
         raise LensFileError(str(error), head.place) from error
+    return chosen, list(_rules(operands, lens))
+
+
+#: Status of a number of a configuration: 1 is a variable.
+VARIABLE, STATUSES = 1, {2: "pickup", 4: "thermal"}
+
+
+def _rules(operands: Sequence[PlacedOperand], lens: Lens) -> Iterator[Vary | Solve]:
+    """The variables and pickups of the numbers of configurations, by the status in their lines."""
+    indices = {placed.cells[0].row: index for index, placed in enumerate(operands)}
+    for index, (operand, cells, _) in enumerate(operands):
+        path = operand.paths[0].path if operand.paths else ()
+        number, name = cells[0].number, ""
+        if len(path) > 2 and path[0] == "surfaces":  # the quantity of that surface
+            names = {place.steps: name for name, place in parameter_paths(lens.surfaces[path[1]]).items()}
+            number, name = path[1], names.get(path[2:], "thickness" if path[2] == "thickness" else "")
+        for k, cell in enumerate(cells, 1):
+            status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
+            if not status or cell.configuration != k:
+                continue
+            where = {"configuration": k, "operand": index}
+            if status == VARIABLE:
+                yield Vary(number, name, **where) if name else Solve(cell.number, cell.name, "variable", **where)
+                continue
+            numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
+            source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
+            followed = (float(indices[int(row)]),) if row == int(row) and int(row) in indices else ()
+            pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
+            yield Solve(cell.number, name or cell.name, STATUSES.get(status, f"status {status}"), **pickup, **where)
 
 
 def _with_environments(lens: Lens, covering: Sequence[Cell]) -> Lens:

@@ -81,8 +81,9 @@ def read(
         if record and record.integer(position, quantity, 0):
             report.warn(message, record.place)
     of_name = partial(medium, catalogs=came, user=catalogs, report=report.again())
-    lens = configurations.read(configurations.LensFile(parts, lens, unit, of_name), report, configuration)
-    lens = optimization.read(parts, lens, unit, report)
+    file_as_stored = configurations.LensFile(parts, lens, unit, of_name)
+    lens, configured = configurations.read(file_as_stored, report, configuration)
+    lens = optimization.read(parts, lens, unit, configured, report)
     configurations.report_environment(parts, lens, report)
     return lens
 

@@ -35,11 +35,9 @@ from raytrace.io.zemax.configurations import (
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
-    changed,
     margin_line,
     statuses,
     tail_lines,
-    with_glass_line,
     with_rules,
 )
 from raytrace.io.zemax.surfaces import (
@@ -96,8 +94,7 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        ruled = with_rules(_surface(lens, number, surface, place), lens, number, place)
-        lines += _with_pickups(ruled, lens, number, place)
+        lines += with_rules(_surface(lens, number, surface, place), lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -442,32 +439,3 @@ def _in_file_unit(text: str, operand: Operand, row: ValueRow, lens: Lens) -> str
         power = types()[type_of(lens.surfaces[operand.number])].power(row.keyword, parameter)
         text = spelled_inverse(float(text)) if power is INVERSE else text
     return text if unit == 1 or power == 0 else in_file(text, power, unit)
-
-
-def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> list[str]:
-    """The lines of a surface with the pickups by which it follows operands of other surfaces.
-
-    Raises LensFileError for a pickup that a .zmx file is not known to have.
-    """
-    for operand in lens.operands:
-        first = operand.paths[0].path if operand.paths else ()
-        for path, factor, offset in operand.paths[1:]:
-            if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
-                continue
-            name = "PRAM" if operand.name.startswith("PAR") else operand.name
-            if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
-                raise LensFileError(f"follows {operand} by a rule that is not written", place)
-            start = {"PRAM": f"PPAR {operand.parameter}", "THIC": "PZUP", "CRVT": "CURV", "GLSS": "GLAS"}[name]
-            line = next((line.split() for line in lines if f"{line} ".startswith(f"  {start} ")), [])
-            if name in ("PRAM", "THIC"):
-                if not line:  # else a solve of the surface itself is written already
-                    lines = [*lines, f"  {start} {operand.number} {factor!r} {offset!r} 0"]
-            elif line[2:3] not in (["0"], ["1"], []):
-                continue
-            elif name == "GLSS":
-                lines = changed(with_glass_line(lines), "GLAS", {2: "2", 3: str(operand.number)})
-            elif offset:
-                raise LensFileError(f"follows {operand} with an offset, which is not written", place)
-            else:
-                lines = changed(lines, "CURV", {2: "4", 3: str(operand.number), 4: repr(factor), 5: "0"})
-    return lines
