@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from test_corpus import CORPUS
-from test_merit_bounds import semi_diameters
+from test_operands_boundaries import semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
