@@ -2,7 +2,7 @@
 
 variables         variable syntax; `Model`: the lens as a function of its variables
 lens_state        the lens at given variables: numbers, solves, first-order data and rays, with derivatives
-operands/         operands of merit functions, a file a family; `operand`: what they have in common; `table`: all of them
+operands/         operands of merit functions, a file a family; `operand`: their definition; `table`: all of them
 merit             default merit functions, merit functions as values, their evaluation with the Jacobian
 evaluate          the value of a merit function row by row, with its table and figure
 problem           constraint syntax; merit function and constraints as the sum of squares of the solver
