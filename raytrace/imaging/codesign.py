@@ -36,7 +36,7 @@ from raytrace.io import write_lens
 from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.optimization.solver import NoOptimum
+from raytrace.optimization.least_squares import NoOptimum
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raytrace.maths.result import plain
-from raytrace.optimization.solver import PATHS, Cycle, PathState, SolverState
+from raytrace.optimization.least_squares import PATHS, Cycle, PathState, SolverState
 from raytrace.stores import (
     Document,
     Kind,
