@@ -15,12 +15,11 @@ from numbers import Integral
 
 import numpy as np
 
-from raytrace.maths.pupil import gauss_legendre
+from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.conventions import Conventions, conventions_of
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
-from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.words import did_you_mean
 
 #: Most rows of a default merit function: each is a ray, with its derivatives by all variables.

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, cell, rows
-from raytrace.maths.value import value
 from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for

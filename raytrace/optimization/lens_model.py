@@ -14,12 +14,11 @@ from torch import Tensor
 
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.variables import GLASS, Address, UnknownNumber, names_at, path_of, with_numbers_of
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, is_round_about_axis, media
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths
 from raytrace.system.phases import power_of
 from raytrace.system.surface import gap_behind, medium_surfaces, vertex_curvature
-from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of

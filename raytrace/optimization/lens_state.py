@@ -1,6 +1,6 @@
 """LensState: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
 
-Numbers are plain, or dual (`maths.dual`) where derivatives are computed; the formulas are the same. SOLVES computes
+Numbers are plain, or dual (`maths.numerics`) where derivatives are computed; the formulas are the same. SOLVES computes
 the numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.context import SETTINGS, Evaluate, EvaluationContext, Line, Planner, RowValues
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model

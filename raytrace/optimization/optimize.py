@@ -18,8 +18,8 @@ from torch import Tensor
 
 from raytrace.files import check_output
 from raytrace.io import write_lens
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Result, cell, number, plain
-from raytrace.maths.value import value
 from raytrace.optimization.attained import NotReached, Reached, reached, refuse_contradictions
 from raytrace.optimization.checkpoint import STOPPED, BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.default_merit import DefaultMerit

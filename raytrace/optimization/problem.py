@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.lens_state import LensState

@@ -18,18 +18,15 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from raytrace.maths.dual import Dual, Vector, slope_of, value_of
-from raytrace.maths.numerics import dot
+from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
 from raytrace.optimization.lens_model import unbent
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.variables import GLASS
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
-from raytrace.tracing.aiming import aiming_of, is_bent
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
-from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
-from raytrace.tracing.trace import sequence_of, trace_surfaces
+from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
 
 
 def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):

@@ -6,7 +6,7 @@ import torch
 from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.panels import first_order_text
 from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
-from raytrace.maths.value import detached
+from raytrace.maths.numerics import detached
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.plotting import style
 from raytrace.system.lens import Lens, field_label

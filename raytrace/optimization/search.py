@@ -21,8 +21,8 @@ from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, cell
-from raytrace.maths.value import detached, value
 from raytrace.optimization.attained import refuse_contradictions
 from raytrace.optimization.default_merit import KINDS, DefaultMerit
 from raytrace.optimization.merit import Merit, merit_for

@@ -10,7 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, value_of
+from raytrace.maths.numerics import Dual, value_of
 from raytrace.optimization.context import (
     SETTINGS,
     BadRow,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, quotient, value_of
+from raytrace.maths.numerics import Dual, quotient, value_of
 from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.arguments import need
