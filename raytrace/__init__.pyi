@@ -61,13 +61,13 @@ from raytrace.maths.sampling import gauss_rings as gauss_rings
 from raytrace.maths.sampling import grid as grid
 from raytrace.maths.sampling import hexapolar as hexapolar
 from raytrace.maths.sampling import sobol as sobol
-from raytrace.optimization.conventions import Conventions as Conventions
-from raytrace.optimization.default_merit import BadMerit as BadMerit
-from raytrace.optimization.default_merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
+from raytrace.optimization.merit import BadMerit as BadMerit
+from raytrace.optimization.merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.merit import Merit as Merit
-from raytrace.optimization.operands.custom import Measure as Measure
+from raytrace.optimization.operands.operand import Conventions as Conventions
+from raytrace.optimization.operands.operand import Measure as Measure
 from raytrace.optimization.optimize import Optimized as Optimized
 from raytrace.optimization.optimize import optimize as optimize
 from raytrace.optimization.problem import Condition as Condition

@@ -17,9 +17,9 @@ from test_stores import STRANGE, put
 import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
-from raytrace.optimization import checkpoint, solver
+from raytrace.optimization import checkpoint, least_squares
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.solver import Sides, State, best_of_paths, minimise
+from raytrace.optimization.least_squares import Sides, State, best_of_paths, minimise
 
 TRIPLET = read_lens("cooke_triplet")
 SPOT = {"merit": "spot", "vary": "curvature sensor", "cycles": 8}
@@ -215,7 +215,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 100.0
-        monkeypatch.setattr(solver.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(least_squares.time, "monotonic", lambda: self.now)
 
     def state(self, x, derivatives):
         """A narrow valley (Rosenbrock)."""

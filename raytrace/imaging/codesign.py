@@ -35,7 +35,7 @@ from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import grid, hexapolar, sobol
-from raytrace.optimization.solver import NoOptimum
+from raytrace.optimization.least_squares import NoOptimum
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture

@@ -22,7 +22,7 @@ from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
 from raytrace.maths.result import Result
 from raytrace.maths.sampling import grid
-from raytrace.optimization.solver import NoOptimum
+from raytrace.optimization.least_squares import NoOptimum
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf

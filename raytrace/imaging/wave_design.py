@@ -26,7 +26,7 @@ from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored,
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.numerics import detached
-from raytrace.optimization.solver import minimise_tensors
+from raytrace.optimization.least_squares import minimise_tensors
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging

@@ -11,7 +11,7 @@ import numpy as np
 
 from raytrace.files import NotWritten, append_text, write_json, write_text
 from raytrace.maths.result import plain
-from raytrace.optimization.solver import PATHS, Cycle, PathState, SolverState
+from raytrace.optimization.least_squares import PATHS, Cycle, PathState, SolverState
 from raytrace.stores import Unfit, anything, either, exactly, listed, mapped, number, read_document, record, text, whole
 from raytrace.system.identity import unlike
 from raytrace.words import calling_level

@@ -23,11 +23,10 @@ import torch
 from scipy.stats import qmc
 
 from raytrace.files import NotWritten
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.solver import SolverOptions, least_squares
-from raytrace.optimization.variables import Freedom, name_of
+from raytrace.optimization.variables import Freedom, Model, name_of
 from raytrace.shards import agreeing, share, total
 from raytrace.stores import DamagedLine, Lines, anything, listed, mapped, number, record, text
 from raytrace.system.identity import identity, unlike

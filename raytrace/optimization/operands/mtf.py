@@ -17,11 +17,10 @@ from raytrace.analysis.mtf import clear_circle, cutoff, mtf_on_grid
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.numerics import Dual, slope_of, value_of
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner
-from raytrace.optimization.operands.custom import OrLost
+from raytrace.optimization.lens_state import largest_field
+from raytrace.optimization.operands.operand import BadRow, Evaluate, EvaluationContext, Line, Operand, OrLost, Planner
 from raytrace.optimization.operands.paraxial import image_index, per_row
 from raytrace.optimization.operands.wavefront import beam_of, colours_of, rings, sphere_of
-from raytrace.optimization.ray_bundle import largest_field
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene

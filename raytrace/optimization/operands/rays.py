@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import Dual, dot, safe_sqrt, slope_of, value_of
-from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
-from raytrace.optimization.ray_bundle import Hits
+from raytrace.optimization.lens_state import Hits
+from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in

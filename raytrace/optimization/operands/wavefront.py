@@ -14,10 +14,18 @@ import numpy as np
 
 from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
 from raytrace.maths.sampling import gauss_rings, square
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.optimization.lens_state import Hits
+from raytrace.optimization.operands.operand import (
+    BadRow,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Planner,
+    RowValues,
+)
 from raytrace.optimization.operands.paraxial import image_index, per_row
 from raytrace.optimization.operands.rays import known
-from raytrace.optimization.ray_bundle import Hits
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere
