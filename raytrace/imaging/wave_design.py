@@ -24,7 +24,7 @@ from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored, restored, scene, transfer
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
-from raytrace.maths.value import detached
+from raytrace.maths.numerics import detached
 from raytrace.optimization.least_squares import minimise_tensors
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
