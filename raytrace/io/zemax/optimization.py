@@ -136,8 +136,7 @@ class TypedSurface(NamedTuple):
         return self.row.names(self.surface, self.numbers, keyword, j)
 
     def code(self, keyword: str) -> int:
-        record = self.block.last(keyword)
-        return record.integer(1, "code", 0) if record else 0
+        return self.block.integer(keyword, "code", 0, 1)
 
     def numbered(self, keyword: str) -> list[tuple[int, Record]]:
         """The records of a keyword in the order of their numbers."""
@@ -150,7 +149,7 @@ class TypedSurface(NamedTuple):
         """The rule of a code, and the surface that it refers to."""
         code = self.code(keyword)
         refers = code in kinds and kinds[code] != "substitute"
-        source = self.block.last(keyword).integer(2, "surface", 0) if refers else 0
+        source = self.block.integer(keyword, "surface", 0, 2) if refers else 0
         return self.solve(quantity, kinds.get(code, f"code {code}"), source=source)
 
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
