@@ -36,6 +36,7 @@ from raytrace.io.zemax.surfaces import (
     FIELD_LISTS,
     FIELD_NAMES,
     NOTE_PIECE,
+    ROWS,
     SYSTEM_APERTURES,
     Sections,
     build,
@@ -246,7 +247,7 @@ def _wavelengths(system: Block, report: Draft) -> dict:
         report.warn(f"the number of wavelengths is not stated (FTYP, fourth value); {count} taken", place)
     if all(slot in slots for slot in range(1, count + 1)):
         chosen = [slots[slot] for slot in range(1, count + 1)]
-        pairs = [(record.number(1, "wavelength"), record.number(2, "weight", 1.0), record) for record in chosen]
+        pairs = [(ROWS["WAVE"].read(record), ROWS["WLWT"].read(record, 1.0, 1.0), record) for record in chosen]
     elif listed is not None and len(listed.words) >= count:
         weight = [weights.number(k, "weight", 1.0) if weights else 1.0 for k in range(count)]
         pairs = [(listed.number(k, "wavelength"), weight[k], listed) for k in range(count)]
