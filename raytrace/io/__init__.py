@@ -13,8 +13,9 @@ pictures          image files
 To add a format: a row of `FORMATS` and a module with a reader: text -> records with places -> LensDraft -> `assemble`.
 To add a keyword or a surface type: a row of its format's tables, as the docstring of its folder says.
 
-Tests: `tests/test_formats.py` for all formats, `test_zemax*.py`, `test_codev.py`, `test_oslo.py`, `test_ray_optics.py`,
-`test_table*.py`, `test_input_limits.py` (rays), `test_pictures.py`; real files in `test_corpus*.py`.
+Tests: `tests/test_formats.py` for all formats; `tests/test_zemax*.py`, `tests/test_codev.py`, `tests/test_oslo.py`,
+`tests/test_ray_optics.py`, `tests/test_table*.py`; `tests/test_input_limits.py` (rays), `tests/test_pictures.py`; real
+files in `tests/test_corpus*.py`.
 """
 
 import dataclasses

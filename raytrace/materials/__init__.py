@@ -10,5 +10,5 @@ To add a formula: a function of coefficients and wavelength, and a row of `FORMU
 `glass_catalogs/`, and its name in `SHIPPED`; another name of it: a row of `CATALOG_NAMES`; another spelling of a glass:
 a line of `glass_catalogs/ALIASES.csv`.
 
-Tests: `tests/test_glass.py`, `test_glass_table.py`, `test_catalogs.py`, `test_environment.py`.
+Tests: `tests/test_glass.py`, `tests/test_glass_table.py`, `tests/test_catalogs.py`, `tests/test_environment.py`.
 """

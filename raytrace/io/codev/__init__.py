@@ -10,5 +10,5 @@ To add a command that is left out or refused: its reason in `LEFT_OUT` or `REFUS
 `SYSTEM_APERTURES`, `APERTURES` or `POSE_WORDS`, which reader and writer use. A formula of private glasses: a row of
 `FORMULA_WORDS` in `glass`.
 
-Tests: `tests/test_codev.py`, and real files in `test_corpus.py`.
+Tests: `tests/test_codev.py`, and real files in `tests/test_corpus.py`.
 """

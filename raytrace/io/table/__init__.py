@@ -9,5 +9,5 @@ write      the columns, written
 To add a spelling of a heading: a word of `_SPELLINGS` in `columns`; a heading to leave out: `_OTHERS`. A header key: a
 row of `_KEYS` in `text`, its reader and its line of `written` in `system`.
 
-Tests: `tests/test_table.py`, also of pandas; layouts of patents and programs in `test_table_layouts.py`.
+Tests: `tests/test_table.py`, also of pandas; layouts of patents and programs in `tests/test_table_layouts.py`.
 """

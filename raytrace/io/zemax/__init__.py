@@ -9,12 +9,12 @@ archive           members of a .zar archive, unpacked
 
 To add:
 - a keyword that is left out: its reason in `SYSTEM_IGNORED` or `SURFACE_IGNORED`;
-- a value, or an operand of configurations: a row of `ROWS`, which gives its keyword, word, path in the lens and power of
-  length; reader, writer, units and operand use it;
+- a value, or an operand of configurations: a row of `ROWS`: keyword, word, path in the lens, power of length, quantity;
+  reader, writer, units and operand use it;
 - a number of a surface type: a row of its PARM in `_TYPES`; a type: a row of `_TYPES`, or, of rotationally symmetric
   terms, the name `zemax` of its kind in `system.shapes`;
 - a solve: a row of `CURVATURE_SOLVES` or `THICKNESS_SOLVES`.
 
-Tests: `tests/test_zemax*.py`, `test_configurations.py`, `test_environment.py`, `test_solves.py`, and real files in
-`test_corpus*.py`; `test_opticstudio*.py` compare with numbers that OpticStudio stored.
+Tests: `tests/test_zemax*.py`, `tests/test_configurations.py`, `tests/test_environment.py`, `tests/test_solves.py`; real
+files in `tests/test_corpus*.py`; `tests/test_opticstudio*.py` compare with numbers that OpticStudio stored.
 """
