@@ -15,7 +15,7 @@ from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order

@@ -8,18 +8,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.grid import Grid, grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.value import value
+from raytrace.maths.sampling import Grid, grid
 from raytrace.plotting.style import array, styled
 from raytrace.psf_models.figures import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths
-from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.focus import NoImage, focused, real_image_distance
 from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.trace import need_axis
 
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm

@@ -21,10 +21,9 @@ from raytrace.analysis.spot_diagram import (
     wavelength_handles,
 )
 from raytrace.io import write_lens
-from raytrace.maths import pupil
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, number, numbers, object_text
-from raytrace.maths.value import detached, value
+from raytrace.maths.sampling import sampled
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -233,7 +232,7 @@ def focus(
     weighted mean of those of several objects; "mean", least mean distance from the centroid.
     object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
     wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
-    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
+    as for `sampling.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
     """
     if criterion not in ("rms", "paraxial", "mean"):
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
@@ -243,7 +242,7 @@ def focus(
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
     warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness
-    at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    at, weights = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)
     scene = {
         "object_distances": distances,

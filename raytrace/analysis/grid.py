@@ -14,9 +14,8 @@ from raytrace.analysis.setting import (
     refuse_axis,
     unvignetted,
 )
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Table, axis, masked
-from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling

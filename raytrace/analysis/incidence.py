@@ -7,9 +7,8 @@ from torch import Tensor
 from raytrace.analysis.panels import DASHES, chart, finished, wavelength_label
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setting
-from raytrace.maths.numerics import dot
+from raytrace.maths.numerics import dot, value
 from raytrace.maths.result import Table, masked
-from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, INK, array, field_colour, styled
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens

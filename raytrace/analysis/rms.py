@@ -10,10 +10,9 @@ from raytrace.analysis.fans import REFERENCES
 from raytrace.analysis.panels import by_wavelength, chart, field_axis, field_name, finished
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting, wavelength_shares
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Table
-from raytrace.maths.value import value
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, array, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points

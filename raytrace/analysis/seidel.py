@@ -19,14 +19,14 @@ from torch import Tensor
 from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Table
-from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
-from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import is_at_infinity, paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
+from raytrace.tracing.trace import need_axis
 from raytrace.words import named, with_article
 
 _SEIDEL = {

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.panels import first_order_text
-from raytrace.maths import pupil
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
+from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.value import detached, value
+from raytrace.maths.sampling import gauss_rings, hexapolar, sampled, sobol, with_rim
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -184,7 +182,7 @@ def spot(
     """The spot of every field and wavelength on the sensor, differentiable in every number of the lens.
 
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; wavelengths: µm, alike in weight,
-    the first one primary, by default the lens's. sampling, rings, points, seed: as for `pupil.sampled`; rays: instead,
+    the first one primary, by default the lens's. sampling, rings, points, seed: as for `sampled`; rays: instead,
     so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
     and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
     weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
@@ -202,11 +200,11 @@ def spot(
         how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}
         return _of_many(lens, fields, rays, "random" if sampling == "random" else "sobol", progress, **how)
     like = lens.surfaces[-2].thickness
-    at, shares = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    at, shares = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     if weights == "equal":
         shares = torch.full_like(shares, 1 / len(shares))
     else:  # the rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss
-        at, shares = pupil.with_rim(at, shares)
+        at, shares = with_rim(at, shares)
     each = iter if progress is None else lambda work: progress(work, "field")
     found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
@@ -239,7 +237,7 @@ def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray
     else:
         with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
             each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
-    tried = pupil.sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
+    tried = sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
     warn_of_failures(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
     return Spots(lens, fields, each, whole)
 

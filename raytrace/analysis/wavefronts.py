@@ -12,9 +12,9 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths import zernike
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Table
-from raytrace.maths.value import value
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from raytrace.files import write_atomically
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.value import value
+from raytrace.maths.sampling import Grid
 from raytrace.system.lens import Lens
-from raytrace.tracing.spot import where_lit
 
 #: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
 _BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
@@ -269,8 +267,8 @@ def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
         dark_of_all = f"{int(dark.sum())} of {dark.numel()}"
         raise EmptyPsf(f"no ray reaches the sensor in {dark_of_all} PSFs, those of index {places}")
-    lit = where_lit(~dark, *moments.values(), empty=empty)
-    return dataclasses.replace(psfs, **dict(zip(moments, lit, strict=True)))
+    shown = {name: torch.where(dark, torch.nan, moment) for name, moment in moments.items()}
+    return dataclasses.replace(psfs, **shown)
 
 
 def _is_dark(light: Kernels | Psf, centroid: Tensor, covariance: Tensor, *, of_waves: bool) -> Tensor:
