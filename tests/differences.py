@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
 
 #: Without undefined gradients, half of the time: only a custom autograd function can fail there, and its tests call
 #: `torch.autograd.gradcheck`.

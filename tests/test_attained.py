@@ -10,10 +10,10 @@ from problems import fields, lens, surface
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.materials.glass import model_glass
-from raytrace.optimization.attained import NotReached
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.optimize import NotReached
 from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 
 REFUSED = {

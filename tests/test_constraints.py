@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import WORDS, BadHold, conditions_of
+from raytrace.optimization.variables import Model
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import trace_lens
 

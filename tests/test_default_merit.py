@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.optimization.default_merit import BadMerit, DefaultMerit
+from raytrace.optimization.merit import BadMerit, DefaultMerit
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 PRINTED = 1e-6  # the files hold six to twelve digits

@@ -8,7 +8,7 @@ import raytrace as rt
 from raytrace.budget import OverBudget
 from raytrace.cli import main
 from raytrace.io.ray_tables import RayTableError
-from raytrace.optimization.default_merit import BadMerit, DefaultMerit
+from raytrace.optimization.merit import BadMerit, DefaultMerit
 from raytrace.system.parameter_paths import BadVariables, counted
 
 SINGLET = rt.read_lens("singlet")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.optimization.merit_rows import UnknownOperand
+from raytrace.optimization.merit import UnknownOperand
 from raytrace.system.optimization_data import OptimizationData, Row
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"

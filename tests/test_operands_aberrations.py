@@ -12,10 +12,9 @@ from problems import fields
 import raytrace as rt
 from raytrace.analysis.seidel import OF_WAVEFRONT
 from raytrace.files import shipped
-from raytrace.optimization.context import BadRow
-from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.operands.operand import BadRow, Conventions
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
 

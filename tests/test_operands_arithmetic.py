@@ -7,10 +7,10 @@ import pytest
 from merit_cases import check_derivatives, model_of, values_of
 
 import raytrace as rt
-from raytrace.optimization.context import BadRow
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation, UnknownOperand
-from raytrace.optimization.operands.arithmetic import ARITHMETIC, Circle
+from raytrace.optimization.merit import Circle, Evaluation, UnknownOperand
+from raytrace.optimization.operands.arithmetic import ARITHMETIC
+from raytrace.optimization.operands.operand import BadRow
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")

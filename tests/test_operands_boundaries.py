@@ -17,12 +17,11 @@ from problems import both_engines, fields, lens, scalar, surface, vector
 import raytrace as rt
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
-from raytrace.optimization.context import EvaluationContext, Planner
-from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import LOST, Evaluation
+from raytrace.optimization.lens_state import Bundle
+from raytrace.optimization.merit import LOST, Evaluation
 from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
-from raytrace.optimization.ray_bundle import Bundle
+from raytrace.optimization.operands.operand import Conventions, EvaluationContext, Planner
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import media
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose

@@ -10,11 +10,10 @@ from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
 from raytrace.io import LensFileWarning
-from raytrace.maths.pupil import gauss_rings, square
-from raytrace.optimization.context import BadRow
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
-from raytrace.optimization.operands.custom import Measure
+from raytrace.maths.sampling import gauss_rings, square
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.operands.operand import BadRow, Measure
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points

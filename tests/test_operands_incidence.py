@@ -8,8 +8,8 @@ from merit_cases import LENSES, check_derivatives, values_of
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")

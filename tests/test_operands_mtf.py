@@ -10,9 +10,9 @@ from problems import values
 
 import raytrace as rt
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
-from raytrace.optimization.lens_model import Model
 from raytrace.optimization.lens_state import LensState
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row, Vary
 
 

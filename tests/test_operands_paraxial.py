@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from merit_cases import LENSES, check_derivatives, is_near, lens_of, values_of
 
-from raytrace.optimization.conventions import Conventions
+from raytrace.optimization.operands.operand import Conventions
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.paraxial import first_order

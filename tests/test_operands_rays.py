@@ -7,9 +7,9 @@ import pytest
 from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 
 import raytrace as rt
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import LOST, Evaluation
+from raytrace.optimization.merit import LOST, Evaluation
 from raytrace.optimization.operands.rays import RAYS
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Row
 
 pytestmark = pytest.mark.usefixtures("compiler")

@@ -13,11 +13,10 @@ from problems import lens as lens_of
 from problems import surface, values, vector
 
 import raytrace as rt
-from raytrace.optimization.context import BadRow
-from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.operands.operand import BadRow, Conventions
 from raytrace.optimization.operands.wavefront import Fit
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import media
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.launch import rays_of_field, vignette

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import Problem
-from raytrace.optimization.variables import bounds_of, freedom
+from raytrace.optimization.variables import Model, bounds_of, freedom
 
 #: Factors of the curvatures of the double Gauss, with which most of its rays are lost.
 BENT = (1.15, 0.58, 0.67, -0.95, 2.44, 1.0, 1.12, 1.41, 0.0, 0.16, 1.51)

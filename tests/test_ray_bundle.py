@@ -9,9 +9,9 @@ import torch
 import raytrace as rt
 from raytrace.files import shipped
 from raytrace.materials.glass import model_glass
-from raytrace.maths.dual import Dual
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.ray_bundle import Bundle
+from raytrace.maths.numerics import Dual
+from raytrace.optimization.lens_state import Bundle
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import with_field_kind
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.tracing.launch import launch

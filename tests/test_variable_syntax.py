@@ -7,8 +7,7 @@ import pytest
 
 import raytrace as rt
 from raytrace.materials.glass import abbe_number, nd
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.variables import VariedGlass, bounds_of, freedom, name_of
+from raytrace.optimization.variables import Model, VariedGlass, bounds_of, freedom, name_of
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables
 
