@@ -21,7 +21,7 @@ from raytrace.io.source import LensFileError
 from raytrace.maths.numerics import value
 from raytrace.maths.sampling import gauss_rings, grid, sobol
 from raytrace.psf_models import psf
-from raytrace.system import shapes
+from raytrace.system import sag_terms, shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.parameter_paths import number_at, parameter_paths, with_number
@@ -241,8 +241,8 @@ def dome(u, coefficients, highest, along):
 def made_up(monkeypatch):
     kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
     monkeypatch.setitem(shapes.KINDS, "dome", kind)
-    ripple = shapes.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
-    monkeypatch.setitem(shapes.SAG_TERMS, "Ripple", ripple)
+    ripple = sag_terms.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
+    monkeypatch.setitem(sag_terms.SAG_TERMS, "Ripple", ripple)
 
 
 FACES = {

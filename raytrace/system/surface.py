@@ -18,8 +18,8 @@ from raytrace.maths.numerics import value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
 from raytrace.system.poses import Gap, Pose, Turn
-from raytrace.system.sag_terms import Sag
-from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, SagTerms, relief, sag_and_derivatives
+from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
+from raytrace.system.shapes import EVEN, KINDS, sag_and_derivatives
 
 
 @value
@@ -31,7 +31,7 @@ class Surface:
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of the `kind`, a key of `shapes.KINDS`: of an even asphere of r², r⁴, … in
         mm^(1-2j), of a toroid its curvature along x and terms of y², y⁴, …; None if not aspheric.
-    sag_terms: added sag D, of a kind of `shapes.SAG_TERMS`, or None. A height at the vertex belongs to the thickness
+    sag_terms: added sag D, of a kind of `sag_terms.SAG_TERMS`, or None. A height at the vertex belongs to the thickness
         before: paraxial optics takes D(0, 0) and the slopes there as 0.
     phase: optical path added by the surface, or its action in place of Snell's law, of a kind of `phases.PHASES`; None
         for a surface that refracts or reflects.

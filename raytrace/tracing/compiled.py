@@ -26,8 +26,8 @@ from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.poses import Gap, Turn, passage
 from raytrace.system.rays import Rays
-from raytrace.system.sag_terms import PowerSag
-from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS
+from raytrace.system.sag_terms import SAG_TERMS, PowerSag
+from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.compiler import NoCompiler, is_built, library
 

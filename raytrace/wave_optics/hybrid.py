@@ -27,8 +27,7 @@ from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels
 from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, media, with_object_distance
-from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
-from raytrace.system.shapes import relief
+from raytrace.system.sag_terms import GridSag, ZernikeSag, relief, spline
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
