@@ -28,7 +28,7 @@ from raytrace.system.parameter_paths import number_at, parameter_paths, with_num
 from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
-from raytrace.system.surface import sag, sag_at
+from raytrace.system.surface import sag, sag_and_derivatives, sag_at
 from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -107,7 +107,7 @@ def test_odd_asphere_is_its_formula_in_fifty_digits(engine):
 
 def test_slopes_are_the_derivatives_of_the_sag():
     u = vector(0.01, 0.5, 20.0).requires_grad_()
-    S, dS, d2S = shapes.sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
+    S, dS, d2S = sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
     (slope,) = torch.autograd.grad(S.sum(), u, create_graph=True)
     (bend,) = torch.autograd.grad(slope.sum(), u)
     assert_close(slope, dS, rtol=1e-13, atol=0)

@@ -26,7 +26,7 @@ from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import MODELS, NotConverged, Psf, drt, paraxial, wave
 from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene

@@ -7,7 +7,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import detached, safe_divide
 from raytrace.maths.sampling import Grid
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media
 from raytrace.system.surface import is_round

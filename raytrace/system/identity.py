@@ -1,4 +1,4 @@
-"""Identity: what a lens is known by in the files that hold numbers for it."""
+"""Identity of a lens in the files that store numbers for it."""
 
 import dataclasses
 import hashlib
@@ -94,7 +94,7 @@ def unlike(before: Mapping, now: Mapping) -> str:
     """
     try:
         if "prescription" in now and "prescription" not in before:
-            return "a lens that it does not tell; an older version wrote it"
+            return "an unidentified lens; an older version wrote it"
         if "prescription" in now and (words := other_lens(before, now)):
             return f"another lens: {words}"
         if "variables" in now and before["variables"] != now["variables"]:
@@ -102,7 +102,7 @@ def unlike(before: Mapping, now: Mapping) -> str:
             expected = f"{missing[0]} among them" if missing else ", ".join(now["variables"])
             return f"other variables: {', '.join(map(str, before['variables']))}; expected {expected}"
     except (KeyError, TypeError, ValueError, AttributeError):
-        return "a lens that its damaged identity does not tell"
+        return "a lens whose identity is damaged"
     other = [name for name in now if name not in ("lens", "surfaces") and before.get(name) != now[name]]
     return f"other {', '.join(other)}" if other else ""
 

@@ -334,7 +334,7 @@ def unknown_changes(lens: Lens) -> dict[int, str]:
 
 
 def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
-    """n (...) of the medium behind a surface at wavelengths (...) µm, beside the lens's air; none of a mirror."""
+    """n (...) of the medium behind a surface at wavelengths (...) µm, relative to the lens's air; a mirror has none."""
     surface, air = lens.surfaces[number], lens.environment
     if air is None and surface.environment is None:
         return refractive_index(surface.glass, wavelength)

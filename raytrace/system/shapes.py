@@ -212,7 +212,7 @@ class Kind:
     least, most: how many coefficients it has.
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
-    words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
+    words: entries of the column "type" of a table; an empty one is resolved by the powers of the terms.
     code: the kind in tracing/cpp/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
@@ -255,34 +255,6 @@ KINDS = {
         Kind("biconic", zemax="BICONICX", form=BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2, code=6),
     )
 }
-
-
-def sag_and_derivatives(
-    u: Tensor,
-    curvature: Tensor | None,
-    conic: Tensor | None,
-    coefficients: Tensor | None,
-    highest: int = 2,
-    *,
-    along: Tensor | float = 1.0,
-    kind: str = EVEN,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
-
-    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
-    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
-
-    S = c u/(1+w) + Σ_j a_j b_j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
-    """
-    S = dS = d2S = torch.zeros_like(u)
-    if curvature is not None:
-        S, dS, d2S = conic_terms(u, curvature, conic, highest, along)
-    if coefficients is not None:
-        P, dP, d2P = KINDS[kind].terms(u, coefficients, highest, along)
-        S = S + P
-        dS = dS if dP is None else dS + dP
-        d2S = d2S if d2P is None else d2S + d2P
-    return S, dS, d2S
 
 
 def size_of_terms(u: Tensor, coefficients: Tensor, kind: str = EVEN) -> Tensor:

@@ -404,9 +404,7 @@ def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
 
 
 def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
-    shape = *task.valid.shape[:-1], 1
-    numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
-    own, indices, gap = with_numbers(task.structure, surfaces, numbers)
+    own, indices, gap = with_numbers(task.structure, surfaces, table, task.valid.shape[:-1])
     return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
 
 

@@ -134,7 +134,7 @@ def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
 
 
 def _unclipped(scene: Scene, pupil: Tensor) -> Tensor:
-    """Which rays would arrive if nothing clipped any (D, F, W, P): behind turned axes numbers alone do not tell."""
+    """Which rays would arrive if nothing clipped any (D, F, W, P): behind turned axes coordinates do not show it."""
     if not any(surface.apertures for surface in scene.lens.surfaces):
         return torch.zeros_like(scene.fields[0], dtype=torch.bool)[:, None, None]
     surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in scene.lens.surfaces)
@@ -210,7 +210,7 @@ def zernike_coefficients(
     """Coefficients 1 … count (D, F, W, count) in mm, fitted to the rays that arrive.
 
     numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
-    empty: what they are where the light fills too little of the entrance pupil to tell them apart (a fit would enlarge
+    empty: what they are where the light fills too little of the entrance pupil to separate them (a fit would enlarge
     the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot_of`.
     Raises ValueError for another numbering.
     """
