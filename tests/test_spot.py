@@ -13,6 +13,7 @@ from test_hardcases import of_kind
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.rays import Rays
 from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
