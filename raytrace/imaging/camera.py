@@ -144,9 +144,8 @@ class Camera(nn.Module):
             distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
             if symmetry(light) != "none" and bool((distance < 1e-12).all()):
                 covariance = covariance[[0, 2]]  # xy is 0 but for rounding, and costs a quadrature over every pixel
-            kernels = (arrives.sum(-1) * beam_share(light))[..., None, None] * gaussian_pixels(
-                window, centroid, covariance
-            )
+            energy = arrives.sum(-1) * beam_share(light)
+            kernels = energy[..., None, None] * gaussian_pixels(window, centroid, covariance)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel

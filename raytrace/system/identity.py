@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -82,7 +83,7 @@ def other_lens(before: Mapping, now: Mapping) -> str:
         return f"{names[0]!r} of {counts[0]} surfaces, not {names[1]!r} of {counts[1]}"
     for k, (a, b) in enumerate(zip(before["surfaces"], now["surfaces"], strict=True)):
         for quantity, one, other in zip((*_SHOWN, "glass"), a, b, strict=True):
-            if k and not _alike(one, other):
+            if k and not alike(one, other):
                 return f"{names[0]!r} with {quantity} {_shown(one)} of surface {k}, not {_shown(other)}"
     return f"{names[0]!r} with other numbers of its surfaces"
 
@@ -107,9 +108,12 @@ def unlike(before: Mapping, now: Mapping) -> str:
     return f"other {', '.join(other)}" if other else ""
 
 
-def _alike(one: object, other: object) -> bool:
+def alike(one: object, other: object) -> bool:
+    """Whether plain values are equal, numbers to the precision of float32."""
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(alike, one, other))
     if isinstance(one, float) and isinstance(other, float):
-        return abs(one - other) <= 1e-6 * max(abs(one), abs(other))  # float32
+        return math.isclose(one, other, rel_tol=1e-6)
     return one == other
 
 
