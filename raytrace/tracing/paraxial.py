@@ -291,11 +291,8 @@ def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
     """Paraxial image distance (...) mm from the last surface before the image; object_distance: (...) mm or inf."""
     wavelength = lens.primary if wavelength is None else wavelength
-    surfaces = lens.surfaces[1:-1]
-    n = signed(surfaces, media(lens, wavelength)[:-1])
-    A, B, C, D = system_matrix(surfaces, n, wavelength)
-    vergence = n[0] / object_distance
-    return -n[-1] * (A + B * vergence) / (C + D * vergence)
+    n = signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
+    return gaussian(lens, n, wavelength).image_distance(n[0] / object_distance)
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
-from raytrace.tracing.trace import is_bent, lens_steps, sequence_of, trace_surfaces
+from raytrace.tracing.trace import is_bent, sequence_of, trace_surfaces, without_apertures
 
 
 @value
@@ -211,11 +211,7 @@ def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tenso
 @torch.no_grad()
 def unclipped(lens: Lens, pupil: Tensor, fields: Tensor, wavelengths: Tensor) -> Tensor:
     """Which rays (F, W, P) of pupil points (2, P) reach the sensor, or would if nothing clipped any."""
-    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    reached = rays.valid
-    for crossing in lens_steps(lens, rays, wavelengths[:, None]):
-        reached = reached & ~crossing.missed & ~crossing.totally_reflected
-    return reached
+    return image_rays(without_apertures(lens), pupil, fields=fields, wavelengths=wavelengths).valid
 
 
 def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
