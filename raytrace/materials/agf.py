@@ -214,6 +214,11 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     if len(coefficients) < count:
         found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
         raise _fault(path, line, found, expected, "is the line cut off?")
+    line_of_range, text = _only(block, "LD", name, path)
+    span = _numbers(text.split(), path, line_of_range)[:2]
+    if span != (0.0, 0.0) and (len(span) < 2 or not 0 < span[0] < span[1]):
+        expected = "the shortest and the longest wavelength in µm"
+        raise _fault(path, line_of_range, f"LD {text[:40]} for {name}", expected)
     comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
     listing = re.search(r"\balternatives: *([^;\n]+)", comment)
     unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
@@ -222,7 +227,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         formula=formula,
         coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
-        wavelength_range=_wavelength_range(block, name, path),
+        wavelength_range=None if span == (0.0, 0.0) else span,
         status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
@@ -235,16 +240,6 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
             if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
     )
-
-
-def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
-    line, text = _only(block, "LD", name, path)
-    numbers = _numbers(text.split(), path, line)[:2]
-    if numbers == (0.0, 0.0):
-        return None
-    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
-        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
-    return numbers
 
 
 def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
