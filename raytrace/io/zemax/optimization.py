@@ -533,7 +533,7 @@ def _operand_pickups(lens: Lens, number: int, place: Place) -> list[Solve]:
         if number == operand.number or not followed or followed[0].path[2] == "environment":
             continue
         path, scale, offset = followed[0]
-        names = {found.steps: name for name, found in parameter_paths(lens.surfaces[number]).items()}
+        names = {at.steps: name for name, at in parameter_paths(lens.surfaces[number]).items()}
         is_parameter = operand.name in ("PRAM", *(f"PAR{j}" for j in range(1, 9)))
         quantity = names.get(path[2:]) if is_parameter else quantities.get(operand.name)
         if not quantity or path[2:] != operand.paths[0].path[2:] or path[2] == "phase":
