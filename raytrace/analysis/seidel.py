@@ -12,6 +12,7 @@ of OpticStudio, so that C1 of a single positive lens is negative; Welford's C ha
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -129,7 +130,12 @@ class Seidel(Analysis):
         return finished(panels[0], self, f"Seidel {quantity} ({self.unit}), field {label}")
 
 
-def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> Seidel:
+def seidel(
+    lens: Lens,
+    *,
+    fields: Points = None,
+    kind: Literal["coefficients", "waves", "transverse", "longitudinal"] = "coefficients",
+) -> Seidel:
     """Third-order aberrations at the primary wavelength, colours between the shortest and the longest wavelength.
 
     kind: "coefficients": S1 … S5, C1, C2 in mm. "waves": W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P = S4/4,
