@@ -140,7 +140,7 @@ def seidel(
 
     kind: "coefficients": S1 … S5, C1, C2 in mm. "waves": W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P = S4/4,
     W311 = S5/2, W020 = C1/2, W111 = C2. "transverse": mm by which rays of the rim miss the paraxial image point, the
-    upper one where there is a choice, in the order of `_transverse`. "longitudinal": mm along z from the paraxial
+    upper one where there is a choice. "longitudinal": mm along z from the paraxial
     focus to theirs. The last two are nan where image space is afocal.
     fields: y or (x, y), of which the distance from the axis counts; the lens's largest by default. Image heights are
     those of the paraxial image. Raises ValueError for a kind not named here, and for a surface of other terms than even
