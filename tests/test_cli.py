@@ -846,7 +846,7 @@ def test_spot_of_every_field_and_wavelength(run):
     assert len(printed) == 2 + 3 * (3 + 1)
 
 
-@pytest.mark.parametrize("sampling", ("gauss", "hexapolar", "square", "sobol", "random"))
+@pytest.mark.parametrize("sampling", ["gauss", "hexapolar", "square", "sobol", "random"])
 def test_samplings_agree(run, sampling):
     """Every rule of the pupil measures the same spot; the seed makes the random ones repeat."""
     arguments = ("spot", "double_gauss", "--field", 10, "--sensor-distance", 57.3, "--sampling", sampling, "--json")

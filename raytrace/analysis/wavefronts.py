@@ -135,7 +135,7 @@ def wavefront(
 ) -> WavefrontMap:
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
-    fields: y or (x, y); wavelengths: µm; size: points across a map; terms: number of Zernike terms, 37 by default;
+    fields: y or (x, y); wavelengths: µm; size: pixels across a map; terms: number of Zernike terms, 37 by default;
     numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. What a
     wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the light
     fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
