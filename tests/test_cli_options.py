@@ -18,7 +18,7 @@ from raytrace.cli import build_parser
 from raytrace.cli.options import PICTURES, picture_file
 from raytrace.cli.run import find_lens
 from raytrace.io import read_lens
-from raytrace.maths.pupil import hexapolar
+from raytrace.maths.sampling import hexapolar
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
 from raytrace.tracing.spot import arrivals
 from raytrace.words import did_you_mean

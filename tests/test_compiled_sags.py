@@ -10,14 +10,13 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 from raytrace.materials.glass import MIRROR
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.rays import Rays
 from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
 from raytrace.system.shapes import SAG_TERMS
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import is_expressible, trace_engine
-from raytrace.tracing.jacobian import hit_jacobian
-from raytrace.tracing.trace import trace_surfaces
+from raytrace.tracing.trace import hit_jacobian, trace_surfaces
 
 
 def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:

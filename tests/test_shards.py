@@ -15,8 +15,8 @@ import raytrace as rt
 from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.maths.grid import grid
-from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, psf, sharing
+from raytrace.maths.sampling import grid
+from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, models, psf
 from raytrace.psf_models.result import mixture
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -97,14 +97,14 @@ def work(folder: str) -> None:
 
 def kill_itself(*words: str) -> None:
     """The command line of a process that is killed, if it is number 1, as soon as kernels are put together."""
-    together = sharing.total
+    together = models.total
 
     def killed(part):
         if shards.share().rank == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return together(part)
 
-    sharing.total = killed
+    models.total = killed
     sys.exit(main(words))
 
 
@@ -205,14 +205,14 @@ def test_a_refusal_is_said_once(tmp_path):
 )
 def test_axes_are_cut_for_the_smallest_largest_block(shape, processes, by_field, expected):
     """(2, 2, 2) by field: four kernels in turn for two fields each, or one field at a time on four of the processes."""
-    assert sharing._cuts(shape, processes, by_field=by_field) == expected
+    assert models._cuts(shape, processes, by_field=by_field) == expected
 
 
 @pytest.mark.parametrize(("shape", "cut"), [((4, 3, 3), (2, 1, 3)), ((5, 2, 7), (3, 2, 4)), ((1, 1, 1), (1, 1, 1))])
 def test_blocks_hold_every_kernel_once(shape, cut):
     seen = np.zeros(shape, int)
     for number in range(int(np.prod(cut))):
-        seen[sharing._block(shape, cut, number)] += 1
+        seen[models._block(shape, cut, number)] += 1
     assert (seen == 1).all()
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from raytrace.bench.measure import field_rays, slope, with_leaf
 from raytrace.bench.speed import with_sensor_leaf
 from raytrace.io import read_lens
-from raytrace.maths.grid import grid
-from raytrace.maths.pupil import sobol
+from raytrace.maths.sampling import grid, sobol
 from raytrace.psf_models import MODELS, fourier, model_of, psf
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays

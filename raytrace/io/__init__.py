@@ -46,8 +46,8 @@ from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.maths.value import value
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, named_value

@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from raytrace.files import encoding
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.maths.value import value
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row

@@ -40,6 +40,7 @@ from raytrace.io.zemax.surfaces import (
     Sections,
     build,
     measured,
+    medium,
     refuse_unsupported,
     sections,
 )
@@ -68,8 +69,9 @@ def read(
     unit = _millimetres(parts.system, report)
     names = tuple(name for record in parts.system.all("GCAT") for name in record.words)
     came = catalogs_of_lens(names, catalogs, report, packed)
-    surface = partial(build, millimetres=unit, catalogs=came, user=catalogs)
-    surfaces = [surface(block, blocks=parts.surfaces, report=report) for block in parts.surfaces]
+    surfaces = [
+        build(block, unit, parts.surfaces, catalogs=came, user=catalogs, report=report) for block in parts.surfaces
+    ]
     lens = _lens(parts, surfaces, unit, report, file)
     for keyword, position, quantity, message in (
         ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
@@ -78,16 +80,10 @@ def read(
         record = parts.system.last(keyword)
         if record and record.integer(position, quantity, 0):
             report.warn(message, record.place)
-    known = dict(zip(parts.surfaces, lens.surfaces, strict=True))
-
-    def rebuild(other: Sections) -> Lens:
-        """The lens of changed records; unchanged surfaces are reused."""
-        draft = report.again()
-        changed = [known.get(block) or surface(block, blocks=other.surfaces, report=draft) for block in other.surfaces]
-        return _lens(other, changed, unit, draft, file)
-
-    lens = configurations.read(parts, lens, rebuild, report, configuration)
-    lens = optimization.read(parts, lens, unit, report)
+    of_name = partial(medium, catalogs=came, user=catalogs, report=report.again())
+    file_as_stored = configurations.LensFile(parts, lens, unit, of_name)
+    lens, configured = configurations.read(file_as_stored, report, configuration)
+    lens = optimization.read(parts, lens, unit, configured, report)
     configurations.report_environment(parts, lens, report)
     return lens
 
@@ -105,7 +101,7 @@ def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
         report.warn("no PWAV: the first wavelength is taken as the primary one", system.place)
     aperture_kind, aperture, source = _aperture(system, surfaces[stop.place.surface].semi_diameter, unit, report)
     draft = LensDraft(
-        surfaces=configurations.in_environments(surfaces, parts.surfaces, environment),
+        surfaces=surfaces,
         stop=stop.place.surface,
         aperture_kind=aperture_kind,
         aperture=aperture,

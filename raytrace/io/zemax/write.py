@@ -18,10 +18,8 @@ from torch import Tensor
 from raytrace.io.assembly import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.io.source import (
     MILLIMETRES,
-    Draft,
     LensFileError,
     Place,
-    Record,
     exact,
     exact_list,
     is_infinite,
@@ -30,39 +28,38 @@ from raytrace.io.source import (
 )
 from raytrace.io.zemax.configurations import (
     FAR,
-    ROWS,
-    Cell,
     environment_line,
-    is_of_surfaces,
+    power_of,
     with_environments,
-    word_of,
 )
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
-    changed,
     margin_line,
     statuses,
     tail_lines,
-    with_glass_line,
     with_rules,
 )
 from raytrace.io.zemax.surfaces import (
+    AIMING,
     AIMINGS,
     BLANK,
     FIELD_KINDS,
     FIELD_LISTS,
     FIELDS_IN_LISTS,
+    GLASS,
     INVERSE,
     NOTE_PIECE,
     POWERS,
+    ROWS,
+    SIZE,
     SYSTEM_APERTURES,
-    Sections,
+    TEXT,
     SurfaceType,
+    ValueRow,
     aperture_keywords,
     in_millimetres,
     poses_are_parameters,
-    sections,
     spelled_inverse,
     type_of,
     types,
@@ -97,8 +94,7 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        ruled = with_rules(_surface(lens, number, surface, place), lens, number, place)
-        lines += _with_pickups(ruled, lens, number, place)
+        lines += with_rules(_surface(lens, number, surface, place), lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -383,20 +379,21 @@ def in_file(word: str, power: int | None, millimetres: float) -> str:
 
 
 def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> list[str]:
-    """MNUM and a line for every operand in every configuration.
+    """MNUM and a line for every operand in every configuration, by the row of its value.
 
-    The value of an operand is its word in the file of the lens in that configuration.
-    body: the lines of system and surfaces of a lens. Raises LensFileError for operands that the lines cannot give.
+    body: the lines of system and surfaces of a lens. Raises LensFileError for operands that the lines cannot give, and
+    for a configuration that a file cannot hold.
     """
     original, lens, place = lens, with_environments(lens, Place(file)), Place(file)
     if not lens.operands:
         return ["MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
     numbers = range(1, count(lens.operands) + 1)
-    texts = [sections("\n".join(body(with_operands(lens, k))) + "\n", file, Draft(file, "zmx")) for k in numbers]
+    for k in numbers:
+        body(with_operands(lens, k))  # refuses what no file holds
     lines = [f"MNUM {len(numbers)} {lens.current_configuration}"]
     rules = statuses(original, lens.operands)
     for position, operand in enumerate(lens.operands):
-        values = [_value(operand, k, texts[k - 1], place) for k in numbers]
+        values = [_value(operand, k, lens, place) for k in range(len(numbers))]
         names = [value.upper() for value in values] if operand.media else []
         for k, name in enumerate(names):  # a file identifies glasses by their names, model glasses too
             if not same(operand.media[k], operand.media[names.index(name)]):
@@ -412,43 +409,33 @@ def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> 
     return lines
 
 
-def _value(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
-    """The value of an operand: the word in the file of its configuration, or its own where it has none there."""
-    if operand.paths and operand.name in ROWS and not is_of_surfaces(operand):
-        record = Record(operand.name, (), "", place)
-        cell = Cell(operand.name, operand.number, operand.parameter, configuration, "", record)
-        word = word_of(text, cell)
-        if word is not None:
-            return repr(FAR) if is_infinite(word) else word.replace('"', "'")
+def _value(operand: Operand, k: int, lens: Lens, place: Place) -> str:
+    """The value of an operand in configuration k, from 0, in the unit of the file."""
+    row = ROWS.get(operand.name) if operand.paths else None
     if operand.numbers is not None:
-        return exact(operand.numbers[configuration - 1], str(operand), place)
-    return one_line(str(operand.values()[configuration - 1]), str(operand), place).replace('"', "'")
+        number = operand.numbers[k]
+        if operand.name == "THIC" and operand.number == 0 and number.ndim == 0 and float(number) == math.inf:
+            return repr(FAR)
+        text = exact(number, str(operand), place)
+        return text if row is None else _in_file_unit(text, operand, row, lens)
+    content = operand.values()[k]
+    if row is None:
+        return one_line(str(content), str(operand), place).replace('"', "'")
+    if row.kind == GLASS:
+        line = _glass(operand.media[k], place)
+        return line[0].split()[row.word] if line else ""
+    if row.kind == SIZE:
+        return "0" if content is None else _in_file_unit(exact(content, str(operand), place), operand, row, lens)
+    if row.kind == AIMING and content in AIMINGS:
+        content = AIMINGS.index(content)
+    return one_line(str(content if row.kind in (AIMING, TEXT) else int(content)), str(operand), place).replace('"', "'")
 
 
-def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> list[str]:
-    """The lines of a surface with the pickups by which it follows operands of other surfaces.
-
-    Raises LensFileError for a pickup that a .zmx file is not known to have.
-    """
-    for operand in lens.operands:
-        first = operand.paths[0].path if operand.paths else ()
-        for path, factor, offset in operand.paths[1:]:
-            if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
-                continue
-            name = "PRAM" if operand.name.startswith("PAR") else operand.name
-            if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
-                raise LensFileError(f"follows {operand} by a rule that is not written", place)
-            start = {"PRAM": f"PPAR {operand.parameter}", "THIC": "PZUP", "CRVT": "CURV", "GLSS": "GLAS"}[name]
-            line = next((line.split() for line in lines if f"{line} ".startswith(f"  {start} ")), [])
-            if name in ("PRAM", "THIC"):
-                if not line:  # else a solve of the surface itself is written already
-                    lines = [*lines, f"  {start} {operand.number} {factor!r} {offset!r} 0"]
-            elif line[2:3] not in (["0"], ["1"], []):
-                continue
-            elif name == "GLSS":
-                lines = changed(with_glass_line(lines), "GLAS", {2: "2", 3: str(operand.number)})
-            elif offset:
-                raise LensFileError(f"follows {operand} with an offset, which is not written", place)
-            else:
-                lines = changed(lines, "CURV", {2: "4", 3: str(operand.number), 4: repr(factor), 5: "0"})
-    return lines
+def _in_file_unit(text: str, operand: Operand, row: ValueRow, lens: Lens) -> str:
+    """A number of an operand in powers of mm as the file has it."""
+    unit, power = 1.0 if lens.optimization_data is None else lens.optimization_data.unit, power_of(row, lens)
+    if not row.path:
+        parameter = int(operand.name[3]) if operand.name[:3] == "PAR" else operand.parameter
+        power = types()[type_of(lens.surfaces[operand.number])].power(row.keyword, parameter)
+        text = spelled_inverse(float(text)) if power is INVERSE else text
+    return text if unit == 1 or power == 0 else in_file(text, power, unit)

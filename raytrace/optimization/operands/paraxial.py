@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, quotient, value_of
+from raytrace.maths.numerics import Dual, quotient, value_of
 from raytrace.optimization.lens_state import LensState, largest_field, listed
 from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues, need
 from raytrace.optimization.operands.rays import known
