@@ -1,6 +1,8 @@
-"""Effective focal lengths of a folder of lens files, as raytrace and as Optiland 0.6.3 read them, against a table of answers.
+"""Effective focal lengths of a folder of lens files, as raytrace and Optiland 0.6.3 read them, against answers.
 
-python docs/experiments/corpus_optiland.py FOLDER ANSWERS.json     {file: {"paraxial_at_own_index": {"efl": {"own": …}}}}
+    python docs/experiments/corpus_optiland.py FOLDER ANSWERS.json
+
+The answers: {file: {"paraxial_at_own_index": {"efl": {"own": …, "efl_air": …, "oracle": whether it is certain}}}}.
 """
 
 import contextlib
