@@ -36,7 +36,6 @@ from raytrace.io.source import (
     Record,
     by_word,
     double,
-    exact,
     integer,
     is_infinite,
     is_number,
@@ -699,7 +698,7 @@ def environment(system: Block) -> Environment | None:
     record = system.last("ENVD")
     if record is None or not record.integer(2, "whether indices follow the environment", 0):
         return None
-    return environment_at((record.number(0, "temperature"), record.number(1, "pressure")), record.place)
+    return environment_at([ROWS[name].read(record) for name in ENVIRONMENT_OPERANDS], record.place)
 
 
 def report_environment(sections: Sections, lens: Lens, report: Draft) -> None:
@@ -726,8 +725,7 @@ def environment_line(lens: Lens, place: Place) -> str:
     """The line of ENVD."""
     if lens.environment is None:
         return "ENVD 20 1 0"
-    values = (exact(getattr(lens.environment, name), name, place) for name in ENVIRONMENT_OPERANDS.values())
-    return " ".join(["ENVD", *values, "1"])
+    return " ".join(["ENVD", *(ROWS[name].write(lens, place) for name in ENVIRONMENT_OPERANDS), "1"])
 
 
 def is_of_surfaces(operand: Operand) -> bool:

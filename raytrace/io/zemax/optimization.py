@@ -46,7 +46,6 @@ from raytrace.io.source import (
 from raytrace.io.zemax.configurations import STATUSES, VARIABLE
 from raytrace.io.zemax.surfaces import (
     BLANK,
-    FIRST_TERM,
     INVERSE,
     SYSTEM_IGNORED,
     TAIL_REASON,
@@ -136,8 +135,7 @@ class TypedSurface(NamedTuple):
         return self.row.names(self.surface, self.numbers, keyword, j)
 
     def code(self, keyword: str) -> int:
-        record = self.block.last(keyword)
-        return record.integer(1, "code", 0) if record else 0
+        return self.block.integer(keyword, "code", 0, 1)
 
     def numbered(self, keyword: str) -> list[tuple[int, Record]]:
         """The records of a keyword in the order of their numbers."""
@@ -150,7 +148,7 @@ class TypedSurface(NamedTuple):
         """The rule of a code, and the surface that it refers to."""
         code = self.code(keyword)
         refers = code in kinds and kinds[code] != "substitute"
-        source = self.block.last(keyword).integer(2, "surface", 0) if refers else 0
+        source = self.block.integer(keyword, "surface", 0, 2) if refers else 0
         return self.solve(quantity, kinds.get(code, f"code {code}"), source=source)
 
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
@@ -360,13 +358,9 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
     """The lens with every number modelled that may change: variables, and solves and pickups of them."""
 
     def modelled(typed: TypedSurface, name: str) -> Surface:
-        if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
-            data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
-            for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
-                named, like = typed.names(keyword, j)
-                if name in [number.name for number in named]:
-                    return like
-        return typed.surface
+        if name in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
+            return typed.surface
+        return typed.row.named(typed.surface, typed.numbers).get(name, ("", 0, typed.surface))[2]
 
     moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
     for solve in data.solves:
@@ -502,7 +496,9 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
             code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
         lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
     rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
-    parameters = _parameters(lens.surfaces[number]) if rules else {}
+    row, surface = types().get(type_of(lens.surfaces[number]) or ""), lens.surfaces[number]
+    has_numbers = bool(rules) and row is not None
+    parameters = row.named(surface, row.numbers(surface)._replace(size=surface.semi_diameter)) if has_numbers else {}
     for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
@@ -610,7 +606,7 @@ def with_glass_line(lines: Lines) -> Lines:
 
 def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: Place) -> Lines:
     keyword, _, j = rule.quantity.partition(" ")
-    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))
+    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))[:2]
     if not keyword:
         raise _unheld(rule, place)
     is_variable = isinstance(rule, Vary) or rule.kind == "variable"
@@ -626,19 +622,6 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
     else:
         line = " ".join([f"PPAR {j}", *map(_spelled, rule.numbers)])
     return _behind(lines, f"PARM {j}", line)
-
-
-def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
-    """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
-    row, by_name = types().get(type_of(surface) or ""), {}
-    if row is None:
-        return by_name
-    numbers = row.numbers(surface)._replace(size=surface.semi_diameter)
-    data = 0 if numbers.terms is None else len(numbers.terms)
-    for keyword, j in (*(("PARM", j) for j in row.parameters), *(("XDAT", FIRST_TERM + k) for k in range(data))):
-        for named in row.names(surface, numbers, keyword, j)[0]:
-            by_name.setdefault(named.name, (keyword, j))
-    return by_name
 
 
 def _unheld(rule: Vary | Solve, place: Place) -> LensFileError:

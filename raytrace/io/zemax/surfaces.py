@@ -33,6 +33,7 @@ from raytrace.io.source import (
     UnsupportedSurface,
     by_word,
     double,
+    exact,
     is_infinite,
     nonzero,
     refuse_surplus,
@@ -43,7 +44,8 @@ from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Path as LensPath
-from raytrace.system.configurations import same
+from raytrace.system.configurations import part, same
+from raytrace.system.lens import Lens
 from raytrace.system.parameter_paths import ParameterPath, parameter_paths
 from raytrace.system.phases import Facets, FringePhase, Grating, Hologram, IdealLens, PolynomialPhase, RadialPhase
 from raytrace.system.poses import Pose, undone
@@ -326,9 +328,14 @@ class ValueRow(NamedTuple):
             return (*steps, (last, number - 1)) if isinstance(last, int) else (*steps, last, (number - 1,))
         return (*(("surfaces", number) if self.of == "surface" else ()), *steps, last)
 
-    def read(self, record: Record, millimetres: float, default: float | None = None) -> float:
+    def read(self, record: Record, millimetres: float = 1.0, default: float | None = None) -> float:
         """The number of a record, in powers of mm."""
         return in_millimetres(record.number(self.word - 1, self.quantity, default), self.power, millimetres)
+
+    def write(self, holder: Surface | Lens, place: Place) -> str:
+        """The number that a surface, or a lens, holds, in powers of mm; 0 where it is not modelled."""
+        steps = tuple(int(step) if step.isdigit() else step for step in self.path.split("."))
+        return exact(part(holder, steps), self.quantity, place)
 
 
 def _field(name: str, path: str, power: int = 0) -> ValueRow:
@@ -586,6 +593,16 @@ class SurfaceType:
         names = {place: name for name, place in parameter_paths(like).items()}
         is_number = keyword == "PARM" or j >= FIRST_TERM
         return tuple(Named(names[place], factor) for place, factor in factors.items() if is_number), like
+
+    def named(self, surface: Surface, numbers: Numbers) -> dict[str, tuple[str, int, Surface]]:
+        """PARM or XDAT of every number of the lens that the type gives, by its name, and a surface that models it."""
+        terms = 0 if numbers.terms is None else len(numbers.terms)
+        found: dict[str, tuple[str, int, Surface]] = {}
+        for keyword, j in (*(("PARM", j) for j in self.parameters), *(("XDAT", FIRST_TERM + k) for k in range(terms))):
+            names, like = self.names(surface, numbers, keyword, j)
+            for number in names:
+                found.setdefault(number.name, (keyword, j, like))
+        return found
 
     def power(self, keyword: str, j: int) -> int | None:
         """The power of length in PARM j, or in XDAT j."""
