@@ -31,10 +31,11 @@ from raytrace.io.ray_tables import RayTableError, read_rays
 from raytrace.materials.agf import CatalogError, read_agf
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import ImplausibleWavelength, InvalidIndex
+from raytrace.maths.arrays import ArrayError, read_npy, read_npz
 from raytrace.system.configurations import count
 from raytrace.wave_optics.element import Pixels, Rings
 from raytrace.wave_optics.height_maps import FORMATS as HEIGHTS
-from raytrace.wave_optics.height_maps import ArrayError, HeightMapError, read_heights, read_npy, write_heights
+from raytrace.wave_optics.height_maps import HeightMapError, read_heights, write_heights
 
 ROOT = Path(__file__).parents[1]
 
@@ -186,21 +187,21 @@ def logs(folder: Path) -> Reader:
 def settings(folder: Path) -> Reader:
     values = {"a": 1, "world": {"b": [1.5, 2]}, "name": "x"}
     run = Run(folder / "run", values)
-    written = run.folder / "settings.json"
+    written = run.path / "settings.json"
     return Reader(
         (written.read_bytes(),),
-        from_file(lambda _: Run(run.folder, values), written),
+        from_file(lambda _: Run(run.path, values), written),
         (DamagedRun, OtherSettings),
     )
 
 
 def arrays(folder: Path) -> Reader:
     originals = []
-    for array in (np.zeros((9, 9)), np.asfortranarray(np.eye(3, 2)), np.array("PMMA")):
+    for save in (np.savez, np.savez_compressed):
         stream = io.BytesIO()
-        np.save(stream, array)
+        save(stream, heights=np.zeros((9, 9)), pitch=0.1, glass="PMMA")
         originals.append(stream.getvalue())
-    return Reader(tuple(originals), read_npy, (ArrayError,))
+    return Reader(tuple(originals), read_npz, (ArrayError,))
 
 
 READERS = {
@@ -208,7 +209,7 @@ READERS = {
     "zar": archives,
     "len": oslo,
     "pictures": pictures,
-    "npy": arrays,
+    "npz": arrays,
     "rays": rays,
     "checkpoints": checkpoints,
     "logs": logs,
@@ -257,22 +258,28 @@ def test_an_array_that_announces_more_than_follows_is_refused():
         read_npy(stream.getvalue())
 
 
-def test_an_archive_is_no_npy(tmp_path):
+def test_an_archive_is_no_npy_and_a_bomb_no_npz(tmp_path):
     path = tmp_path / "map.npy"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.npy", b"")
     with pytest.raises(HeightMapError, match=r"map\.npy: is no \.npy file"):
         read_heights(path)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", bytes(10**6))
+    content = bytearray(stream.getvalue())
+    entry = content.index(b"PK\x01\x02")
+    content[entry + 24 : entry + 28] = (2**32 - 2).to_bytes(4, "little")  # announces 4 GB
+    with pytest.raises(ArrayError):
+        read_npz(bytes(content))
 
 
 def test_arrays_come_back(tmp_path):
     given = {"heights": np.arange(6.0).reshape(2, 3), "by_columns": np.asfortranarray(np.eye(3, 2)), "glass": "PMMA"}
-    with open(tmp_path / "all.npy", "wb") as file:
-        for array in (np.zeros((0, 3)), *given.values()):
-            np.save(file, array)
-    empty, *found = read_npy((tmp_path / "all.npy").read_bytes())
-    assert empty.shape == (0, 3)
-    assert all(np.array_equal(*pair) for pair in zip(found, given.values(), strict=True))
+    np.savez_compressed(tmp_path / "a.npz", empty=np.zeros((0, 3)), **given)
+    found = read_npz((tmp_path / "a.npz").read_bytes())
+    assert found.keys() == {"empty", *given}
+    assert all(np.array_equal(found[name], given[name]) for name in given)
     np.save(tmp_path / "a.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(ArrayError, match="expected numbers"):
         read_npy((tmp_path / "a.npy").read_bytes())

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_training import fit
 
 import raytrace as rt
 from raytrace import shards
@@ -80,8 +81,11 @@ def cases() -> dict[str, dict[str, np.ndarray]]:
 
 
 def work(folder: str) -> None:
-    """What each process of `test_two_processes_compute_what_one_does` runs."""
+    """Each process of `test_two_processes_compute_and_train_as_one_does`: kernels, ten steps of training, an error."""
     with shards.processes() as share:
+        weights = fit(Path(folder, "training of two"), 10)
+        if share.rank == 0:
+            torch.save(weights, Path(folder, "weights.pt"))
         found = {f"{name}/{key}": t for name, numbers in cases().items() for key, t in numbers.items()}
         np.savez(Path(folder, f"{share.rank}.npz"), **found)
         try:
@@ -132,8 +136,11 @@ def run_function(call: str, *, folder: Path, processes: int = 2) -> subprocess.C
 # ---------------------------------------------------------------- several processes
 
 
-def test_two_processes_compute_what_one_does(tmp_path):
-    """Every model, each axis of a scene cut in turn, to rounding and in both processes; an error of one is of all."""
+def test_two_processes_compute_and_train_as_one_does(tmp_path):
+    """One start of torchrun. Kernels of every model, each axis of a scene cut in turn, to rounding in both processes;
+
+    weights after ten steps of Adam, to 1e-12; an error of one process is raised in all.
+    """
     done = run_function(f"work({str(tmp_path)!r})", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     together = [np.load(tmp_path / f"{rank}.npz") for rank in range(2)]
@@ -144,6 +151,7 @@ def test_two_processes_compute_what_one_does(tmp_path):
             # An estimated error is a small difference of sums, and stands for two digits.
             close = 1e-9 if key == "error" else ROUNDING
             np.testing.assert_allclose(first, expected, rtol=close, atol=close, err_msg=f"{name}: {key}")
+    torch.testing.assert_close(torch.load(tmp_path / "weights.pt"), fit(tmp_path / "one", 10), atol=1e-12, rtol=1e-12)
     assert (tmp_path / "0.txt").read_text() == "FailedElsewhere: the share of 1 makes no sense"
     assert (tmp_path / "1.txt").read_text() == "ValueError: the share of 1 makes no sense"
 

@@ -6,6 +6,7 @@
 | sampling  | points and weights on the unit disc (Gauss, hexapolar, Sobol …): table SAMPLINGS; pixel grids   |
 | zernike   | Zernike polynomials: Noll, ANSI and fringe indices, values, gradients, fits                    |
 | bivariate | polynomials in x and y with derivatives                                                        |
+| arrays    | .npy and .npz files, read with care                                                            |
 | result    | results of public functions: columns, text, document, frame                                    |
 
 To add a sampling: a function of one size that returns points (2, P) and weights (P,), and a row of SAMPLINGS.

@@ -17,6 +17,7 @@ from raytrace.materials.environment import (
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
 from raytrace.maths.numerics import check_precision, value
+from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand
@@ -395,8 +396,7 @@ def with_field_kind(lens: Lens, kind: str) -> Lens:
 
 def name_of_field(field: Tensor) -> str:
     """A field point (2,) in words: its y alone on the axis of x."""
-    x, y = field.tolist()
-    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+    return point_text(*field.tolist())
 
 
 def field_label(lens: Lens, field: Sequence[float]) -> str:

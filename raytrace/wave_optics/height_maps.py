@@ -16,7 +16,6 @@ import io
 import json
 import math
 import os
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,15 +27,11 @@ from PIL import Image, PngImagePlugin
 
 from raytrace.files import read_bytes, write_atomically
 from raytrace.io.pictures import PictureError, decoded
+from raytrace.maths.arrays import LARGEST, ArrayError, read_npy
 from raytrace.wave_optics.element import Pixels, Rings
 
 Map = Pixels | Rings
 
-#: Bytes of memory that the arrays of one file may take.
-_LARGEST = 2**32
-
-_NUMBERS_AND_TEXTS = "biufSU"  # truth, whole and real numbers, texts
-_FORMAT = np.lib.format
 #: The largest grey value of 16 bits.
 _WHITE = 65535
 #: At most so many different heights are listed in a picture's description, to be read back exactly.
@@ -82,7 +77,7 @@ def read_heights(
     file = str(path)
     form = _format(file)
     try:
-        content = read_bytes(path, _LARGEST)
+        content = read_bytes(path, LARGEST)
     except OSError as error:
         raise HeightMapError(f"cannot be read: {error.strerror or error}", file) from error
     if not content:
@@ -108,45 +103,6 @@ def write_heights(profile: Map, path: str | os.PathLike) -> None:
         write_atomically(path, lambda stream: stream.write(content))
     except OSError as error:
         raise HeightMapError(error.strerror or str(error), file) from error
-
-
-class ArrayError(ValueError):
-    """Bytes that hold no array of numbers or texts, in one line."""
-
-
-def read_npy(content: bytes) -> list[np.ndarray]:
-    """The arrays that stand one after another in the bytes of an .npy file. Raises ArrayError."""
-    stream, found = io.BytesIO(content), []
-    while not found or stream.tell() < len(content):
-        found.append(_next_array(stream, len(content)))
-    return found
-
-
-def _next_array(stream: io.BytesIO, length: int) -> np.ndarray:
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            version = _FORMAT.read_magic(stream)
-            readers = {(1, 0): _FORMAT.read_array_header_1_0, (2, 0): _FORMAT.read_array_header_2_0}
-            shape, by_columns, kind = readers[version](stream)
-    except Exception as error:  # the header is Python's text: parsing it raises all that parsing Python can
-        raise ArrayError(f"no .npy array, damaged or cut off ({_words(error)})") from error
-    if kind.kind not in _NUMBERS_AND_TEXTS or kind.hasobject:
-        raise ArrayError(f"an array of {kind}; expected numbers")
-    if not all(isinstance(part, int) and part >= 0 for part in shape) or len(shape) > 32:
-        raise ArrayError(f"an array of the shape {str(shape)[:60]}")
-    count = math.prod(shape)
-    size = count * kind.itemsize
-    if size > length - stream.tell():
-        raise ArrayError(f"an array of {count} numbers announced, but only {length - stream.tell()} bytes follow")
-    array = np.frombuffer(stream.read(size), kind, count) if size else np.zeros(count if count < _LARGEST else 0, kind)
-    try:
-        return array.reshape(shape, order="F" if by_columns else "C")
-    except ValueError as error:
-        raise ArrayError(f"an array of the shape {str(shape)[:60]}") from error
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _write_npy(profile: Map, file: str) -> bytes:
