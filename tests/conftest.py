@@ -1,4 +1,4 @@
-"""Loads the fixtures of `shared_fixtures.py`, except in the process of `pytest -n` that only distributes tests to workers."""
+"""Loads `shared_fixtures.py`, except in the process of `pytest -n` that only distributes tests to its workers."""
 
 import os
 

@@ -80,7 +80,7 @@ def test_every_kind_of_surface_and_of_loss(dtype, with_path):
 
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
 @pytest.mark.parametrize("with_path", [True, False])
-def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
+def test_the_adjoint_equals_autograd(dtype, close, with_path):
     """By every number of the lens and by the rays, of a merit in which all that comes out has a weight."""
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(dtype=dtype)
     generator = torch.Generator().manual_seed(1)
@@ -208,7 +208,7 @@ def test_populations_and_wavelengths_get_rows_of_their_own(axes):
     assert_close(by_compiled, by_eager, rtol=1e-10, atol=1e-8)
 
 
-def test_what_differs_along_the_last_axis_is_left_to_torch():
+def test_numbers_that_differ_by_ray_are_left_to_torch():
     rays = some_rays(3)
     surfaces = [surface(vector(0.01, 0.02, 0.03), 5.0, 1.5)]
     how = {"indices": [scalar(1.0), scalar(1.5)], "side": 1, "gap": None}
