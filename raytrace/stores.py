@@ -216,14 +216,18 @@ def parsed(content: bytes) -> object:
 
 
 def read_file(
-    path: str | os.PathLike, decode: Callable[[bytes], object], error: type[ValueError], advice: str, most: int = _MOST
+    path: str | os.PathLike,
+    decode: Callable[[bytes], object],
+    error: type[ValueError],
+    advice: str,
+    most: int | None = None,
 ) -> object:
-    """The decoded content of a regular file of at most `most` bytes; decode raises Unfit.
+    """The decoded content of a regular file of at most `most` bytes (default 1 GiB); decode raises Unfit.
 
     Raises OSError, and `error` with the file, its line, and the advice how to resume.
     """
     try:
-        return decode(read_bytes(path, most))
+        return decode(read_bytes(path, _MOST if most is None else most))
     except Unfit as reason:
         place = f"{path}, line {reason.line}" if reason.line else f"{path}"
         raise error(f"{place}: {reason}; {advice}") from reason
