@@ -85,6 +85,7 @@ REFUSED = {
     "'b' is missing": (record({"a": number(), "b": text}), {"a": 1}),
     "a: b: found": (record({"a": record({"b": text})}), {"a": {"b": 2}}),
     "c: found": (record({}, {"c": text}), {"c": 2}),
+    "found a list of 1, expected names and values": (record({}, {"c": text}), ["c"]),
     'found "d", expected "a" or null': (exactly("a", None), "d"),
     "expected a text": (either(number(), text), []),
     "found 'colour', expected model": (fields_of(Outcome), {"colour": 1}),

@@ -12,6 +12,8 @@ processes.
 | gaussian | centroid and covariance of traced rays                                          | gaussian.py    |
 | drt      | all traced rays: geometric optics                                               | drt.py         |
 | wave     | the traced wavefront: diffraction with the true aberrations                     | wave.py        |
+
+`drt.reference` and `direct_sum.reference` compute converged kernels of geometric optics and of waves, to compare with.
 """
 
 from raytrace.psf_models.figures import CloseUp as CloseUp
