@@ -403,7 +403,7 @@ class Records(Store):
         self.lines = None if path is None else Lines(path, check, head=mapped(anything))
 
     def read(self) -> list[tuple[int, object]]:
-        """Every record with the number of its line; the file is begun where there is none.
+        """Every record with the number of its line; a missing file is started.
 
         Warns DamagedLine. Raises OSError and the errors of the kind.
         """

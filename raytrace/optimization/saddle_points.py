@@ -130,7 +130,7 @@ def with_meniscus(lens: Lens, k: int) -> Lens:
 
 
 def _behind(surface: int, k: int) -> int:
-    """The number of a surface once two more stand before surface k."""
+    """The number of a surface after two surfaces are inserted before surface k."""
     return surface + 2 if surface >= k else surface
 
 
