@@ -240,7 +240,7 @@ def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k
     curves = np.linalg.eigvalsh(found.curves)
     assert curves[0] < -1e-9 < curves[1]
     for sign in (1.0, -1.0):
-        state = stage.problem.state(place.beside(stage, sign), False)
+        state = stage.problem.state(place.displaced(stage, sign), False)
         assert np.sqrt(state.cost) < size
         assert np.abs(state.held).max() < 1e-9
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from raytrace import stores
 from raytrace.experiments import Store
 from raytrace.files import append_text
 from raytrace.imaging.codesign import Outcome
@@ -84,6 +85,7 @@ REFUSED = {
     "'b' is missing": (record({"a": number(), "b": text}), {"a": 1}),
     "a: b: found": (record({"a": record({"b": text})}), {"a": {"b": 2}}),
     "c: found": (record({}, {"c": text}), {"c": 2}),
+    "found a list of 1, expected names and values": (record({}, {"c": text}), ["c"]),
     'found "d", expected "a" or null': (exactly("a", None), "d"),
     "expected a text": (either(number(), text), []),
     "found 'colour', expected model": (fields_of(Outcome), {"colour": 1}),
@@ -323,6 +325,14 @@ def test_a_store_does_not_wait_for_a_pipe(name, tmp_path):
         path.unlink()
     os.mkfifo(path)
     with pytest.raises(OSError, match="is not a regular file"):
+        STORES[name](tmp_path / "kept", IDENTITY)
+
+
+@pytest.mark.parametrize("name", STORES)
+def test_a_store_reads_no_file_above_its_bound(name, tmp_path, monkeypatch):
+    STORES[name](tmp_path / "kept", IDENTITY)
+    monkeypatch.setattr(stores, "_MOST", 8)
+    with pytest.raises(OSError, match="is larger than"):
         STORES[name](tmp_path / "kept", IDENTITY)
 
 
