@@ -442,13 +442,6 @@ class Parameter(NamedTuple):
     followers: Mapping[ParameterPath, float] = {}
 
 
-class Named(NamedTuple):
-    """A number of the lens by its name in `parameter_paths`: factor times the number of the file in mm."""
-
-    name: str
-    factor: float
-
-
 @dataclasses.dataclass(frozen=True)
 class SurfaceType:
     """A TYPE.
@@ -587,12 +580,12 @@ class SurfaceType:
         held = parameter_paths(like).values()
         return {place: factor for place, factor in factors.items() if place in held}, like
 
-    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
+    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[dict[str, float], Surface]:
         """`places` by the names of the numbers; without the radius that normalises terms, which is no variable."""
         factors, like = self.places(surface, numbers, keyword, j)
         names = {place: name for name, place in parameter_paths(like).items()}
         is_number = keyword == "PARM" or j >= FIRST_TERM
-        return tuple(Named(names[place], factor) for place, factor in factors.items() if is_number), like
+        return {names[place]: factor for place, factor in factors.items() if is_number}, like
 
     def named(self, surface: Surface, numbers: Numbers) -> dict[str, tuple[str, int, Surface]]:
         """PARM or XDAT of every number of the lens that the type gives, by its name, and a surface that models it."""
@@ -600,8 +593,8 @@ class SurfaceType:
         by_name: dict[str, tuple[str, int, Surface]] = {}
         for keyword, j in (*(("PARM", j) for j in self.parameters), *(("XDAT", FIRST_TERM + k) for k in range(terms))):
             names, like = self.names(surface, numbers, keyword, j)
-            for number in names:
-                by_name.setdefault(number.name, (keyword, j, like))
+            for name in names:
+                by_name.setdefault(name, (keyword, j, like))
         return by_name
 
     def power(self, keyword: str, j: int) -> int | None:
