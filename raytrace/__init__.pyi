@@ -56,11 +56,11 @@ from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import MIRROR as MIRROR
 from raytrace.materials.glass import refractive_index as refractive_index
 from raytrace.materials.properties import glass as glass
-from raytrace.maths.grid import grid as grid
-from raytrace.maths.pupil import gauss_rings as gauss_rings
-from raytrace.maths.pupil import hexapolar as hexapolar
-from raytrace.maths.pupil import sobol as sobol
-from raytrace.maths.value import to as to
+from raytrace.maths.numerics import to as to
+from raytrace.maths.sampling import gauss_rings as gauss_rings
+from raytrace.maths.sampling import grid as grid
+from raytrace.maths.sampling import hexapolar as hexapolar
+from raytrace.maths.sampling import sobol as sobol
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.merit import BadMerit as BadMerit
@@ -107,7 +107,6 @@ from raytrace.tracing.base_ray import BaseRay as BaseRay
 from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiled import prepare as prepare
 from raytrace.tracing.compiled import trace_engine as trace_engine
-from raytrace.tracing.jacobian import hit_jacobian as hit_jacobian
 from raytrace.tracing.launch import UnfilledStop as UnfilledStop
 from raytrace.tracing.launch import rays as rays
 from raytrace.tracing.lens_report import info as info
@@ -120,6 +119,7 @@ from raytrace.tracing.ray_listing import trace as trace
 from raytrace.tracing.scene import Memo as Memo
 from raytrace.tracing.spot import Spot as Spot
 from raytrace.tracing.streaming import mean_square_gradient as mean_square_gradient
+from raytrace.tracing.trace import hit_jacobian as hit_jacobian
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf
 from raytrace.wave_optics.element_files import read_element as read_element

@@ -13,8 +13,8 @@ from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS
 from raytrace.io.source import Place, decode
-from raytrace.tracing.aiming import aiming_of, at_stop
 from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
+from raytrace.tracing.trace import aiming_of, at_stop
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 

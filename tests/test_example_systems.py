@@ -7,7 +7,7 @@ import torch
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.maths.pupil import fan
+from raytrace.maths.sampling import fan
 
 EXAMPLES = sorted(path.stem for path in (shipped("lenses") / "examples").glob("*.zmx"))
 

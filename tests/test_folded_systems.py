@@ -11,9 +11,9 @@ from differences import gradcheck
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
-from raytrace.tracing.aiming import Bent
 from raytrace.tracing.focus import along_normal, focus_of_rms
 from raytrace.tracing.scene import symmetry
+from raytrace.tracing.trace import Bent
 from raytrace.tracing.wavefront import rms, wavefront_of
 
 FIELDS = [0.0, 7.0, 14.0]

@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 import raytrace as rt
 from raytrace.materials.glass import MIRROR
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.poses import Pose
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface

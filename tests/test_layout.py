@@ -8,7 +8,7 @@ import torch
 
 import raytrace as rt
 from raytrace.analysis import cross_section
-from raytrace.maths.pupil import fan
+from raytrace.maths.sampling import fan
 from raytrace.system.surface import sag_at
 from raytrace.tracing.geometry import frames
 

@@ -8,7 +8,7 @@ import torch
 from problems import number
 
 from raytrace.io import read_lens
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models import Execution, Gaussian, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture

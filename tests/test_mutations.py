@@ -187,10 +187,10 @@ def logs(folder: Path) -> Reader:
 def settings(folder: Path) -> Reader:
     values = {"a": 1, "world": {"b": [1.5, 2]}, "name": "x"}
     run = Run(folder / "run", values)
-    written = run.folder / "settings.json"
+    written = run.path / "settings.json"
     return Reader(
         (written.read_bytes(),),
-        from_file(lambda _: Run(run.folder, values), written),
+        from_file(lambda _: Run(run.path, values), written),
         (DamagedRun, OtherSettings),
     )
 

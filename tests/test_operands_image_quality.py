@@ -10,7 +10,7 @@ from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
 from raytrace.io import LensFileWarning
-from raytrace.maths.pupil import gauss_rings, square
+from raytrace.maths.sampling import gauss_rings, square
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.operand import BadRow, Measure
 from raytrace.optimization.variables import Model

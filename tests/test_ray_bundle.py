@@ -9,7 +9,7 @@ import torch
 import raytrace as rt
 from raytrace.files import shipped
 from raytrace.materials.glass import model_glass
-from raytrace.maths.dual import Dual
+from raytrace.maths.numerics import Dual
 from raytrace.optimization.lens_state import Bundle
 from raytrace.optimization.variables import Model
 from raytrace.system.lens import with_field_kind

@@ -10,7 +10,7 @@ from test_operands_boundaries import semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.lens_state import SOLVES
 from raytrace.optimization.variables import Model, freedom
 from raytrace.system import configurations

@@ -9,8 +9,7 @@ from differences import gradcheck
 from problems import double_gauss, lens, scalar, surface, vector
 
 from raytrace.materials.glass import constant
-from raytrace.maths.grid import centres, grid
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import centres, gauss_rings, grid
 from raytrace.psf_models import DRT, psf, wave
 from raytrace.system import sag_terms as sag_terms
 from raytrace.system.lens import Lens, media, with_sensor_distance

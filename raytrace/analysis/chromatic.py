@@ -6,7 +6,7 @@ from torch import Tensor
 from raytrace.analysis.panels import chart, drawn_at_least, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order
@@ -54,7 +54,8 @@ class ChromaticFocalShift(Analysis):
 def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: int = 101) -> ChromaticFocalShift:
     """The paraxial focus over wavelength, as -n y/ω of the axial marginal ray, along the light.
 
-    wavelengths: µm, of which the first is primary; `samples` go over their range, by default that of the lens's own.
+    wavelengths: µm, of which the first is primary; samples: wavelengths of the curve, over their range, by default that
+    of the lens's own.
     Raises NothingToShow for a lens of a single
     wavelength, and for one without an image.
     """

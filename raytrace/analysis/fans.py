@@ -1,5 +1,7 @@
 """Fans: transverse ray aberration and OPD along the two principal sections of the pupil."""
 
+from typing import Literal
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -7,9 +9,9 @@ from torch import Tensor
 from raytrace.analysis.panels import by_wavelength, drawn_at_least, field_labels, finished, ruled, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting
-from raytrace.maths.pupil import fan as pupil_fan
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, masked
-from raytrace.maths.value import value
+from raytrace.maths.sampling import fan as pupil_fan
 from raytrace.plotting.style import GREY, array, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
@@ -89,12 +91,13 @@ def opd_fan(
     fields: Points = None,
     wavelengths: Numbers = None,
     points: int = 41,
-    reference: str = "primary",
+    reference: Literal["primary", "own"] = "primary",
 ) -> Fan:
     """OPD in waves against the chief ray of each wavelength; arguments as for `ray_fan`.
 
-    reference: the sphere, "primary": about the point of the primary wavelength for all, so that lateral colour shows as
-    tilt and axial colour as defocus; "own": about each wavelength's own point, which takes lateral colour out.
+    points: rays across the pupil; reference: the sphere, "primary": about the point of the primary wavelength for all,
+    so that lateral colour shows as tilt and axial colour as defocus; "own": about each wavelength's own point, which
+    takes lateral colour out.
     """
     lens, fields = setting(lens, fields, wavelengths)
     front = _front(lens, fields, points, reference)

@@ -23,10 +23,9 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import axis
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.result import Table, axis
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
@@ -78,8 +77,8 @@ class Mtf(Analysis):
     def drawn(self) -> "Mtf":
         return _mtf(self.lens, self.fields, fine(self.frequencies), self.by_rays)
 
-    def __str__(self) -> str:
-        return "\n".join([Analysis.__str__(self), *_remarks(self)])
+    def tables(self) -> list[Table]:
+        return _tables(self)
 
     @styled
     def draw(self):
@@ -118,8 +117,8 @@ class ThroughFocusMtf(Analysis):
     def about(self) -> dict:
         return {"transfer": transfer(self)}
 
-    def __str__(self) -> str:
-        return "\n".join([Analysis.__str__(self), *_remarks(self)])
+    def tables(self) -> list[Table]:
+        return _tables(self)
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -160,12 +159,13 @@ def mtf(
         OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              diffraction
         OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      geometric
 
-    geometric: True or False; by default diffraction, except for a field that would need more than 1280 points across
-    the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted to change by at most 1e-3
-    at every frequency: that field is geometric, as `by_rays` reports.
-    The wavelengths' OTFs add by weight and transmitted light, each at its own place on the sensor: lateral colour
-    counts. through_focus: mm by which the sensor moves to either side, of one frequency. fields: y or (x, y);
-    wavelengths: µm. Raises ValueError where too few rays arrive or the blur is too large.
+    geometric: of rays alone, or always of diffraction; by default of diffraction, except for a field that would need
+    more than 1280 points across the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted
+    to change by at most 1e-3 at every frequency: that field is geometric, as `by_rays` reports. The wavelengths' OTFs
+    add by weight and transmitted light, each at its own place on the sensor: lateral colour counts. frequencies:
+    cycles/mm, by default 41 from 0 to the resolution of the sharpest field, at most half of the diffraction cutoff;
+    through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
+    ValueError where too few rays arrive or the blur is too large.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
@@ -259,11 +259,11 @@ def transfer(found: Mtf | ThroughFocusMtf) -> str:
     return f"diffraction (geometric for {names})"
 
 
-def _remarks(found: Mtf | ThroughFocusMtf) -> list[str]:
-    """A line of text on fields that are geometric unasked."""
-    if not bool(found.by_rays.any()):
-        return []
-    return [f"transfer: {transfer(found)}"]
+def _tables(found: Mtf | ThroughFocusMtf) -> list[Table]:
+    """The table, with a line on fields that are geometric by default."""
+    table = found.thinned(found.columns(), found.EVERY)
+    note = [f"transfer: {transfer(found)}"] if bool(found.by_rays.any()) else []
+    return [table._replace(notes=[*table.notes, *note])]
 
 
 def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, cell, rows
-from raytrace.maths.value import value
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import Model

@@ -1,6 +1,6 @@
 """LensState: a lens in one configuration at given variables: its numbers, first-order data and rays, with derivatives.
 
-Numbers are plain, or dual (`maths.dual`) where derivatives are computed; the formulas are the same. SOLVES computes
+Numbers are plain, or dual (`maths.numerics`) where derivatives are computed; the formulas are the same. SOLVES computes
 the numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
 
 A `Bundle` launches and traces all rays of a merit function's rows in one pass. Rays start as in `tracing.launch`. Rays
@@ -22,18 +22,15 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from raytrace.maths.dual import Dual, Vector, slope_of, value_of
-from raytrace.maths.numerics import dot
+from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import sag_at, signed, vertex_curvature
-from raytrace.tracing.aiming import aiming_of, is_bent
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
-from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
-from raytrace.tracing.trace import sequence_of, trace_surfaces
+from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))

@@ -28,8 +28,8 @@ from numbers import Integral
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.maths.pupil import gauss_legendre
+from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.operands.operand import (
     SETTINGS,
     Conventions,
@@ -44,10 +44,9 @@ from raytrace.optimization.operands.operand import (
 )
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import Model
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
-from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.words import did_you_mean
 
 # -- default merit functions -------------------------------------------------------------------------------------------

@@ -32,8 +32,8 @@ from raytrace.analysis.panels import first_order_text
 from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.files import check_output
 from raytrace.io import write_lens
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, cell, number, plain
-from raytrace.maths.value import detached, value
 from raytrace.optimization.checkpoint import STOPPED, BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.glass_choice import Choice, GlassStep, catalogs_of, pool_of
 from raytrace.optimization.least_squares import (

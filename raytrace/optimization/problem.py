@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.least_squares import Sides, State
 from raytrace.optimization.lens_state import Bundle, LensState, Ray
 from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit

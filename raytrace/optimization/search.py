@@ -21,8 +21,8 @@ from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, cell
-from raytrace.maths.value import detached, value
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
 from raytrace.optimization.optimize import drawn_fields, opened, refuse_contradictions

@@ -37,7 +37,7 @@ from raytrace.materials.glass import (
 )
 from raytrace.optimization.lens_state import LensState, unbent
 from raytrace.system.configurations import same
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, is_round_about_axis, media
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     BadVariables,
@@ -53,7 +53,6 @@ from raytrace.system.parameter_paths import (
 )
 from raytrace.system.phases import power_of
 from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
-from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of

@@ -9,7 +9,7 @@ from functools import reduce
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, value_of
+from raytrace.maths.numerics import Dual, value_of
 from raytrace.optimization.lens_state import listed
 from raytrace.optimization.operands.operand import (
     SETTINGS,

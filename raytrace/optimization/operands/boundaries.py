@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.lens_state import ENDS, Bundle, LensState, largest_field, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from raytrace.maths.dual import Dual, value_of
+from raytrace.maths.numerics import Dual, value_of
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, listed
 from raytrace.optimization.variables import View
 from raytrace.system.lens import Lens

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, quotient, value_of
+from raytrace.maths.numerics import Dual, quotient, value_of
 from raytrace.optimization.lens_state import LensState, largest_field, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,

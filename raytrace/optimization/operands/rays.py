@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.maths.numerics import dot, safe_sqrt
+from raytrace.maths.numerics import Dual, dot, safe_sqrt, slope_of, value_of
 from raytrace.optimization.lens_state import Hits
 from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues, known
 from raytrace.system.intersection import normal

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, Vector, slope_of, value_of
-from raytrace.maths.numerics import dot
-from raytrace.maths.pupil import gauss_rings, square
+from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.sampling import gauss_rings, square
 from raytrace.optimization.lens_state import Hits
 from raytrace.optimization.operands.operand import (
     BadRow,
@@ -29,8 +28,8 @@ from raytrace.optimization.operands.operand import (
     per_row,
 )
 from raytrace.optimization.operands.paraxial import image_index
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere
 
 

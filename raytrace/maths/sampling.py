@@ -1,6 +1,7 @@
-"""Points and weights on the unit disc. Every rule returns points (2, P) and weights (P,) that sum to 1.
+"""Samplings: points and weights on the unit disc, and grids of pixels.
 
-The weights integrate over the area of the disc: Σ w f(x, y) ≈ (1/π) ∬ f dx dy.
+Every rule of the disc returns points (2, P) and weights (P,) that sum to 1 and integrate over its area:
+Σ w f(x, y) ≈ (1/π) ∬ f dx dy.
 """
 
 import functools
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford
+from raytrace.maths.numerics import value
 
 _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
 _POINT_BYTES = 64  # of a point and its weight, with what it takes to make them
@@ -191,3 +193,45 @@ def sampled(
         raise ValueError(f"`{wrong}` belongs to `sampling={takers}`; {sampling} takes `{counted}`")
     own = {"seed": seed} if rule in (sobol, random) else {}
     return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)
+
+
+@value
+class Grid:
+    """rows × columns square pixels.
+
+        x_i = centre_x + (i - (columns - 1)/2)·pitch,   y_j likewise: an odd grid has a pixel at its centre
+
+    pitch: scalar, mm; rows, columns: how many; centre: (2, ...) mm on the sensor, batch axes as those of the kernels.
+    """
+
+    pitch: Tensor
+    rows: int
+    columns: int
+    centre: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.rows, self.columns
+
+
+def grid(pitch: Tensor | float, size: int | tuple[int, int], centre: Tensor | None = None) -> Grid:
+    """A grid of `size` pixels (rows, columns; one number for a square) around `centre`, by default the axis."""
+    rows, columns = (size, size) if isinstance(size, int) else size
+    pitch = torch.as_tensor(pitch, dtype=torch.float64) if not isinstance(pitch, Tensor) else pitch
+    return Grid(pitch, rows, columns, pitch.new_zeros(2) if centre is None else centre)
+
+
+def centres(grid: Grid) -> tuple[Tensor, Tensor]:
+    """x (..., columns) and y (..., rows) of the pixel centres, mm."""
+    return _line(grid, 0, grid.columns, 0.0), _line(grid, 1, grid.rows, 0.0)
+
+
+def edges(grid: Grid) -> tuple[Tensor, Tensor]:
+    """x (..., columns + 1) and y (..., rows + 1) of the pixel edges, mm."""
+    return _line(grid, 0, grid.columns + 1, -0.5), _line(grid, 1, grid.rows + 1, -0.5)
+
+
+def _line(grid: Grid, axis: int, count: int, first: float) -> Tensor:
+    pixels = grid.columns if axis == 0 else grid.rows
+    position = torch.arange(count, dtype=grid.pitch.dtype, device=grid.pitch.device) + (first - 0.5 * (pixels - 1))
+    return grid.centre[axis][..., None] + position * grid.pitch
