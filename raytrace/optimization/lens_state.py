@@ -147,7 +147,7 @@ _CONVERGED = 1e-15  # relative
 
 
 class LensState:
-    """view: `lens_model.View`; variables: (n,) numbers, or a Dual of them."""
+    """view: `variables.View`; variables: (n,) numbers, or a Dual of them."""
 
     def __init__(self, view, variables):
         self.view, self.lens, self.variables = view, view.lens, variables
@@ -338,7 +338,7 @@ class LensState:
             self.__dict__.pop(name, None)
         self._kept.clear()
 
-    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles (`ray_bundle`) -----------
+    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles of rays ---------------
 
     def through_torch(
         self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False, only: Sequence | None = None
@@ -744,7 +744,10 @@ class Bundle:
         count = state.count or max((len(part.slope) for part in moving), default=0)
         if not count:
             return surfaces, task, torch.from_numpy(changes), None, None
-        start = self._start(count, position, direction, opl) if moving else None
+        start = None
+        if moving:
+            slopes = torch.from_numpy(np.stack([slope_of(part, count) for part in (*position, *direction, opl)]))
+            start = slopes[:3], slopes[3:6], slopes[6]
         changes = changes if state.count else np.zeros((count, *table.shape))
         return surfaces, task, torch.from_numpy(changes), start, count
 
@@ -756,10 +759,6 @@ class Bundle:
     def _as_hits(self, state: LensState, parts, valid: np.ndarray) -> Hits:
         slopes = [slope_of(part, state.count) for part in parts] if state.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
-
-    def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
-        slopes = torch.from_numpy(np.stack([slope_of(part, count) for part in (*position, *direction, opl)]))
-        return slopes[:3], slopes[3:6], slopes[6]
 
     def _hits(self, end, count: int | None) -> Hits:
         """The rays of `ask`, from the table of a trace."""
@@ -803,7 +802,8 @@ class Bundle:
     def launched(self, state: LensState):
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
-            return self._launched_by_torch(state)
+            parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
+            return parts[:3], parts[3:6], parts[6], valid
         if not self._aims:
             return self._through(state, self.pupil)
         pupil, found = self._aimed(state)
@@ -853,10 +853,6 @@ class Bundle:
         height = hits.position[1][np.array([0])]
         real = np.abs(height) * np.sign(value_of(paraxial))
         return real[0] if hits.valid[0] else paraxial
-
-    def _launched_by_torch(self, state: LensState):
-        parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
-        return parts[:3], parts[3:6], parts[6], valid
 
     def _start_by_torch(self, lens: Lens) -> Rays:
         field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
