@@ -189,6 +189,18 @@ class LensState:
             return [c + bend for c, bend in zip(self.curvature, self.view.further_power[0], strict=True)]
         return self.through_torch(lambda lens: [vertex_curvature(surface).reshape(()) for surface in lens.surfaces])
 
+    def of_surfaces(self, quantity: str):
+        """A number (S,) of all surfaces, of `View.of_surfaces`; 0 where a surface has none."""
+        stored = self.view.of_surfaces
+        values, slopes = (stored[quantity] if quantity in stored else 0.0 * stored["conic"]).copy(), None
+        for (surface, name), number in self.numbers.items():
+            if name == quantity:
+                values[surface] = value_of(number)
+                if isinstance(number, Dual):
+                    slopes = np.zeros((self.count, len(values))) if slopes is None else slopes
+                    slopes[:, surface] = number.slope
+        return values if slopes is None else Dual(values, slopes)
+
     def _listed(self, quantity: str, stored: list[float]) -> list:
         numbers = list(stored)
         for (surface, name), number in self.numbers.items():

@@ -52,6 +52,7 @@ from raytrace.system.parameter_paths import (
     with_number,
 )
 from raytrace.system.phases import power_of
+from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
@@ -643,6 +644,17 @@ class View:
         return [
             0.0 if surface.curvature is None else float(surface.curvature.detach()) for surface in self.lens.surfaces
         ]
+
+    @cached_property
+    def of_surfaces(self) -> dict[str, np.ndarray]:
+        """Thickness, curvature, conic and even terms a2, a4 … (S,) of all surfaces, 0 where a surface has none."""
+        surfaces = self.lens.surfaces
+        conics = [0.0 if surface.conic is None else float(surface.conic.detach()) for surface in surfaces]
+        numbers = {name: np.array(n) for name, n in (("thickness", self.thickness), ("curvature", self.curvature))}
+        terms = [s.coefficients.tolist() if s.coefficients is not None and s.kind == EVEN else [] for s in surfaces]
+        for j in range(max(map(len, terms))):
+            numbers[f"a{2 * j + 2}"] = np.array([even[j] if j < len(even) else 0.0 for even in terms])
+        return numbers | {"conic": np.array(conics)}
 
     @cached_property
     def further_power(self) -> tuple[np.ndarray, np.ndarray]:

@@ -112,7 +112,7 @@ def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
 # -- Seidel ------------------------------------------------------------------------------------------------------------
 
 
-def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
+def _seidel(state: LensState, wavelength: int):
     """S1 to S5 in mm, (K,) each, of surfaces 1 to the last before the image."""
     n, c = state.index(wavelength), state.vertex_curvature
     surfaces = range(1, len(c) - 1)
@@ -125,28 +125,9 @@ def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
     vertex = listed(c[1:-1], state.count)
     indices = [listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0)]
     invariant = omega_bar * y - omega * y_bar
-    return third_order(marginal, chief, vertex, indices, shapes.departures(state, vertex), invariant)
-
-
-class _Shapes:
-    """The difference of surfaces from the spheres of their vertex curvatures, in r⁴."""
-
-    def __init__(self, planner: Planner):
-        surfaces = [*enumerate(planner.lens.surfaces)][1:-1]
-        number = planner.view.number
-        self.conics = [(k, number((k, "conic"))) for k, surface in surfaces if surface.conic is not None]
-        even = [k for k, surface in surfaces if surface.coefficients is not None and len(surface.coefficients) > 1]
-        self.terms = [(k, number((k, "a4"))) for k in even]
-
-    def departures(self, state: LensState, vertex):
-        """G (K,) in 1/mm³."""
-        c, count = listed(state.curvature[1:-1], state.count), state.count
-        shape, terms = [1.0] * len(value_of(c)), [0.0] * len(value_of(c))
-        for k, stored in self.conics:
-            shape[k - 1] = 1 + state.numbers.get((k, "conic"), stored)
-        for k, stored in self.terms:
-            terms[k - 1] = state.numbers.get((k, "a4"), stored)
-        return departure_from_sphere(c, listed(shape, count), listed(terms, count), vertex)
+    curvature, conic, a4 = (state.of_surfaces(name)[1:-1] for name in ("curvature", "conic", "a4"))
+    departure = departure_from_sphere(curvature, 1 + conic, a4, vertex)
+    return third_order(marginal, chief, vertex, indices, departure, invariant)
 
 
 def _seidel_sum(lines: Sequence[Line], planner: Planner, *, which: int) -> Evaluate:
@@ -156,11 +137,10 @@ def _seidel_sum(lines: Sequence[Line], planner: Planner, *, which: int) -> Evalu
     for k, surface in enumerate(planner.lens.surfaces):
         if not is_even(surface):
             raise BadRow(lines[0], f"is of even powers of r: surface {k} has other terms, added sag or a phase")
-    shapes = planner.shared(_Shapes)
     share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
 
     def number(context: EvaluationContext, line: Line):
-        sums, surface = context.state.kept(_seidel, line.wavelength, shapes)[which], line.row.integers[0]
+        sums, surface = context.state.kept(_seidel, line.wavelength)[which], line.row.integers[0]
         total = sums[surface - 1] if surface else sums.sum()
         return total / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
 

@@ -122,29 +122,13 @@ class Gaps:
         self.end = np.array(
             [next((k for k in range(j + 1, last) if not surfaces[k].is_break), last) for j in range(last + 1)]
         )
-        self.stored = {"thickness": np.array(view.thickness), "curvature": np.array(view.curvature)}
-        self.stored |= {"conic": np.array([0.0 if s.conic is None else float(s.conic.detach()) for s in surfaces])}
-        terms = [s.coefficients.tolist() if s.coefficients is not None and _is_even(s) else [] for s in surfaces]
-        self.terms = [f"a{2 * j + 2}" for j in range(max(map(len, terms)))]
-        for j, name in enumerate(self.terms):
-            self.stored[name] = np.array([even[j] if j < len(even) else 0.0 for even in terms])
+        self.terms = [name for name in view.of_surfaces if name[0] == "a"]
         self.others = [k for k, surface in enumerate(surfaces) if not (surface.is_break or _is_even(surface))]
-
-    def numbers(self, state: LensState, quantity: str):
-        """A number (S,) of all surfaces."""
-        values, slopes = self.stored[quantity].copy(), None
-        for (surface, name), number in state.numbers.items():
-            if name == quantity:
-                values[surface] = value_of(number)
-                if isinstance(number, Dual):
-                    slopes = np.zeros((state.count, len(values))) if slopes is None else slopes
-                    slopes[:, surface] = number.slope
-        return values if slopes is None else Dual(values, slopes)
 
     @once_a_context
     def centre(self, context: EvaluationContext):
         """mm on the axis, signed like the lens's."""
-        each = total = self.numbers(context.state, "thickness")
+        each = total = context.state.of_surfaces("thickness")
         start = np.arange(len(self.end))
         for step in range(1, int((self.end - start).max())):
             within = start + step < self.end
@@ -188,8 +172,8 @@ class Gaps:
 
     def _closing(self, state: LensState, u):
         """(1+k) c² u, which is 1 at the edge of a closed conic."""
-        c = self.numbers(state, "curvature")
-        return (1 + self.numbers(state, "conic")) * (c * c) * u
+        c = state.of_surfaces("curvature")
+        return (1 + state.of_surfaces("conic")) * (c * c) * u
 
     def _even_sag(self, state: LensState, heights):
         """c u/(1 + √(1 - q)) + Σ a_j u^j, u = s², q = (1+k) c² u.
@@ -197,7 +181,7 @@ class Gaps:
         Of a conic that closes within s, from 1 - q = ε on, 1 - q is ε/(1 + τ + τ²), τ = 1 - (1 - q)/ε: above 0, with
         two continuous derivatives.
         """
-        u, c = heights * heights, self.numbers(state, "curvature")
+        u, c = heights * heights, state.of_surfaces("curvature")
         left = 1 - self._closing(state, u)
         closed = value_of(left) < _EDGE
         if closed.any():
@@ -206,7 +190,7 @@ class Gaps:
         sag = c * u / (1 + np.sqrt(left))
         power = u
         for name in self.terms:
-            sag = sag + power * self.numbers(state, name)
+            sag = sag + power * state.of_surfaces(name)
             power = power * u
         return sag
 
@@ -245,7 +229,7 @@ class Amount(NamedTuple):
 _CENTRE = Amount(lambda gaps, context, code: gaps.centre(context), 1)
 _EDGE_THICKNESS = Amount(Gaps.edge, 1, "edges")
 _SHORTFALL = Amount(lambda gaps, context, code: gaps.shortfall(context), 1, "semi-diameters")
-_CURVATURE = Amount(lambda gaps, context, code: gaps.numbers(context.state, "curvature"), -1)
+_CURVATURE = Amount(lambda gaps, context, code: context.state.of_surfaces("curvature"), -1)
 
 # -- surfaces of a row -------------------------------------------------------------------------------------------------
 
@@ -392,7 +376,7 @@ _OF_RANGES = (
 )
 
 _DIAMETER = Amount(lambda gaps, context, code: 2.0 * gaps.semi_diameters.at(context), 1, "semi-diameters")
-_CONIC = Amount(lambda gaps, context, code: gaps.numbers(context.state, "conic"))
+_CONIC = Amount(lambda gaps, context, code: context.state.of_surfaces("conic"))
 
 #: Of surface int1: head of the names, amount, text, convention, violations of the ends of the gap.
 _OF_ONE = (
