@@ -1,6 +1,5 @@
 """Kit of the scripts in `docs/experiments`: a grid of cases, a store that resumes, a page with tables and figures."""
 
-import io
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -9,10 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from raytrace.files import write_atomically, write_json, write_text
-from raytrace.imaging.training import DamagedRun, Run
+from raytrace.imaging.training import RUN
+from raytrace.maths.arrays import ArrayError, read_npz
 from raytrace.pages import write_page
 from raytrace.plotting.style import save
-from raytrace.stores import number, read_document
+from raytrace.stores import Folder, Unfit, number, read_document, read_file
+
+_ADVICE = "remove it to compute it again"
 
 
 def cases(**axes: Sequence) -> Iterator[dict]:
@@ -20,31 +22,34 @@ def cases(**axes: Sequence) -> Iterator[dict]:
     return (dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values()))
 
 
-class Store:
+class Store(Folder):
     """Results in a folder by key, computed only if they are missing.
 
     about: whatever all of them depend on; the folder refuses another (`OtherSettings`).
     """
 
     def __init__(self, folder: Path, about: Mapping):
-        self.folder = Run(folder, about).folder
+        super().__init__(folder, about, RUN)
 
     def number(self, key: str, compute: Callable[[], float]) -> float:
         """A number. Raises DamagedRun."""
-        file = self.folder / f"{key}.json"
-        if not file.exists():
-            write_json(file, compute())
-        return read_document(file, number(infinite=True), DamagedRun, "remove it to compute it again")
+        read = lambda file: read_document(file, number(infinite=True), RUN.damaged, _ADVICE)  # noqa: E731
+        return self.record(f"{key}.json", compute, write=write_json, read=read)
 
     def arrays(self, key: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        """Arrays by name."""
-        file = self.folder / f"{key}.npz"
-        if not file.exists():
-            packed = io.BytesIO()
-            np.savez(packed, **compute())
-            write_atomically(file, lambda stream: stream.write(packed.getvalue()))
-        with np.load(file) as stored:
-            return {name: stored[name] for name in stored.files}
+        """Arrays by name. Raises DamagedRun."""
+
+        def write(file: Path, arrays: Mapping) -> None:
+            write_atomically(file, lambda stream: np.savez(stream, **arrays))
+
+        def decode(content: bytes) -> dict[str, np.ndarray]:
+            try:
+                return read_npz(content)
+            except ArrayError as error:
+                raise Unfit(f"{error}") from error
+
+        read = lambda file: read_file(file, decode, RUN.damaged, _ADVICE)  # noqa: E731
+        return self.record(f"{key}.npz", compute, write=write, read=read)
 
 
 def published(file: str | Path, docs: str | Path) -> str:

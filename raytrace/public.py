@@ -135,7 +135,7 @@ def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) 
 
 
 def _lens(verb: str, name: str, value: object) -> Lens:
-    return as_lens(value, verb)
+    return value if isinstance(value, Lens) else as_lens(value, verb)
 
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:

@@ -1,11 +1,19 @@
-"""Stores: JSON files that work resumes from, each checked against a schema when it is read.
+"""Stores: files from which a computation resumes. Each refuses the records of another computation.
 
-A schema is a check: it takes what JSON holds and returns the value, or raises Unfit saying what was found and expected.
-A document is one value, replaced as a whole. Records are one a line, appended: what a killed process began to append is
-no record, and a damaged line is reported by its number while the others hold.
+| store | place | identity | records | of |
+|---|---|---|---|---|
+| `Document` | a file | its part "of" | one, replaced as a whole | `optimize` (checkpoint) |
+| `Records` | a file | its first line | lines, appended | `search` (journal) |
+| `Folder` | a folder | `settings.json` | files, replaced; lines, appended | training runs, experiments |
+
+A schema is a check: it takes a value of JSON and returns the value that is stored, or raises Unfit, which says what was
+found and expected. A file is replaced as a whole or not at all. Of lines, the incomplete one of a killed process is cut
+off, and damaged ones are reported by their number while the others hold.
 """
 
+import csv
 import dataclasses
+import io
 import json
 import math
 import os
@@ -15,7 +23,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from raytrace.files import append_text, read_bytes, write_text
+from raytrace.files import NotWritten, append_text, read_bytes, write_json, write_text
+from raytrace.shards import share
 from raytrace.words import calling_level
 
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
@@ -206,13 +215,23 @@ def parsed(content: bytes) -> object:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def read_document(path: str | os.PathLike, check: Check, error: type[ValueError], advice: str) -> object:
-    """The value of a document. Raises OSError, and `error` with the file, its line, and the advice how to go on."""
+def read_file(
+    path: str | os.PathLike, decode: Callable[[bytes], object], error: type[ValueError], advice: str, most: int = _MOST
+) -> object:
+    """The decoded content of a regular file of at most `most` bytes; decode raises Unfit.
+
+    Raises OSError, and `error` with the file, its line, and the advice how to resume.
+    """
     try:
-        return check(parsed(read_bytes(path, _MOST)))
-    except Unfit as found:
-        place = f"{path}, line {found.line}" if found.line else f"{path}"
-        raise error(f"{place}: {found}; {advice}") from found
+        return decode(read_bytes(path, most))
+    except Unfit as reason:
+        place = f"{path}, line {reason.line}" if reason.line else f"{path}"
+        raise error(f"{place}: {reason}; {advice}") from reason
+
+
+def read_document(path: str | os.PathLike, check: Check, error: type[ValueError], advice: str) -> object:
+    """The value of a JSON file. Raises as `read_file`."""
+    return read_file(path, lambda content: check(parsed(content)), error, advice)
 
 
 class Lines:
@@ -220,52 +239,216 @@ class Lines:
 
     def __init__(self, path: str | os.PathLike, record: Check, *, head: Check | None = None):
         self.path, self.record, self.head = Path(path), record, head
-        self._end: int | None = None  # bytes of what is whole, where more follows
+        self._end: int | None = None  # bytes of complete lines, where more follows
         self._gap = ""  # between the last record and the next
 
-    def read(self, error: type[ValueError], advice: str) -> tuple[object, list[tuple[int, object]]]:
-        """The head, None where there is none, and every record with the number of its line.
+    def encoded(self, value: object) -> str:
+        """The line of a record."""
+        return json.dumps(value) + "\n"
 
-        Warns DamagedLine of lines that hold none. Raises OSError, and `error` with the advice for a damaged head.
+    def decoded(self, line: bytes, head: object) -> object:
+        """The record of a line behind a head; of the first line, the head itself. Raises Unfit."""
+        return (self.head if head is None and self.head else self.record)(parsed(line))
+
+    def scan(self, error: type[ValueError], advice: str) -> tuple[object, list[tuple[int, object]], list[str]]:
+        """The head, None where there is none, every record with the number of its line, and damaged lines in words.
+
+        Raises OSError, and `error` with the advice for a damaged head.
         """
         content = read_bytes(self.path, _MOST) if self.path.exists() else b""
         *lines, torn = content.split(b"\n")
-        head, found, damaged = None, [], []
-        for number, line in enumerate([*lines, torn], 1):
-            is_torn = number > len(lines)
-            if is_torn and not line:
-                break
-            is_head = number == 1 and self.head is not None
+        head, records, damaged = None, [], []
+        self._end, self._gap = None, ""
+        for number, line in enumerate([*lines, torn] if torn else lines, 1):
+            is_head, is_torn = number == 1 and self.head is not None, number > len(lines)
             try:
-                value = (self.head if is_head else self.record)(parsed(line))
+                value = self.decoded(line, head)
             except Unfit as reason:
                 if is_head:
                     raise error(f"{self.path}, line 1: {reason}; {advice}") from reason
                 if is_torn:
                     self._end = len(content) - len(torn)
                 else:
-                    damaged.append(f"line {number}: {reason}")
+                    damaged.append(f"{self.path}, line {number}: {reason}")
                 continue
             if is_head:
                 head = value
             else:
-                found.append((number, value))
+                records.append((number, value))
             self._gap = "\n" if is_torn else ""
-        self._report(damaged)
-        return head, found
+        return head, records, damaged
 
-    def _report(self, damaged: list[str]) -> None:
+    def read(self, error: type[ValueError], advice: str) -> tuple[object, list[tuple[int, object]]]:
+        """The head, and every record with the number of its line. Warns DamagedLine; raises as `scan`."""
+        head, records, damaged = self.scan(error, advice)
         for words in damaged[:_REPORTED]:
-            warnings.warn(f"{self.path}, {words}; the line is ignored", DamagedLine, stacklevel=calling_level())
+            warnings.warn(f"{words}; the line is ignored", DamagedLine, stacklevel=calling_level())
         if len(damaged) > _REPORTED:
             warnings.warn(f"{self.path}: {len(damaged)} damaged lines in all", DamagedLine, stacklevel=calling_level())
+        return head, records
 
-    def begin(self, head: object) -> None:
-        """Begin the file with its first line, as a whole or not at all; the folder is made."""
+    def begin(self, head: object, *values: object) -> None:
+        """Write the first line and these records, as a whole or not at all; the folder is made."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(self.path, json.dumps(head) + "\n")
+        write_text(self.path, "".join(map(self.encoded, (head, *values))))
+        self._end, self._gap = None, ""
+
+    def append(self, *values: object, sync: bool = True) -> None:
+        """Add records behind all that are complete. Raises OSError; the file is as before then."""
+        append_text(self.path, self._gap + "".join(map(self.encoded, values)), end=self._end, sync=sync)
+        self._end, self._gap = None, ""
+
+
+class Table(Lines):
+    """Rows of numbers as CSV, the first of a row a whole number, under a line of column names."""
+
+    def __init__(self, path: str | os.PathLike):
+        super().__init__(path, anything, head=anything)
+
+    def encoded(self, value: Sequence) -> str:
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow(value)
+        return line.getvalue()
+
+    def decoded(self, line: bytes, head: list[str] | None) -> list:
+        try:
+            text = line.decode("utf-8").removesuffix("\r")
+            cells = next(csv.reader([text]), [])
+            if head is None:
+                return cells
+        except (UnicodeDecodeError, csv.Error) as reason:
+            raise Unfit(f"is no table ({' '.join(str(reason).split())})") from None
+        try:
+            row = [int(cells[0]), *map(float, cells[1:])]
+        except (ValueError, IndexError):
+            row = []
+        if len(row) != len(head) or not cells[0].isdecimal() or any(map(math.isnan, row)):
+            raise Unfit(f"found {text[:400]!r}, expected {len(head)} numbers, of {','.join(head)[:400]}")
+        return row
+
+
+# -- stores ------------------------------------------------------------------------------------------------------------
+
+
+def changed(before: Mapping, now: Mapping) -> str:
+    """How settings differ, "" where they do not."""
+    return "; ".join(
+        f"{' '.join(key.split())[:400]} was {before.get(key)!r}, now {now.get(key)!r}"
+        for key in sorted({*before, *now})
+        if before.get(key) != now.get(key)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of store: its errors in words.
+
+    damaged: error of a file that holds no such records, with the advice how to resume; other: error of a store of
+    another identity, whose refusal has {path} and {difference}; difference: how two identities differ, "" where they do
+    not; lost: the consequence of a record that cannot be written.
+    """
+
+    damaged: type[ValueError]
+    advice: str
+    other: type[ValueError]
+    refusal: str
+    difference: Callable[[Mapping, Mapping], str] = changed
+    lost: str = "the computation continues, but cannot resume from here"
+
+
+class Store:
+    """Records of one computation in a file or folder. Only the first of several processes writes.
+
+    path: None stores nothing; of: the identity, everything that the records depend on, as plain values for JSON.
+    """
+
+    def __init__(self, path: str | os.PathLike | None, of: Mapping, kind: Kind):
+        self.path, self.of, self.kind = None if path is None else Path(path), of, kind
+
+    def verify(self, before: Mapping) -> None:
+        """Raise the error of the kind for another identity."""
+        if words := self.kind.difference(before, self.of):
+            raise self.kind.other(self.kind.refusal.format(path=self.path, difference=words))
+
+    def keep(self, write: Callable[..., None], *values: object) -> None:
+        """Write by a function. Warns NotWritten where that fails: the computation continues and stores nothing more."""
+        if self.path is None or share().rank:
+            return
+        try:
+            write(*values)
+        except OSError as error:
+            words = f"{self.path}: {error.strerror}; {self.kind.lost}"
+            warnings.warn(words, NotWritten, stacklevel=calling_level())
+            self.path = None
+
+
+class Document(Store):
+    """A file of one record, {"of": the identity, …}, replaced as a whole."""
+
+    def read(self, check: Check) -> object:
+        """The checked record. Raises OSError and the errors of the kind."""
+
+        def checked(value: object) -> object:
+            if "of" not in _names(value):
+                raise Unfit("does not say what it is of; an older version wrote it")
+            self.verify(_inside("of", mapped(anything), value["of"]))
+            return check(value)
+
+        return read_document(self.path, checked, self.kind.damaged, self.kind.advice)
+
+    def write(self, values: Mapping) -> None:
+        """Replace the record. Warns NotWritten."""
+        self.keep(write_json, self.path, {"of": self.of, **values})
+
+
+class Records(Store):
+    """A file of appended records, a line of JSON each, behind a first line that holds the identity."""
+
+    def __init__(self, path: str | os.PathLike | None, of: Mapping, kind: Kind, check: Check):
+        super().__init__(path, of, kind)
+        self.lines = None if path is None else Lines(path, check, head=mapped(anything))
+
+    def read(self) -> list[tuple[int, object]]:
+        """Every record with the number of its line; the file is begun where there is none.
+
+        Warns DamagedLine. Raises OSError and the errors of the kind.
+        """
+        if self.lines is None:
+            return []
+        before, records = self.lines.read(self.kind.damaged, self.kind.advice)
+        if before is not None:
+            self.verify(before)
+        elif not share().rank:
+            self.lines.begin(self.of)
+        return records
 
     def append(self, value: object) -> None:
-        """Add a record behind all that are whole. Raises OSError; the file is as before then."""
-        append_text(self.path, self._gap + json.dumps(value) + "\n", end=self._end)
-        self._end, self._gap = None, ""
+        """Add a record. Warns NotWritten."""
+        self.keep(lambda: self.lines.append(value))
+
+
+class Folder(Store):
+    """A folder with the identity in `settings.json`; it is made, and refused if it has another identity.
+
+    usual: defaults of settings that a folder of an older version does not have.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike, of: Mapping, kind: Kind, *, usual: Mapping = MappingProxyType({})
+    ):  # fmt: skip
+        of, usual = (json.loads(json.dumps(dict(values))) for values in (of, usual))
+        super().__init__(path, of, kind)
+        self.path.mkdir(parents=True, exist_ok=True)
+        file = self.path / "settings.json"
+        if file.exists():
+            before = read_document(file, mapped(anything), kind.damaged, kind.advice)
+            self.verify({key: value for key, value in usual.items() if key in of} | before)
+        elif not share().rank:
+            write_json(file, of)
+
+    def record(self, name: str, compute: Callable, *, write: Callable, read: Callable) -> object:
+        """The record of a file, by `read(path)`; where there is none it is computed and stored by `write(path, …)`."""
+        file = self.path / name
+        if not file.exists():
+            write(file, compute())
+        return read(file)

@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.rays import Rays, start
 from raytrace.tracing.compiled import trace_engine
 

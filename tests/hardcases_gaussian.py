@@ -10,7 +10,7 @@ from decimal import Decimal, getcontext
 import torch
 from problems import floats
 
-from raytrace.maths.grid import Grid
+from raytrace.maths.sampling import Grid
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.tracing.spot import spot_of_points
 

@@ -6,7 +6,7 @@ image, inside_energy and the one-sided derivatives of loss = Σ image[iy][ix]·(
 
 import torch
 
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models.drt import splat
 
 EXACT = 1e-14  # of a weight of 1

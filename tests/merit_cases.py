@@ -7,8 +7,8 @@ import numpy as np
 from test_seidel import SYSTEMS
 
 import raytrace as rt
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 from raytrace.system.optimization_data import Solve, Vary
 
 LENSES = {

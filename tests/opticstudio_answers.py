@@ -19,7 +19,8 @@ from raytrace.io.zemax.surfaces import AIMINGS
 from raytrace.materials import glass
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.environment import Environment
-from raytrace.maths import pupil, zernike
+from raytrace.maths import zernike
+from raytrace.maths.sampling import gauss_rings, hexapolar
 from raytrace.psf_models import wave
 from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture, media
 from raytrace.system.rays import Rays
@@ -165,7 +166,7 @@ def points_of(case: dict) -> tuple[torch.Tensor, torch.Tensor]:
     """Pupil points (2, P) and weights of `sampling`: ["grid", N], ["points", list] or ["gq", rings, arms]."""
     kind, *numbers = case.get("sampling", ["gq", 14, 56])
     if kind == "gq":
-        points, weights = pupil.gauss_rings(*numbers, dtype=torch.float64)
+        points, weights = gauss_rings(*numbers, dtype=torch.float64)
         if "sampling" in case:  # OpticStudio's arms begin at +x
             first = torch.atan2(points[1, 0], points[0, 0])
             c, s = torch.cos(first), torch.sin(first)
@@ -287,7 +288,7 @@ def spot(case):
     off = []
     shares = lens.wavelength_weights / lens.wavelength_weights.max()
     for wavelength, share in zip(lens.wavelengths, shares.tolist(), strict=True):
-        points = pupil.hexapolar(case["rings"] * share**0.5, dtype=torch.float64)[0]
+        points = hexapolar(case["rings"] * share**0.5, dtype=torch.float64)[0]
         rays = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelength[None]), wavelength)
         off.append(1000 * (rays.position[:2] - chief)[:, :, 0])
     off = torch.cat(off, -1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from raytrace.bench.measure import squared_radius, variables
 from raytrace.bench.peers import Optiland
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens
 from raytrace.system.phases import Grating
 from raytrace.system.rays import Rays

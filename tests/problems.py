@@ -14,8 +14,8 @@ import torch
 
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Aperture, Surface

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models.dft import phasor
 from raytrace.wave_optics.element import path
 from raytrace.wave_optics.scene import WaveScene, aperture, excess, millimetres

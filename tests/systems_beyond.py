@@ -9,7 +9,7 @@ from raytrace.bench.measure import SAMPLE, Tracer, field_rays
 from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.phases import Grating
 from raytrace.system.poses import Pose

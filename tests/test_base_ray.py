@@ -9,8 +9,8 @@ from bends import pose, real
 from differences import gradcheck
 
 import raytrace as rt
-from raytrace.tracing.aiming import Bent, at_stop, is_bent
 from raytrace.tracing.paraxial import largest_field
+from raytrace.tracing.trace import Bent, at_stop, is_bent
 
 
 def near(found, expected, tolerance=1e-9):

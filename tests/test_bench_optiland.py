@@ -6,8 +6,8 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 
 pytest.importorskip("optiland", reason="needs the extra [bench]")
 peers = script("bench_optiland")

@@ -6,7 +6,7 @@ import pytest
 from scripts import script
 
 from raytrace.io import read_lens
-from raytrace.optimization.default_merit import DefaultMerit
+from raytrace.optimization.merit import DefaultMerit
 from raytrace.system.optimization_data import OptimizationData, Vary
 
 bench = script("bench_optimise")

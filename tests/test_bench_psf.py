@@ -22,7 +22,7 @@ from raytrace.bench.psf_cases import Case, Method, cases
 from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.io import read_lens
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import MODELS, drt, wave
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture

@@ -27,7 +27,7 @@ from raytrace.bench.report import Measured
 from raytrace.bench.speed import STAGES, Bench, Row, Sizes, document, measure, three_aspheres, with_sensor_leaf
 from raytrace.cli import main
 from raytrace.io import read_lens
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.pages import KEPT
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import trace_engine

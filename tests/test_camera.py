@@ -40,7 +40,7 @@ from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.training import Run, Share
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import psf
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance

@@ -15,11 +15,12 @@ import torch
 from test_stores import STRANGE, put
 
 import raytrace as rt
+from raytrace import stores
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
-from raytrace.optimization import checkpoint, solver
+from raytrace.optimization import checkpoint, least_squares
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.solver import Sides, State, best_of_paths, minimise
+from raytrace.optimization.least_squares import Sides, State, best_of_paths, minimise
 
 TRIPLET = read_lens("cooke_triplet")
 SPOT = {"merit": "spot", "vary": "curvature sensor", "cycles": 8}
@@ -128,7 +129,7 @@ def test_a_checkpoint_of_an_older_version_is_refused(kept, tmp_path):
     document = json.loads(kept.read_text())
     path = tmp_path / "old.json"
     path.write_text(json.dumps({key: document[key] for key in ("merit", "cycles", "variables")}))
-    with pytest.raises(BadCheckpoint, match=r"old.json: does not say which lens it is of; an older version wrote it"):
+    with pytest.raises(BadCheckpoint, match=r"old.json: does not say what it is of; an older version wrote it"):
         rt.optimize(TRIPLET, resume=path, merit="spot", vary="curvature:1-4 sensor")
 
 
@@ -185,7 +186,7 @@ def test_a_checkpoint_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch)
     def full(path, document):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(checkpoint, "write_json", full)
+    monkeypatch.setattr(stores, "write_json", full)
     with pytest.warns(rt.files.NotWritten, match=r"kept.json: No space left on device; the optimisation continues"):
         found = rt.optimize(TRIPLET, checkpoint=tmp_path / "kept.json", **SPOT | {"cycles": 2})
     assert found.cycles == 2
@@ -215,7 +216,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 100.0
-        monkeypatch.setattr(solver.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(least_squares.time, "monotonic", lambda: self.now)
 
     def state(self, x, derivatives):
         """A narrow valley (Rosenbrock)."""

@@ -256,11 +256,12 @@ def test_help_teaches_by_example(run, command):
 def test_examples_of_the_help_parse():
     from raytrace.cli import build_parser
 
+    parser = build_parser()
     for command in commands.COMMANDS:
         for line in command.examples.splitlines()[1:]:
             words = line.split("|")[0].split()
             assert words[0] == "raytrace"
-            assert build_parser().parse_args(words[1:]).command == command.name
+            assert parser.parse_args(words[1:]).command == command.name
 
 
 @pytest.mark.parametrize(

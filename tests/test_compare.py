@@ -12,8 +12,7 @@ from problems import MICROMETRE, NANOMETRE
 
 from raytrace import analysis, read_lens
 from raytrace.cli import main
-from raytrace.maths.grid import grid
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings, grid
 from raytrace.psf_models import NotConverged, psf
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing.spot import image_rays

@@ -16,8 +16,8 @@ from torch.testing import assert_close
 from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.materials.glass import MIRROR
-from raytrace.maths.pupil import sobol
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import sobol
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import ZernikeSag
@@ -31,9 +31,8 @@ from raytrace.tracing.compiled import (
     uses_compiled,
     with_numbers,
 )
-from raytrace.tracing.jacobian import hit_jacobian, pushed
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import trace_lens, trace_surfaces
+from raytrace.tracing.trace import hit_jacobian, pushed, trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

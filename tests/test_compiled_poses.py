@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 import raytrace as rt
 from raytrace.materials.glass import MIRROR
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import media
 from raytrace.system.poses import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
@@ -20,8 +20,7 @@ from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
 from raytrace.tracing.compiled import push, rows_of, task_of, trace_compiled, trace_engine
-from raytrace.tracing.jacobian import hit_jacobian
-from raytrace.tracing.trace import trace_surfaces
+from raytrace.tracing.trace import hit_jacobian, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, slope_of, value_of
 
 FUNCTIONS = [
     lambda a, b: a * b + a / b - b / a + 2 * a - b * 3 + 1 / a - (2 - b),

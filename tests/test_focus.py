@@ -8,7 +8,7 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
 from raytrace.materials.glass import MIRROR
-from raytrace.maths import pupil
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.focus import (
@@ -22,7 +22,7 @@ from raytrace.tracing.focus import (
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import EmptySpot, image_rays, spot_of
 
-POINTS, WEIGHTS = pupil.gauss_rings(6)
+POINTS, WEIGHTS = gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)
 
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from raytrace.maths import zernike
 from raytrace.maths.bivariate import powers
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial

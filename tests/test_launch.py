@@ -7,8 +7,8 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.maths import pupil
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import media, with_object_distance
 from raytrace.tracing.launch import (
     MarginalRayLost,
@@ -21,7 +21,7 @@ from raytrace.tracing.launch import (
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
-POINTS, _ = pupil.hexapolar(2)
+POINTS, _ = hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 INF = math.inf
 
@@ -223,7 +223,7 @@ def test_the_axial_chief_ray_can_be_aimed():
 @pytest.mark.parametrize("angle", [0.0, 60.0, 75.0])
 def test_wide_angles_are_aimed(angle):
     system = fisheye(field=fields("angle", (angle,)))
-    points = pupil.hexapolar(1)[0]
+    points = hexapolar(1)[0]
     rays = launch(system, points, ray_aiming="real")
     assert rays.valid.all()
     assert aiming_error(system, rays, points) <= 1e-10  # of the stop radius

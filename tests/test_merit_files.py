@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from raytrace.io import read_lens
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 
 FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 

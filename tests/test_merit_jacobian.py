@@ -5,10 +5,8 @@ import pytest
 import torch
 
 from raytrace.io import read_lens
-from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit_rows import Evaluation
-from raytrace.optimization.variables import freedom, with_numbers_of
+from raytrace.optimization.merit import DefaultMerit, Evaluation
+from raytrace.optimization.variables import Model, freedom, with_numbers_of
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.trace import trace_lens
 

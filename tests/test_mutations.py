@@ -12,16 +12,16 @@ import torch
 from mutations import Reader, survive
 from PIL import Image
 from problems import number
+from test_codev import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
 from test_configurations import CASES as CONFIGURED
 from test_configurations import scan
-from test_intent import CONFIGURED as VARIED
-from test_intent import MERIT_LINES, RULES, STOP_RULES
 from test_oslo import CONIC, FAR, SINGLET, double_gauss
 from test_oslo import text as oslo_text
-from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
-from test_seq import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
+from test_table_layouts import LOWENTHAL, NOCTILUX, summilux
 from test_zemax import file
 from test_zemax_archive import archive
+from test_zemax_optimization import CONFIGURED as VARIED
+from test_zemax_optimization import MERIT_LINES, RULES, STOP_RULES
 from test_zemax_types import CASES, text
 
 from raytrace.imaging.training import DamagedRun, OtherSettings, Run, load_state, read_state
@@ -187,10 +187,10 @@ def logs(folder: Path) -> Reader:
 def settings(folder: Path) -> Reader:
     values = {"a": 1, "world": {"b": [1.5, 2]}, "name": "x"}
     run = Run(folder / "run", values)
-    written = run.folder / "settings.json"
+    written = run.path / "settings.json"
     return Reader(
         (written.read_bytes(),),
-        from_file(lambda _: Run(run.folder, values), written),
+        from_file(lambda _: Run(run.path, values), written),
         (DamagedRun, OtherSettings),
     )
 

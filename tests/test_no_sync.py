@@ -9,8 +9,8 @@ from problems import double_gauss, lens, surface, vector
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from raytrace.materials.glass import MIRROR
-from raytrace.maths import pupil
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import sobol
 from raytrace.system import intersection as search
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays
@@ -118,7 +118,7 @@ def trainable(system):
 def prepared(system, device="cpu"):
     """A trainable lens, its rays, and its media, on the device: what the trace itself is given."""
     system = trainable(to(system, device=device))
-    points = pupil.sobol(64, device=device)[0]
+    points = sobol(64, device=device)[0]
     with torch.no_grad():
         rays = launch(system, points, fields=vector(0.0, 8.0).to(device)[:, None])
         indices = media(system, system.wavelengths[:, None])
@@ -198,6 +198,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
     assert not bool(found[0][0].all())
 
 
+@pytest.mark.slow  # 5 s for every step on a device without numbers; that no step reads one is shown above
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}
     given = {name: torch.empty(shape, dtype=torch.float64, device="meta") for name, shape in shapes.items()}

@@ -12,13 +12,12 @@ from scipy.optimize import minimize
 from scripts import script
 
 import raytrace as rt
-from raytrace.optimization import solver as paths
-from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization import least_squares as paths
+from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOptions, State, least_squares
+from raytrace.optimization.merit import DefaultMerit
+from raytrace.optimization.optimize import optimize_report
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
-from raytrace.optimization.report import optimize_report
-from raytrace.optimization.solver import Linear, NoStep, Sides, SolverOptions, State, least_squares
-from raytrace.optimization.variables import freedom, name_of
+from raytrace.optimization.variables import Model, freedom, name_of
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface

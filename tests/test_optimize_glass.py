@@ -24,9 +24,9 @@ from raytrace.optimization.glass_choice import (
     hull,
     pool_of,
 )
+from raytrace.optimization.least_squares import Sides, State, least_squares
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem, conditions_of
-from raytrace.optimization.solver import Sides, State, least_squares
 from raytrace.optimization.variables import freedom, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables

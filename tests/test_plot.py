@@ -18,7 +18,7 @@ from raytrace.analysis.focus_report import focus_rays
 from raytrace.analysis.spot_diagram import airy_radius, field_spots, shares_of
 from raytrace.io import read_lens
 from raytrace.materials.glass import constant
-from raytrace.maths.pupil import fan, gauss_rings
+from raytrace.maths.sampling import fan, gauss_rings
 from raytrace.plotting import style
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_label, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture, Surface, sag

@@ -12,10 +12,10 @@ from problems import number
 
 from raytrace import analysis, read_lens
 from raytrace.cli import main
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.plotting import style
 from raytrace.plotting.style import fill
-from raytrace.psf_models import close_up, psf
+from raytrace.psf_models import close_up_of, psf
 from raytrace.psf_models.figures import DECADES, psf_grid
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -30,7 +30,7 @@ def seen(name: str, model: str, **options):
     lens = read_lens(LENSES / f"{name}.zmx")
     fields, distances = options.pop("fields", own_fields(lens)), options.pop("object_distances", number([math.inf]))
     result = psf(lens, model, fields=fields, object_distances=distances, center="chief", **options)
-    return result, close_up(result), fields
+    return result, close_up_of(result), fields
 
 
 @pytest.mark.parametrize(("name", "model"), [("phone", "wave"), ("hubble", "wave"), ("telephoto", "gaussian")])

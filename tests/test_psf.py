@@ -11,7 +11,7 @@ from differences import gradcheck
 from problems import field, number, sharp_double_gauss
 
 import raytrace as rt
-from raytrace.maths.grid import Grid, grid
+from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import DRT, EmptyPsf, Execution, Fourier, Gaussian, NotConverged, Paraxial, Wave, model_of, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture

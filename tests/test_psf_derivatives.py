@@ -9,7 +9,7 @@ from differences import gradcheck
 from problems import double_gauss, scalar, vector
 
 from raytrace.materials.glass import model_glass
-from raytrace.maths.grid import Grid
+from raytrace.maths.sampling import Grid
 from raytrace.psf_models import drt, gaussian
 from raytrace.psf_models.drt import energy_of_fans
 from raytrace.psf_models.models import MODELS

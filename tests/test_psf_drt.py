@@ -8,7 +8,7 @@ import torch
 from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
-from raytrace.maths.grid import Grid, grid
+from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import drt
 from raytrace.psf_models.drt import fit, kernels, reference
 from raytrace.system.lens import Lens

@@ -14,8 +14,8 @@ import torch
 from problems import number
 
 from raytrace.io import read_lens
-from raytrace.maths.grid import grid
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import NotConverged, drt, fourier, psf, wave
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.pupil_clearance import between, clear_arms

@@ -8,7 +8,7 @@ import torch
 from differences import gradcheck
 from problems import vector
 
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import fourier
 from raytrace.system.lens import with_sensor_distance
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance

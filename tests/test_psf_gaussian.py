@@ -9,8 +9,7 @@ import torch
 from problems import MICROMETRE, double_gauss, scalar, vector
 
 from raytrace.io import read_lens
-from raytrace.maths.grid import Grid, grid
-from raytrace.maths.pupil import gauss_rings, sobol
+from raytrace.maths.sampling import Grid, gauss_rings, grid, sobol
 from raytrace.psf_models import gaussian
 from raytrace.psf_models import pixels as rules
 from raytrace.psf_models.drt import trace_clearances

@@ -11,7 +11,7 @@ import torch
 from problems import number, vector
 
 from raytrace.io import read_lens
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import Execution, Memo, model_of, psf, wave
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.surface import Aperture

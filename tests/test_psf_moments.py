@@ -9,7 +9,7 @@ import torch
 from problems import number
 
 from raytrace import read_lens
-from raytrace.maths.grid import centres, grid
+from raytrace.maths.sampling import centres, grid
 from raytrace.psf_models import model_of, psf
 from raytrace.system.lens import with_sensor_distance
 

@@ -8,7 +8,7 @@ import torch
 from differences import gradcheck, gradgradcheck
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.maths.grid import Grid, grid
+from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import paraxial, psf
 from raytrace.system.lens import with_sensor_distance
 from raytrace.tracing.paraxial import paraxial_image_distance

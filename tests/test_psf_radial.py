@@ -8,7 +8,7 @@ import torch
 from differences import gradcheck
 from problems import number
 
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models.dft import integrate, sub_pixels
 from raytrace.psf_models.radial import energy_of_rings, is_centred, radii_of_waves, unfold
 

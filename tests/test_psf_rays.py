@@ -9,8 +9,7 @@ from differences import gradcheck, gradgradcheck
 from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
-from raytrace.maths import pupil
-from raytrace.maths.grid import Grid, grid
+from raytrace.maths.sampling import Grid, grid, sobol
 from raytrace.psf_models.drt import below_edge, histogram, kernels_of_rays, splat, splat_cells, splat_smooth, trace_fans
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
@@ -93,7 +92,7 @@ def test_equals_brute_force_within_its_noise(field, times):
 
 
 def seeds(count: int):
-    return [lambda n, s=s, **like: pupil.sobol(n, seed=s, **like) for s in range(count)]
+    return [lambda n, s=s, **like: sobol(n, seed=s, **like) for s in range(count)]
 
 
 @pytest.mark.parametrize("field", [0.0, 14.0])

@@ -9,8 +9,7 @@ import torch
 from differences import gradcheck
 from problems import scene_of, vector
 
-from raytrace.maths.grid import grid
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings, grid
 from raytrace.psf_models import wave
 from raytrace.psf_models.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
 from raytrace.system.lens import with_sensor_distance

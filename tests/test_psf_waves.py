@@ -9,9 +9,8 @@ import torch
 from problems import field, number, scene_of, vector
 
 from raytrace.materials.glass import constant
-from raytrace.maths.grid import Grid, grid
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import Grid, gauss_rings, grid
 from raytrace.psf_models import NotConverged, fourier, psf, wave
 from raytrace.psf_models.dft import huygens
 from raytrace.system.lens import Lens

@@ -9,7 +9,7 @@ from problems import scalar, sharp_double_gauss, vector
 from test_psf_derivatives import moved
 
 import raytrace as rt
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import DRT, Fourier, Gaussian, Paraxial, Wave, psf
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.maths import pupil
+from raytrace.maths.sampling import SAMPLINGS, fan, gauss_legendre, gauss_rings, hexapolar, random, sobol, square
 
 ROUNDING = 2.0**-53
 RULES = {
-    "gauss": lambda: pupil.gauss_rings(4),
-    "hexapolar": lambda: pupil.hexapolar(5),
-    "square": lambda: pupil.square(20),
-    "sobol": lambda: pupil.sobol(256),
-    "random": lambda: pupil.random(256),
+    "gauss": lambda: gauss_rings(4),
+    "hexapolar": lambda: hexapolar(5),
+    "square": lambda: square(20),
+    "sobol": lambda: sobol(256),
+    "random": lambda: random(256),
 }
 
 
@@ -38,7 +38,7 @@ def test_weights_sum_to_one_and_points_lie_in_the_disc(name):
 
 @pytest.mark.parametrize("rings", [1, 2, 3, 6, 10])
 def test_gauss_rings_are_exact_to_their_degree(rings):
-    points, weights = pupil.gauss_rings(rings)
+    points, weights = gauss_rings(rings)
     for i in range(4 * rings):
         for j in range(4 * rings - i):
             if i + j <= 4 * rings - 2:
@@ -47,22 +47,20 @@ def test_gauss_rings_are_exact_to_their_degree(rings):
 
 
 def test_gauss_rings_are_not_exact_beyond_their_degree():
-    points, weights = pupil.gauss_rings(2)
+    points, weights = gauss_rings(2)
     r_squared = points[0] ** 2 + points[1] ** 2
     assert abs((weights * r_squared**4).sum().item() - 1 / 5) > 1e-4
 
 
 def test_gauss_arms_resolve_as_many_harmonics():
-    points, weights = pupil.gauss_rings(3, arms=7)
+    points, weights = gauss_rings(3, arms=7)
     angle = torch.atan2(points[1], points[0])
     for m in range(1, 7):
         assert abs((weights * torch.cos(m * angle)).sum().item()) <= 20 * ROUNDING
     assert abs(abs((weights * torch.cos(7 * angle)).sum().item()) - 1) <= 20 * ROUNDING
 
 
-@pytest.mark.parametrize(
-    ("rule", "sizes", "order"), [(pupil.hexapolar, (8, 16, 32), 1.8), (pupil.square, (32, 64, 128), 0.9)]
-)
+@pytest.mark.parametrize(("rule", "sizes", "order"), [(hexapolar, (8, 16, 32), 1.8), (square, (32, 64, 128), 0.9)])
 def test_rules_converge_to_the_mean_of_a_smooth_function(rule, sizes, order):
     """f = 1/(1.2 - x): mean over the disc 2 (1.2 - √(1.44 - 1)); the error falls with the size to the order given."""
     exact = 2 * (1.2 - math.sqrt(0.44))
@@ -73,7 +71,7 @@ def test_rules_converge_to_the_mean_of_a_smooth_function(rule, sizes, order):
     assert math.log2(errors[0] / errors[-1]) / 2 >= order, errors
 
 
-@pytest.mark.parametrize("rule", [pupil.sobol, pupil.random])
+@pytest.mark.parametrize("rule", [sobol, random])
 def test_points_are_those_of_their_seed(rule):
     one, other, again = rule(64, seed=1)[0], rule(64, seed=2)[0], rule(64, seed=1)[0]
     assert torch.equal(one, again)
@@ -83,16 +81,16 @@ def test_points_are_those_of_their_seed(rule):
 def test_global_random_state_is_neither_read_nor_changed():
     torch.manual_seed(3)
     before = torch.get_rng_state()
-    first = pupil.random(16)[0]
-    pupil.sobol(16)
+    first = random(16)[0]
+    sobol(16)
     assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(4)
-    assert torch.equal(pupil.random(16)[0], first)
+    assert torch.equal(random(16)[0], first)
 
 
 def test_generator_is_advanced():
     generator = torch.Generator().manual_seed(7)
-    assert not torch.equal(pupil.random(8, generator=generator)[0], pupil.random(8, generator=generator)[0])
+    assert not torch.equal(random(8, generator=generator)[0], random(8, generator=generator)[0])
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("sobol", 2e-3), ("random", 6e-2)])
@@ -102,14 +100,14 @@ def test_stochastic_rules_fill_the_area_evenly(name, tolerance):
     assert abs((weights * (points**2).sum(0)).sum().item() - 0.5) <= tolerance
 
 
-@pytest.mark.parametrize("name", pupil.SAMPLINGS)
+@pytest.mark.parametrize("name", SAMPLINGS)
 def test_samplings_by_name_take_one_size_and_a_dtype(name):
-    points, weights = pupil.SAMPLINGS[name][0](4, dtype=torch.float32)
+    points, weights = SAMPLINGS[name][0](4, dtype=torch.float32)
     assert points.dtype == weights.dtype == torch.float32
 
 
 def test_patterns_are_symmetric_where_promised():
-    for points, _ in (pupil.gauss_rings(3), pupil.square(9)):
+    for points, _ in (gauss_rings(3), square(9)):
         for flip in ([-1.0, 1.0], [1.0, -1.0]):
             mirrored = points * torch.tensor(flip, dtype=torch.float64)[:, None]
             distance = (mirrored[:, :, None] - points[:, None, :]).abs().amax(0).amin(1)
@@ -117,16 +115,16 @@ def test_patterns_are_symmetric_where_promised():
 
 
 def test_smallest_sizes():
-    assert pupil.fan(1)[0].tolist() == [[0.0], [0.0]]
-    assert pupil.fan(3, "x")[0].tolist() == [[-1.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
-    assert pupil.square(1)[0].tolist() == [[0.0], [0.0]]
-    assert pupil.gauss_rings(1)[1].sum() == 1.0
+    assert fan(1)[0].tolist() == [[0.0], [0.0]]
+    assert fan(3, "x")[0].tolist() == [[-1.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
+    assert square(1)[0].tolist() == [[0.0], [0.0]]
+    assert gauss_rings(1)[1].sum() == 1.0
 
 
 @pytest.mark.parametrize("count", [257, 600])
 def test_many_gauss_points_are_those_of_eigenvalues_and_exact(count):
     """∫ x^k dx = 2 / (k + 1) up to k = 2n - 1; the weights of eigenvalues err by ten times as much."""
-    nodes, weights = pupil.gauss_legendre(count)
+    nodes, weights = gauss_legendre(count)
     assert abs(nodes - np.polynomial.legendre.leggauss(count)[0]).max() <= 4 * ROUNDING
     for k in (2, count // 2 * 2, 2 * count - 2):
         assert (weights * nodes**k).sum() == pytest.approx(2 / (k + 1), rel=3e-12)
@@ -135,6 +133,6 @@ def test_many_gauss_points_are_those_of_eigenvalues_and_exact(count):
 def test_thousands_of_gauss_points_integrate_what_turns_a_thousand_times():
     """In 0.1 s; ∫ cos 6000 x dx = 2 sin(6000) / 6000, exact to rounding for n well above 3000."""
     began = time.process_time()
-    nodes, weights = pupil.gauss_legendre(5000)
+    nodes, weights = gauss_legendre(5000)
     assert time.process_time() - began < 5
     assert abs((weights * np.cos(6000 * nodes)).sum() - math.sin(6000) / 3000) <= 100 * ROUNDING

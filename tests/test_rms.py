@@ -12,7 +12,7 @@ from raytrace import rms_over_field, wavefront
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
-from raytrace.maths import pupil
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.surface import Aperture
 from raytrace.tracing.spot import image_rays, spot_of
 
@@ -24,11 +24,11 @@ def own_fields(system):
 
 
 def test_each_wavelength_is_that_of_its_map_and_own_spheres_add_as_squares():
-    own = rms_over_field(TRIPLET, fields=own_fields(TRIPLET), reference="own", pupil=pupil.gauss_rings(14, 56))
+    own = rms_over_field(TRIPLET, fields=own_fields(TRIPLET), reference="own", pupil=gauss_rings(14, 56))
     torch.testing.assert_close(own.rms, wavefront(TRIPLET, size=8).rms, rtol=1e-9, atol=1e-12)
     weights = TRIPLET.wavelength_weights / TRIPLET.wavelength_weights.sum()
     torch.testing.assert_close(own.polychromatic**2, (own.rms**2 * weights).sum(-1))
-    primary = rms_over_field(TRIPLET, fields=own_fields(TRIPLET), pupil=pupil.gauss_rings(14, 56))
+    primary = rms_over_field(TRIPLET, fields=own_fields(TRIPLET), pupil=gauss_rings(14, 56))
     torch.testing.assert_close(primary.rms, own.rms)
     assert primary.polychromatic[0].item() == pytest.approx(own.polychromatic[0].item(), rel=1e-9)  # no lateral colour
     assert (primary.polychromatic[1:] / own.polychromatic[1:] - 1).abs().min().item() > 1e-4
@@ -45,7 +45,7 @@ def test_the_strehl_ratio_of_small_aberrations_is_that_of_the_diffraction_integr
 
 def test_spots_are_those_of_the_rays():
     system = double_gauss(wavelengths=(0.53, 0.6))
-    rule = pupil.gauss_rings(6)
+    rule = gauss_rings(6)
     found = rms_over_field(system, fields=own_fields(system), spot=True, pupil=rule)
     expected = spot_of(image_rays(system, rule[0]), rule[1])
     torch.testing.assert_close(found.rms, expected.rms_radius)
@@ -70,7 +70,7 @@ def test_a_curvature_carries_its_derivatives(spot):
     def together(curvature):
         front = dataclasses.replace(surface(0.02, 5.0, 1.5), curvature=curvature)
         system = lens([front, surface(-0.01, 60.0)], field=fields("angle", (3.0,)), wavelengths=(0.5, 0.6))
-        return rms_over_field(system, samples=2, spot=spot, pupil=pupil.gauss_rings(2)).polychromatic
+        return rms_over_field(system, samples=2, spot=spot, pupil=gauss_rings(2)).polychromatic
 
     assert gradcheck(together, (scalar(0.02).requires_grad_(),), rtol=1e-4)
 

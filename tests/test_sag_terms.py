@@ -11,8 +11,8 @@ from problems import lens, points, surface, vector
 from raytrace.io import write_lens
 from raytrace.io.source import LensFileError
 from raytrace.maths import zernike
-from raytrace.maths.grid import grid
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import model_of, psf
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.lens import media

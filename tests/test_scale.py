@@ -19,9 +19,8 @@ from raytrace.materials.glass import AIR, constant
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import engine
-from raytrace.tracing.jacobian import hit_jacobian
 from raytrace.tracing.refraction import refract
-from raytrace.tracing.trace import trace_surfaces
+from raytrace.tracing.trace import hit_jacobian, trace_surfaces
 
 LENGTHS = {"x", "y", "z", "opl"}
 ASPHERES = [case for case in CASES if case.get("family") == "asphere" and len(case["surfaces"]) < 5]

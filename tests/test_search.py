@@ -13,9 +13,9 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
-from raytrace.optimization.conventions import conventions_of
-from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization.least_squares import SolverOptions, least_squares
+from raytrace.optimization.merit import DefaultMerit
+from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
@@ -29,8 +29,7 @@ from raytrace.optimization.search_tasks import (
     length_of,
     space_of,
 )
-from raytrace.optimization.solver import SolverOptions, least_squares
-from raytrace.optimization.variables import bounds_of, freedom
+from raytrace.optimization.variables import Model, bounds_of, freedom
 
 PLANE = float("inf")
 PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem

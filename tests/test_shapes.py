@@ -18,9 +18,8 @@ from raytrace.analysis.cross_section import depth
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens, write_lens
 from raytrace.io.source import LensFileError
-from raytrace.maths.grid import grid
-from raytrace.maths.pupil import gauss_rings, sobol
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.sampling import gauss_rings, grid, sobol
 from raytrace.psf_models import psf
 from raytrace.system import shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_training import fit
 
 import raytrace as rt
 from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.maths.grid import grid
-from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, psf, sharing
+from raytrace.maths.sampling import grid
+from raytrace.psf_models import Execution, Fourier, Gaussian, model_of, models, psf
 from raytrace.psf_models.result import mixture
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -80,8 +81,11 @@ def cases() -> dict[str, dict[str, np.ndarray]]:
 
 
 def work(folder: str) -> None:
-    """What each process of `test_two_processes_compute_what_one_does` runs."""
+    """Each process of `test_two_processes_compute_and_train_as_one_does`: kernels, ten steps of training, an error."""
     with shards.processes() as share:
+        weights = fit(Path(folder, "training of two"), 10)
+        if share.rank == 0:
+            torch.save(weights, Path(folder, "weights.pt"))
         found = {f"{name}/{key}": t for name, numbers in cases().items() for key, t in numbers.items()}
         np.savez(Path(folder, f"{share.rank}.npz"), **found)
         try:
@@ -97,14 +101,14 @@ def work(folder: str) -> None:
 
 def kill_itself(*words: str) -> None:
     """The command line of a process that is killed, if it is number 1, as soon as kernels are put together."""
-    together = sharing.total
+    together = models.total
 
     def killed(part):
         if shards.share().rank == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return together(part)
 
-    sharing.total = killed
+    models.total = killed
     sys.exit(main(words))
 
 
@@ -132,8 +136,11 @@ def run_function(call: str, *, folder: Path, processes: int = 2) -> subprocess.C
 # ---------------------------------------------------------------- several processes
 
 
-def test_two_processes_compute_what_one_does(tmp_path):
-    """Every model, each axis of a scene cut in turn, to rounding and in both processes; an error of one is of all."""
+def test_two_processes_compute_and_train_as_one_does(tmp_path):
+    """One start of torchrun. Kernels of every model, each axis of a scene cut in turn, to rounding in both processes;
+
+    weights after ten steps of Adam, to 1e-12; an error of one process is raised in all.
+    """
     done = run_function(f"work({str(tmp_path)!r})", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     together = [np.load(tmp_path / f"{rank}.npz") for rank in range(2)]
@@ -144,6 +151,7 @@ def test_two_processes_compute_what_one_does(tmp_path):
             # An estimated error is a small difference of sums, and stands for two digits.
             close = 1e-9 if key == "error" else ROUNDING
             np.testing.assert_allclose(first, expected, rtol=close, atol=close, err_msg=f"{name}: {key}")
+    torch.testing.assert_close(torch.load(tmp_path / "weights.pt"), fit(tmp_path / "one", 10), atol=1e-12, rtol=1e-12)
     assert (tmp_path / "0.txt").read_text() == "FailedElsewhere: the share of 1 makes no sense"
     assert (tmp_path / "1.txt").read_text() == "ValueError: the share of 1 makes no sense"
 
@@ -205,14 +213,14 @@ def test_a_refusal_is_said_once(tmp_path):
 )
 def test_axes_are_cut_for_the_smallest_largest_block(shape, processes, by_field, expected):
     """(2, 2, 2) by field: four kernels in turn for two fields each, or one field at a time on four of the processes."""
-    assert sharing._cuts(shape, processes, by_field=by_field) == expected
+    assert models._cuts(shape, processes, by_field=by_field) == expected
 
 
 @pytest.mark.parametrize(("shape", "cut"), [((4, 3, 3), (2, 1, 3)), ((5, 2, 7), (3, 2, 4)), ((1, 1, 1), (1, 1, 1))])
 def test_blocks_hold_every_kernel_once(shape, cut):
     seen = np.zeros(shape, int)
     for number in range(int(np.prod(cut))):
-        seen[sharing._block(shape, cut, number)] += 1
+        seen[models._block(shape, cut, number)] += 1
     assert (seen == 1).all()
 
 

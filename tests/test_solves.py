@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from test_corpus import CORPUS
-from test_merit_bounds import semi_diameters
+from test_operands_boundaries import semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.lens_model import Model
+from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.lens_state import SOLVES
-from raytrace.optimization.variables import freedom
+from raytrace.optimization.variables import Model, freedom
 from raytrace.system import configurations
 from raytrace.system.configurations import ScaledPath
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary

@@ -13,7 +13,6 @@ from test_hardcases import of_kind
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
-from raytrace.maths import pupil
 from raytrace.system.rays import Rays
 from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
@@ -207,7 +206,7 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
         found.append(json.loads(capsys.readouterr().out))
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     fields = torch.stack([lens.fields.x, lens.fields.y])
-    expected = spot_of(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
+    expected = spot_of(image_rays(lens, hexapolar(6)[0]), about=chief_reference(lens, fields))
     radii = number([entry["rms_radius_um"] for entry in found[1]["results"]]).reshape(3, 3)
     torch.testing.assert_close(radii, 1e3 * expected.rms_radius, rtol=1e-12, atol=0)
     assert found[0]["reference"] == "centroid"

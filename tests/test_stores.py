@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 import torch
 
+from raytrace.experiments import Store
 from raytrace.files import append_text
 from raytrace.imaging.codesign import Outcome
-from raytrace.imaging.training import DamagedRun, Run
+from raytrace.imaging.training import DamagedRun, OtherSettings, Run
 from raytrace.materials.catalogs import find_glass
 from raytrace.optimization.search_tasks import BadSearch, Journal, TaskResult
 from raytrace.stores import (
     DamagedLine,
+    Document,
+    Kind,
     Lines,
+    Records,
     Unfit,
     anything,
     either,
@@ -264,6 +268,83 @@ def test_a_damaged_row_of_a_log_is_named_and_the_others_stay(row, tmp_path):
     with pytest.warns(DamagedLine, match="log.csv, line 3: .*; the line is dropped"):
         run.forget_after(9)
     assert run.rows() == [{"step": 0.0, "loss": 1.0}, {"step": 2.0, "loss": 3.0}]
+
+
+# -- the store that all share -----------------------------------------------------------------------------------------
+
+IDENTITY = {"rate": 0.1, "seed": 1}
+KIND = Kind(DamagedRun, "begin anew", OtherSettings, "{path} holds others: {difference}")
+_NUMBER = record({"value": number()})
+
+
+def document(path: Path, of: dict) -> object:
+    store = Document(path, of, KIND)
+    if not path.exists():
+        store.write({"value": 0.1})
+    return store.read(_NUMBER)["value"]
+
+
+def records(path: Path, of: dict) -> object:
+    store = Records(path, of, KIND, _NUMBER)
+    if not (found := store.read()):
+        store.append({"value": 0.1})
+        found = Records(path, of, KIND, _NUMBER).read()
+    return found[0][1]["value"]
+
+
+def folder(path: Path, of: dict) -> object:
+    return Store(path, of).number("value", lambda: 0.1)
+
+
+STORES = {"document": document, "records": records, "folder": folder}
+
+
+@pytest.mark.parametrize("name", STORES)
+def test_a_store_resumes_and_refuses_another_identity_and_damage(name, tmp_path):
+    open_store, path = STORES[name], tmp_path / "kept"
+    assert open_store(path, IDENTITY) == open_store(path, IDENTITY) == 0.1
+    with pytest.raises(OtherSettings, match=r"kept holds .*: rate was 0.1, now 0.2"):
+        open_store(path, IDENTITY | {"rate": 0.2})
+    files = [path] if path.is_file() else [path / "settings.json", path / "value.json"]
+    for file in files:
+        content = file.read_bytes()
+        put(file, "x")
+        with pytest.raises(DamagedRun, match=f"{file.name}, line 1: is no JSON"):
+            open_store(path, IDENTITY)
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", STORES)
+def test_a_store_does_not_wait_for_a_pipe(name, tmp_path):
+    path = tmp_path / "kept"
+    if name == "folder":
+        STORES[name](path, IDENTITY)
+        path = path / "value.json"
+        path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(OSError, match="is not a regular file"):
+        STORES[name](tmp_path / "kept", IDENTITY)
+
+
+def test_files_of_a_run_are_no_pipes(tmp_path):
+    run = Run(tmp_path, {"a": 1})
+    for path in (run.checkpoint, run.log):
+        os.mkfifo(path)
+    with pytest.raises(DamagedRun, match="is not a regular file"):
+        run.load()
+    for read in (run.rows, lambda: run.forget_after(1)):
+        with pytest.raises(OSError, match="is not a regular file"):
+            read()
+
+
+def test_arrays_of_a_store_come_back_and_damaged_ones_are_refused(tmp_path):
+    given = {"heights": np.arange(6.0).reshape(2, 3)}
+    for compute in (lambda: given, None):
+        found = Store(tmp_path, IDENTITY).arrays("a", compute)
+        assert np.array_equal(found["heights"], given["heights"])
+    put(tmp_path / "a.npz", "no archive")
+    with pytest.raises(DamagedRun, match=r"a.npz: no .npz file .*; remove it to compute it again"):
+        Store(tmp_path, IDENTITY).arrays("a", None)
 
 
 # -- labels of elements -----------------------------------------------------------------------------------------------

@@ -12,9 +12,8 @@ import torch
 from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 import raytrace as rt
-from raytrace.maths import pupil
-from raytrace.maths.grid import grid
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import SAMPLINGS, grid, sobol, with_rim
 from raytrace.psf_models import DRT, Execution, psf
 from raytrace.psf_models.drt import kernels_of_rays, stream_kernels
 from raytrace.system.lens import with_object_distance
@@ -59,7 +58,7 @@ def test_points_are_those_of_the_pupil_whatever_the_chunk(sampling, size):
     chunks = list(pupil_chunks(count, size, sampling=sampling, seed=3, like=LIKE, cut=333))
     assert max(chunk.shape[1] for chunk in chunks) <= size
     assert 333 in torch.tensor([chunk.shape[1] for chunk in chunks]).cumsum(0)
-    points = pupil.SAMPLINGS[sampling][0](count, seed=3)[0]
+    points = SAMPLINGS[sampling][0](count, seed=3)[0]
     found = torch.cat(chunks, 1)
     assert torch.equal(found[:, 1:], points[:, 1:])
     # The engine of torch gives its first point in float32.
@@ -79,7 +78,7 @@ def test_points_after_the_last_of_the_sequence_are_those_of_the_next_seed(monkey
     monkeypatch.setattr(streaming, "_SOBOL_POINTS", 1024)
     found = torch.cat(list(pupil_chunks(1500, 256, seed=7, like=LIKE, cut=1100)), 1)
     assert found.shape == (2, 1500)
-    assert torch.equal(found[:, 1025:], pupil.sobol(476, seed=8)[0][:, 1:])
+    assert torch.equal(found[:, 1025:], sobol(476, seed=8)[0][:, 1:])
 
 
 def test_other_samplings_are_refused():
@@ -110,7 +109,7 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_rays_are_those_of_launch(name):
     system = SCENES[name]
-    points = pupil.sobol(200)[0]
+    points = sobol(200)[0]
     rays = launch(system, points)
     points_of_field = torch.stack([system.fields.x, system.fields.y]).unbind(1)
     for f, field in enumerate(points_of_field):
@@ -170,7 +169,7 @@ def test_moments_of_nothing_leave_others_alone():
 @pytest.mark.parametrize("make", [double_gauss, clipped, aspheric_singlet])
 def test_spot_is_that_of_all_rays_at_once(make, distance):
     system = with_object_distance(make(), distance)
-    points, weights = pupil.sobol(3000, seed=4)
+    points, weights = sobol(3000, seed=4)
     whole = spot_of(trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None]), weights)
     found = stream_spot(
         system, 3000, seed=4, wavelengths=COLOURS, max_bytes=SMALL * (9 if make is aspheric_singlet else 1)
@@ -197,7 +196,7 @@ def test_size_of_the_chunk_changes_rounding_alone():
 
 def test_spot_of_all_wavelengths():
     weights = vector(1.0, 3.0)
-    points, equal = pupil.sobol(2000)
+    points, equal = sobol(2000)
     system = double_gauss()
     rays = trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
     found = stream_spots(system, 2000, wavelengths=COLOURS, wavelength_weights=weights, max_bytes=SMALL)[1]
@@ -212,7 +211,7 @@ def test_spot_of_all_wavelengths():
 def test_largest_distance_of_many_rays_lies_between_the_bounds_reported(monkeypatch):
     monkeypatch.setattr(streaming, "_PILOT", 64)
     system = double_gauss()
-    points, weights = pupil.sobol(5000)
+    points, weights = sobol(5000)
     exact = spot_of(trace_lens(system, launch(system, points), system.wavelengths[:, None]), weights).geometric_radius
     found = stream_spot(system, 5000, max_bytes=SMALL)
     assert bool((found.geometric_radius <= exact * (1 + 1e-9)).all())
@@ -222,7 +221,7 @@ def test_largest_distance_of_many_rays_lies_between_the_bounds_reported(monkeypa
 
 def test_rim_counts_for_the_largest_distance_alone():
     system = double_gauss()
-    points, weights = pupil.with_rim(*pupil.sobol(500))
+    points, weights = with_rim(*sobol(500))
     whole = spot_of(trace_lens(system, launch(system, points), system.wavelengths[:, None]), weights)
     found = stream_spot(system, 500, rim=72)
     assert torch.allclose(found.geometric_radius, whole.geometric_radius, rtol=1e-9, atol=0)
@@ -327,7 +326,7 @@ def test_gradient_is_that_of_all_rays_at_once(distance):
     scale, idle = scalar(1.01).requires_grad_(), scalar(3.0).requires_grad_()
     leaves = [*curvatures, scale, idle]
     system = with_object_distance(bent(curvatures, scale), distance)
-    points, weights = pupil.sobol(1000)
+    points, weights = sobol(1000)
     rays = trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
     merit = spot_of(rays, weights).mean_square_radius.mean()
     exact = torch.autograd.grad(merit, leaves[:-1], retain_graph=True)
@@ -396,7 +395,7 @@ import ctypes, resource, sys, torch
 sys.path.insert(0, "tests")
 from problems import double_gauss, aspheric_singlet, vector
 from raytrace.tracing import streaming
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models import DRT, Execution, psf
 from raytrace.tracing.streaming import mean_square_gradient
 import dataclasses

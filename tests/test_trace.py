@@ -21,9 +21,8 @@ from problems import (
 )
 
 from raytrace.materials.glass import MIRROR, sellmeier
-from raytrace.maths import pupil
-from raytrace.maths.numerics import dot
-from raytrace.maths.value import to
+from raytrace.maths.numerics import dot, to
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.intersection import normal
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays, start
@@ -364,7 +363,7 @@ def test_autocast_does_not_touch_the_trace():
 def test_fields_wavelengths_and_pupil_together_equal_one_at_a_time():
     flint = sellmeier([1.34, 0.2, 0.93], [0.0099, 0.0447, 111.9])
     system = double_gauss(glasses=(flint, flint, flint), wavelengths=(0.45, 0.53, 0.65))
-    points, _ = pupil.hexapolar(2)
+    points, _ = hexapolar(2)
     whole = trace_lens(system, launch(system, points), system.wavelengths[:, None])
     assert whole.position.shape == (3, 3, 3, 19)
     for f in range(3):

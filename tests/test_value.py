@@ -10,7 +10,7 @@ from torch.utils import _pytree as pytree
 
 import raytrace as rt
 from raytrace.materials.glass import AIR
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import trace_lens

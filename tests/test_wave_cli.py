@@ -19,7 +19,7 @@ import raytrace as rt
 from raytrace.cli import wave_options
 from raytrace.cli.commands import WAVE_COMMANDS
 from raytrace.materials.glass import index
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import BASELINES, aim, baseline
 from raytrace.wave_optics.element_files import read_element, read_label, write_element

@@ -9,7 +9,7 @@ from problems import number
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.maths.zernike import noll, polynomials
 from raytrace.wave_optics.element import (
     Element,

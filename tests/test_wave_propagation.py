@@ -11,7 +11,7 @@ from problems import scalar, vector
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models.dft import bessel_j1, integrate
 from raytrace.wave_optics import propagation, pupil
 from raytrace.wave_optics.compute import psf

@@ -11,7 +11,7 @@ from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import InvalidIndex, OutOfRange, sellmeier
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.psf_models.dft import phasor
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import psf

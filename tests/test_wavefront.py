@@ -7,7 +7,7 @@ import torch
 from problems import double_gauss, lens, scalar, stigmatic_problems, surface, vector
 from test_trace import rays_of_problem
 
-from raytrace.maths import pupil
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import media
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import trace_lens, trace_surfaces
@@ -29,7 +29,7 @@ def test_perfect_image_has_no_wavefront_error(problem, radius):
 def test_path_does_not_depend_on_where_the_rays_are_taken():
     """Free propagation changes the foot on the plane, not the wavefront."""
     here = double_gauss()
-    points, _ = pupil.hexapolar(3)
+    points, _ = hexapolar(3)
     surfaces = list(here.surfaces)
     surfaces[-2] = surface(float(surfaces[-2].curvature), 40.0)
     behind = dataclasses.replace(here, surfaces=tuple(surfaces))
@@ -60,7 +60,7 @@ def test_opd_gives_back_the_transverse_aberration():
 
 def test_no_subtraction_of_long_paths():
     """An object 10¹² mm away costs no digits: its wavefront tends to that of infinity as 1/distance."""
-    points, _ = pupil.hexapolar(3)
+    points, _ = hexapolar(3)
     found = []
     for distance in (float("inf"), 1e12):
         system = double_gauss(object_distance=distance)

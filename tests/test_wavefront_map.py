@@ -9,7 +9,7 @@ from differences import gradcheck
 from problems import vector
 
 from raytrace.maths.numerics import dot
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import scene, trace_scene

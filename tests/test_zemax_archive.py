@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_catalog import SMALL
+from test_catalogs import SMALL
 from test_zemax import file as singlet
 
 from raytrace import check

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from raytrace.maths import zernike
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 
 EXACT = 1e-12  # rounding of sums over a few thousand points
 

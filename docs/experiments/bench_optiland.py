@@ -36,7 +36,7 @@ from torch import Tensor
 
 from raytrace.bench.report import digits, table
 from raytrace.materials.glass import AIR, Glass, from_table
-from raytrace.maths.pupil import gauss_legendre
+from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.optimize import optimize
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Row, Vary

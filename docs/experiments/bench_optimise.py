@@ -24,11 +24,10 @@ from matplotlib.figure import Figure
 from raytrace.bench.report import Measured, Request, digits, in_words, table
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
-from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
-from raytrace.optimization.variables import freedom, name_of
+from raytrace.optimization.variables import Model, freedom, name_of
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare

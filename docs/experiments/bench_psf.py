@@ -33,9 +33,8 @@ from raytrace.bench.psf import (
 )
 from raytrace.bench.psf_cases import Method
 from raytrace.bench.report import Measured, Request, milliseconds, table, yes
-from raytrace.maths import pupil
-from raytrace.maths.grid import Grid
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import Grid, random
 from raytrace.psf_models import drt
 from raytrace.psf_models.result import Kernels
 from raytrace.tracing.scene import Scene
@@ -55,7 +54,7 @@ SQUARE = (64, 96)  # points across the square pupil grids that are run
 def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int = PIECE, seed: int = 0) -> Kernels:
     """The histogram of independent random rays, in pieces."""
     generator = torch.Generator().manual_seed(seed)
-    sampling = functools.partial(pupil.random, generator=generator)
+    sampling = functools.partial(random, generator=generator)
     sizes = [min(piece, count - first) for first in range(0, count, piece)]
     parts = [drt.kernels_of_rays(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
     centroid, covariance, kernel = (

@@ -31,7 +31,7 @@ from raytrace.bench.report import Measured, Request, significant, table, yes
 from raytrace.cli.progress import progress
 from raytrace.cli.run import say
 from raytrace.io import read_lens
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_even

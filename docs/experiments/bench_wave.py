@@ -25,9 +25,9 @@ from raytrace.bench.measure import clock, name_of, nothing
 from raytrace.bench.report import Measured, Request, digits, table, yes
 from raytrace.cli.progress import progress
 from raytrace.materials.glass import index
-from raytrace.maths.grid import grid
+from raytrace.maths.numerics import to
 from raytrace.maths.result import number
-from raytrace.maths.value import to
+from raytrace.maths.sampling import grid
 from raytrace.pages import measured
 from raytrace.plotting import style
 from raytrace.psf_models.dft import Aliased, phasor

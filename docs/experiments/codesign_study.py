@@ -31,7 +31,7 @@ from raytrace.imaging.codesign import camera as camera_at_start
 from raytrace.imaging.image import blur
 from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.training import load_state, read_log, read_state
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.launch import launch

@@ -33,8 +33,8 @@ from raytrace.imaging.pictures import Pictures, crop, dead_leaves
 from raytrace.imaging.variables import PhaseVariables
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
-from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
+from raytrace.maths.sampling import grid
 from raytrace.plotting.style import GREY, array, field_colour, framed, new_figure, number_text, styled
 from raytrace.plotting.style import save as save_figure
 from raytrace.psf_models.dft import phasor

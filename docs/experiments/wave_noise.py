@@ -59,8 +59,8 @@ from raytrace.imaging.wave_camera import (
     transfer,
 )
 from raytrace.imaging.wave_design import WaveCamera
+from raytrace.maths.numerics import detached
 from raytrace.maths.result import Result
-from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
 from raytrace.plotting.style import INK, new_figure, styled
 from raytrace.settings import DesignSettings

@@ -19,15 +19,13 @@ from raytrace.analysis.setting import (
     unvignetted,
 )
 from raytrace.analysis.spot_diagram import airy_radius
-from raytrace.maths.dual import divide
-from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
+from raytrace.maths.numerics import divide, dot_2, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, masked
-from raytrace.maths.value import value
 from raytrace.plotting.style import FAINT, new_figure, styled
 from raytrace.system.lens import Lens
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import is_at_infinity
 from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
+from raytrace.tracing.trace import is_bent
 
 NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
 NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration

@@ -6,7 +6,7 @@ from torch import Tensor
 from raytrace.analysis.panels import chart, drawn_at_least, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order

@@ -8,18 +8,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.grid import Grid, grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis, number, numbers
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.result import Column, Result, Table, axis, number, numbers
+from raytrace.maths.sampling import Grid, grid
 from raytrace.plotting.style import array, styled
 from raytrace.psf_models.figures import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths
-from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.focus import NoImage, focused, real_image_distance
 from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.trace import need_axis
 
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
@@ -31,15 +30,15 @@ _SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first 
 _AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
 
 
-#: Properties of each model: attribute, heading of its column; and the whole numbers among them.
-_SHOWN = {
-    "conic": "Δ conic",
-    "anisotropy": "σ long/short",
-    "asymmetry": "asymmetry",
-    "dark_ring": "dark ring/Airy",
-    "parameters": "parameters",
-    "rays": "rays",
-}
+#: Properties of each model, and the whole numbers among them.
+_SHOWN = (
+    Column("conic", "", ".4f", "Δ conic"),
+    Column("anisotropy", "", ".4f", "σ long/short"),
+    Column("asymmetry", "", ".4f"),
+    Column("dark_ring", "", ".4f", "dark ring/Airy"),
+    Column("parameters", "", ".0f"),
+    Column("rays", "", ".0f"),
+)
 _WHOLE = ("parameters", "rays")
 
 
@@ -56,6 +55,8 @@ class Abilities(Result):
     rays: traced for one kernel on the axis.
     """
 
+    COLUMNS = (Column("model", form="<"), *_SHOWN)
+
     conic: Tensor
     anisotropy: Tensor
     asymmetry: Tensor
@@ -66,27 +67,17 @@ class Abilities(Result):
 
     def columns(self) -> dict[str, Tensor]:
         model = torch.arange(len(self.models), device=self.conic.device)
-        return {"model": model, **{name: getattr(self, name) for name in _SHOWN}}
+        return {"model": model, **{column.name: getattr(self, column.name) for column in _SHOWN}}
 
     def words(self) -> dict:
         return {"model": self.models}
 
     def of(self, m: int) -> dict[str, float | int | None]:
         """The answers of one model."""
-        return {name: (int if name in _WHOLE else number)(getattr(self, name)[m]) for name in _SHOWN}
+        return {name: (int if name in _WHOLE else number)(getattr(self, name)[m]) for name, *_ in _SHOWN}
 
-    def __str__(self) -> str:
-        said = ["what each model can represent: see `raytrace compare --help`"]
-        said.append(f"{'':>14} " + " ".join(f"{heading:>15}" for heading in _SHOWN.values()))
-        for m, name in enumerate(self.models):
-            said.append(f"{name:>14} " + " ".join(f"{_cell(shown):>15}" for shown in self.of(m).values()))
-        return "\n".join(said)
-
-
-def _cell(shown: float | int | None) -> str:
-    if shown is None:
-        return "none"
-    return f"{shown}" if isinstance(shown, int) else "0" if abs(shown) < 1e-12 else f"{shown:.4f}"
+    def tables(self) -> list[Table]:
+        return [Table(self.columns(), ["properties that each model can represent: see `raytrace compare --help`"])]
 
 
 @value
@@ -157,21 +148,24 @@ class Comparison(Result):
         place = {"sensor_distance": number(self.sensor_distance), "wavelength": number(self.wavelength)}
         return {**place, "models": models}
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
+        """A row for each model, and for each object distance its σ, difference and error."""
         pixels = self.psfs[-1].grid
         size = f"{pixels.columns} × {pixels.rows} pixels of {1000 * float(pixels.pitch):g} µm"
-        distances = " ".join(f"{f'{distance:g} mm':>24}" for distance in self.object_distances.tolist())
-        said = [
+        title = [
             f"{self.sensor}; on the axis, {size}",
             f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {self.models[-1]}, "
-            "estimated error of the kernel (Gaussian DRT: of σ)",
-            f"{'object at':>14} {distances}",
+            "estimated error of the kernel (Gaussian DRT: of σ), for objects at",
         ]
-        columns = (values.tolist() for values in (self.sigma, self.difference, self.error))
-        for name, *row in zip(self.models, *columns, strict=True):
-            cells = (f"{1000 * s:>8.3f} {d:>6.3f} {e:>8.1e}" for s, d, e in zip(*row, strict=True))
-            said.append(f"{name:>14} " + " ".join(cells))
-        return "\n".join([*said, *([] if self.abilities is None else [str(self.abilities)])])
+        columns = {Column("model", form="<"): self.models}
+        table = self.columns()
+        for k, distance in enumerate(self.object_distances.tolist()):
+            columns |= {
+                Column(f"sigma {k}", "µm", ".3f", f"{distance:g} mm\nσ"): table["sigma_um"][:, k],
+                Column(f"difference {k}", "", ".3f", " \nΔ"): table["difference"][:, k],
+                Column(f"error {k}", "", ".1e", " \nerror"): table["error"][:, k],
+            }
+        return [Table(columns, title, [] if self.abilities is None else [str(self.abilities)])]
 
     @styled
     def draw(self, *, log: bool = False):
@@ -279,7 +273,7 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
                 "rays": model.compared["model"].rays if "model" in model.compared else focused.rays,
             }
         )
-    table = {key: lens.wavelengths.new_tensor([float(row[key]) for row in rows]) for key in _SHOWN}
+    table = {key: lens.wavelengths.new_tensor([float(row[key]) for row in rows]) for key, *_ in _SHOWN}
     return Abilities(**table, models=tuple(model.title for model in _ROWS))
 
 

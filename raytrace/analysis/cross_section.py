@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.pupil import fan
+from raytrace.maths.sampling import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect

@@ -18,8 +18,7 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, afford, piece
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.plotting.style import GREY, array, styled
 from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector

@@ -7,10 +7,9 @@ from torch import Tensor
 from raytrace.analysis.panels import by_wavelength, drawn_at_least, field_labels, finished, ruled, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import fan as pupil_fan
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, masked
-from raytrace.maths.value import value
+from raytrace.maths.sampling import fan as pupil_fan
 from raytrace.plotting.style import GREY, array, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.spot import chief_arrives, image_rays

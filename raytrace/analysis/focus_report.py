@@ -21,10 +21,9 @@ from raytrace.analysis.spot_diagram import (
     wavelength_handles,
 )
 from raytrace.io import write_lens
-from raytrace.maths import pupil
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, number, numbers, object_text, rows
-from raytrace.maths.value import detached, value
+from raytrace.maths.numerics import detached, safe_divide, value
+from raytrace.maths.result import Column, Result, Table, number, numbers, object_text
+from raytrace.maths.sampling import sampled
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -76,6 +75,11 @@ class Focus(Result):
     of least RMS spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their
     weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated.
     """
+
+    COLUMNS = (
+        Column("place", form="<", heading=" "), Column("sensor_distance", "mm", ".6f", "sensor distance"),
+        Column("rms_radius_um", "µm", ".4f", "RMS spot radius"),
+    )  # fmt: skip
 
     lens: Lens
     before: Lens
@@ -138,7 +142,7 @@ class Focus(Result):
             "is_real": self.is_real,
         }
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         data = first_order(self.before)
         diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
         focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
@@ -150,14 +154,10 @@ class Focus(Result):
             f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
             f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
             f"  object at {objects}; field {fields} {self.before.fields.unit}; {colours} µm; "
-            f"criterion {self.criterion}\n",
-            f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
+            f"criterion {self.criterion}",
+            "",
         ]
-        for row, (words, _) in zip(rows(self.columns()), self._sensors(), strict=True):
-            rms = row["rms_radius_um"]
-            radius = "no rays" if rms is None else f"{rms:>15.4f} µm"
-            lines.append(f"  {words:<28} {row['sensor_distance']:>15.6f} mm {radius}")
-        return "\n".join(lines)
+        return [Table(self.columns(), lines)]
 
     def _sensors(self) -> list[tuple[str, Tensor]]:
         """Sensor distances with their names."""
@@ -232,7 +232,7 @@ def focus(
     weighted mean of those of several objects; "mean", least mean distance from the centroid.
     object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
     wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
-    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
+    as for `sampling.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
     """
     if criterion not in ("rms", "paraxial", "mean"):
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
@@ -242,7 +242,7 @@ def focus(
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
     warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness
-    at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    at, weights = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)
     scene = {
         "object_distances": distances,

@@ -14,9 +14,8 @@ from raytrace.analysis.setting import (
     refuse_axis,
     unvignetted,
 )
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Column, axis, cell, masked
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.result import Column, Table, axis, masked
 from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
@@ -60,7 +59,7 @@ class GridDistortion(Analysis):
             "ideal_y": ideal_y,
             "actual_x": x,
             "actual_y": y,
-            "distortion_percent": masked(100 * self.distortion, self.valid),
+            "distortion_percent": self._percent(),
         }
 
     def summary(self) -> dict[str, Tensor]:
@@ -71,14 +70,19 @@ class GridDistortion(Analysis):
         shown = torch.where(self.valid, self.distortion, 0.0).flatten(1)
         return shown.gather(1, shown.abs().argmax(1, keepdim=True))[:, 0]
 
-    def __str__(self) -> str:
-        """A map in per cent for each wavelength, top row first."""
-        lines = []
-        maps = masked(100 * self.distortion, self.valid)
-        for wavelength, largest, grid in zip(self.wavelengths.tolist(), self.largest().tolist(), maps, strict=True):
-            lines.append(f"distortion in % at {wavelength:g} µm over the grid, largest {100 * largest:.6f} %")
-            lines += ["".join(cell(value, ">9.4f") for value in row) for row in grid.flip(0).tolist()]
-        return "\n".join(lines)
+    def tables(self) -> list[Table]:
+        """A map in per cent for each wavelength: y of the grid in rows, the top row first, x in columns."""
+        unit = self.column("field_x").unit or "tan θ"
+        x, y = self.fields[0, 0].tolist(), self.fields[1, :, 0].tolist()
+        tables = []
+        for wavelength, largest, grid in zip(self.wavelengths, self.largest(), self._percent(), strict=True):
+            columns = {Column(f"x = {number:.4g}", form=".4f"): grid[:, k].flip(0) for k, number in enumerate(x)}
+            title = f"distortion in % at {wavelength:g} µm over the grid ({unit}), largest {100 * largest:.6f} %"
+            tables.append(Table({Column("y"): [f"{number:.4g}" for number in y[::-1]], **columns}, [title]))
+        return tables
+
+    def _percent(self) -> Tensor:
+        return masked(100 * self.distortion, self.valid)
 
     @styled
     def draw(self, *, exaggerate: float = 1.0):

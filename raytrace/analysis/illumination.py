@@ -10,9 +10,8 @@ from raytrace.analysis.panels import chart, few, field_axis, field_name, finishe
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, refuse_axis, scene_of, setting, shown, wavelength_shares
 from raytrace.maths import zernike
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, field_colour, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.wavefront import wavefront_of

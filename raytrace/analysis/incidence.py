@@ -7,9 +7,8 @@ from torch import Tensor
 from raytrace.analysis.panels import DASHES, chart, finished, wavelength_label
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setting
-from raytrace.maths.numerics import dot
-from raytrace.maths.result import masked
-from raytrace.maths.value import value
+from raytrace.maths.numerics import dot, value
+from raytrace.maths.result import Table, masked
 from raytrace.plotting.style import GREY, INK, array, field_colour, styled
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
@@ -54,8 +53,8 @@ class Incidence(OverField):
         angles = masked(self.angle, self.valid)[..., -1].unbind(2)
         return {**self.heads(wavelength=self.wavelengths), "height": height, **dict(zip(_RAYS, angles, strict=True))}
 
-    def __str__(self) -> str:
-        return self.table(self.columns() if self.surfaces else self.summary())
+    def tables(self) -> list[Table]:
+        return [Table(self.columns() if self.surfaces else self.summary())]
 
     def at(self, fields: Tensor) -> "Incidence":
         return _incidence(self.lens, fields)

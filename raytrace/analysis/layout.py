@@ -12,9 +12,9 @@ from torch import Tensor
 
 from raytrace.analysis import cross_section, layout_3d
 from raytrace.analysis.panels import first_order_text
-from raytrace.maths.pupil import fan, hexapolar
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, numbers
-from raytrace.maths.value import detached, value
+from raytrace.maths.sampling import fan, hexapolar
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import (

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis import cross_section
-from raytrace.maths.pupil import fan
+from raytrace.maths.sampling import fan
 from raytrace.plotting import style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import Lens, media

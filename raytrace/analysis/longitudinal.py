@@ -6,14 +6,13 @@ from torch import Tensor
 from raytrace.analysis.panels import by_wavelength, chart, drawn_at_least, finished, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, like
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import axis, masked
-from raytrace.maths.value import value
 from raytrace.plotting.style import GREY, array, styled
 from raytrace.system.lens import Lens, with_wavelengths
-from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import need_axis
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that replaces the central one leaves 1e-8 of the spherical aberration
 

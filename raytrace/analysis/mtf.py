@@ -24,10 +24,9 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import axis
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.result import Table, axis
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
@@ -80,8 +79,8 @@ class Mtf(Analysis):
     def drawn(self) -> "Mtf":
         return _mtf(self.lens, self.fields, fine(self.frequencies), self.by_rays)
 
-    def __str__(self) -> str:
-        return "\n".join([Analysis.__str__(self), *_remarks(self)])
+    def tables(self) -> list[Table]:
+        return _tables(self)
 
     @styled
     def draw(self):
@@ -120,8 +119,8 @@ class ThroughFocusMtf(Analysis):
     def about(self) -> dict:
         return {"transfer": transfer(self)}
 
-    def __str__(self) -> str:
-        return "\n".join([Analysis.__str__(self), *_remarks(self)])
+    def tables(self) -> list[Table]:
+        return _tables(self)
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -265,11 +264,11 @@ def transfer(found: Mtf | ThroughFocusMtf) -> str:
     return f"diffraction (geometric for {names})"
 
 
-def _remarks(found: Mtf | ThroughFocusMtf) -> list[str]:
-    """A line of text on fields that are geometric unasked."""
-    if not bool(found.by_rays.any()):
-        return []
-    return [f"transfer: {transfer(found)}"]
+def _tables(found: Mtf | ThroughFocusMtf) -> list[Table]:
+    """The table, with a line on fields that are geometric by default."""
+    table = found.thinned(found.columns(), found.EVERY)
+    note = [f"transfer: {transfer(found)}"] if bool(found.by_rays.any()) else []
+    return [table._replace(notes=[*table.notes, *note])]
 
 
 def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:

@@ -25,14 +25,13 @@ from torch import Tensor
 from raytrace.analysis.setting import refuse_dark
 from raytrace.budget import forewarn, piece
 from raytrace.maths import zernike
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_legendre, gauss_rings
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.psf_models.dft import TooManyPoints, phasor
 from raytrace.system.apertures import stands_inside
 from raytrace.system.lens import name_of_field
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene, beam_share
+from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 _PROBE = 10, 40

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from raytrace.analysis.setting import field_line, refuse_axis
 from raytrace.maths.numerics import broadcast_shape
-from raytrace.maths.result import Result, axis, flat, rows, text_table
+from raytrace.maths.result import Column, Result, Table, axis, rows
 
 _FINE = 321  # points of a curve over frequency or radius, when it is drawn
 
@@ -54,21 +54,22 @@ class Analysis(Result):
         """The same curves with points as close as a drawn line needs."""
         return self
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         summary = self.summary()
-        return self.table(summary) if summary else self.table(self.columns(), self.EVERY)
+        return [Table(summary) if summary else self.thinned(self.columns(), self.EVERY)]
 
-    def table(self, columns: dict[str, Tensor], every: int = 1) -> str:
-        """Columns as text under their names and units, every `every`-th point of longer curves."""
+    def thinned(self, columns: dict[str, Tensor], every: int) -> Table:
+        """Columns of every `every`-th point of longer curves, along the last axis."""
         length = broadcast_shape(*(c.shape for c in columns.values()))[-1]
-        thin = every if length > 2 * every else 1
-        listed = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
-        if "field_x" in listed and not listed["field_x"].any():
-            del listed["field_x"]
-        lines = text_table({self.column(name): column for name, column in listed.items()}, "  ")
-        if thin > 1:
-            lines.append(f"{len(range(0, length, thin))} of {length} points of each curve; --json lists all")
-        return "\n".join(lines)
+        if every == 1 or length <= 2 * every:
+            return Table(columns)
+        thin = {name: c[..., ::every] if c.shape[-1] == length else c for name, c in columns.items()}
+        return Table(thin, notes=[f"{len(range(0, length, every))} of {length} points of each curve; --json lists all"])
+
+    def by_wavelength(self, values: Tensor, unit: str = "", form: str = ".6g") -> dict[Column, Tensor]:
+        """Columns of text of values (..., W), one for each wavelength."""
+        headings = (f"{wavelength:g} µm" for wavelength in self.wavelengths.tolist())
+        return dict(zip((Column(name, unit, form) for name in headings), values.unbind(-1), strict=True))
 
 
 def fine(places: Tensor) -> Tensor:

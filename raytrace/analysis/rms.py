@@ -10,12 +10,11 @@ from raytrace.analysis.fans import REFERENCES
 from raytrace.analysis.panels import by_wavelength, chart, field_axis, field_name, finished
 from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting, wavelength_shares
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Column, cell
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_sqrt, value
+from raytrace.maths.result import Column, Table
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, array, styled
-from raytrace.system.lens import Lens, name_of_field
+from raytrace.system.lens import Lens
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of
 
@@ -42,7 +41,11 @@ class RmsOverField(OverField):
     reference: str
 
     COMMAND = "rms-over-field"
-    COLUMNS = Column("rms", "waves"), Column("polychromatic", "waves")
+    COLUMNS = (
+        Column("rms", "waves"), Column("strehl", "", ".4f", "Strehl"),
+        Column("polychromatic", "waves", heading="all, weighted"),
+        Column("polychromatic_um", "µm", heading="all, weighted"),
+    )  # fmt: skip
 
     @property
     def quantity(self) -> str:
@@ -63,19 +66,11 @@ class RmsOverField(OverField):
         table = {**self.heads(), **self._listed("polychromatic")}
         return table if self.strehl is None else {**table, "strehl": self.strehl}
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         """A row for each field, a column for each wavelength."""
-        (rms,), (together,) = (self._listed(name).items() for name in ("rms", "polychromatic"))
-        heads = ["all, weighted", *(f"{wavelength:g} µm" for wavelength in self.wavelengths.tolist())]
-        table = torch.cat([together[1][:, None], rms[1]], 1)
-        names = ["field", *map(name_of_field, self.fields.T)]
-        texts = [[f"{head:>14}" for head in heads], *([cell(x, ">14.6g") for x in row] for row in table.tolist())]
-        if self.strehl is not None:
-            ratios = ["Strehl".rjust(13), *(cell(ratio, ">13.4f") for ratio in self.strehl.tolist())]
-            texts = [[*row, ratio] for row, ratio in zip(texts, ratios, strict=True)]
-        lines = [f"{name:>10}" + "".join(row) for name, row in zip(names, texts, strict=True)]
-        lines.insert(1, f"{self.lens.fields.unit:>10}" + f"{self.column(rms[0]).unit:>14}" * len(heads))
-        return "\n".join(lines)
+        ((name, rms),), summary = self._listed("rms").items(), self.summary()
+        strehl = {"strehl": summary.pop("strehl")} if "strehl" in summary else {}
+        return [Table({**summary, **self.by_wavelength(rms, self.column(name).unit), **strehl})]
 
     def at(self, fields: Tensor) -> "RmsOverField":
         return _rms(self.lens, fields, self.quantity == "spot", self.reference, (self.points, self.weights))

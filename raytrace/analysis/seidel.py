@@ -19,14 +19,14 @@ from torch import Tensor
 from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
-from raytrace.maths.result import Column, cell
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.result import Column, Table
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
-from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import is_at_infinity, paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
+from raytrace.tracing.trace import need_axis
 from raytrace.words import named, with_article
 
 _SEIDEL = {
@@ -61,7 +61,12 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
-    COLUMNS = property(lambda self: [Column(name, self.unit) for name in self.names])
+    COLUMNS = property(
+        lambda self: [
+            *(Column(name, self.unit) for name in self.names),
+            Column("marginal_yni", "mm", heading="y n i"), Column("chief_yni", "mm", heading="ȳ n ī"),
+        ]
+    )  # fmt: skip
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
@@ -80,23 +85,19 @@ class Seidel(Analysis):
         total = self.contributions.sum(-1)
         return {**self.heads(), **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         """A table for each field: a row for each surface, and their sums, of which y n i has none."""
-        lines = []
+        surfaces = [*map(str, range(1, self.contributions.shape[-1] + 1)), "sum"]
+        heights = {"marginal_yni": self.marginal_yni, "chief_yni": self.chief_yni}
+        tables = []
         for f, field in enumerate(self.fields.unbind(1)):
-            invariant = cell(abs(float(self.invariant[f])), ".6g")
-            lines.append(
-                f"field {field_words(self.lens, field)}, optical invariant {invariant} mm, aberrations in {self.unit}"
-            )
-            columns = dict(zip(self.names, self.contributions[:, f], strict=True))
-            sums = [column.sum() for column in columns.values()]
+            columns = {name: [*row, row.sum()] for name, row in zip(self.names, self.contributions[:, f], strict=True)}
             if self.kind == "coefficients":
-                columns |= {"y n i": self.marginal_yni[f], "ȳ n ī": self.chief_yni[f]}
-            lines.append(f"{'surface':>7}" + "".join(f"{name:>13}" for name in columns))
-            for k, row in enumerate([*zip(*columns.values(), strict=True), sums], 1):
-                name = k if k <= self.contributions.shape[-1] else "sum"
-                lines.append(f"{name:>7}" + "".join(cell(float(value), ">13.6g") for value in row))
-        return "\n".join(lines)
+                columns |= {name: [*values[f], ""] for name, values in heights.items()}
+            invariant = f"optical invariant {abs(float(self.invariant[f])):.6g} mm"
+            title = f"field {field_words(self.lens, field)}, {invariant}"
+            tables.append(Table({Column("surface"): surfaces, **columns}, [title]))
+        return tables
 
     @styled
     def draw(self):

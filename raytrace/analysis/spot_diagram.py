@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.panels import first_order_text
-from raytrace.maths import pupil
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
-from raytrace.maths.result import Column, Result, axis, number, numbers, text_table
-from raytrace.maths.value import detached, value
+from raytrace.maths.numerics import detached, safe_divide, value
+from raytrace.maths.result import Column, Result, Table, axis, number, numbers
+from raytrace.maths.sampling import gauss_rings, hexapolar, sampled, sobol, with_rim
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -52,14 +50,10 @@ class Spots(Result):
     lens, fields: (2, F). The table has a row a spot; `save` writes the rays.
     """
 
-    COLUMNS = property(
-        lambda self: [
-            Column("field_x", self.lens.fields.unit), Column("field_y", self.lens.fields.unit, ">10g", "field"),
-            Column("wavelength", "µm", ">11g"), Column("centroid_x", "mm", ">13.7f", "centroid x"),
-            Column("centroid_y", "mm", ">13.7f", "centroid y"), Column("rms_radius_um", "µm", ">10.4f", "RMS"),
-            Column("geometric_radius_um", "µm", ">10.4f", "GEO"),
-            Column("lost", "", ">11.0f" if self.arrivals is None else ">7.0f", "rays\nlost"),
-        ]
+    COLUMNS = (
+        Column("centroid_x", "mm", ".7f", "centroid x"), Column("centroid_y", "mm", ".7f", "centroid y"),
+        Column("rms_radius_um", "µm", ".4f", "RMS"), Column("geometric_radius_um", "µm", ".4f", "GEO"),
+        Column("lost", "", ".0f", "rays\nlost"),
     )  # fmt: skip
 
     lens: Lens
@@ -107,19 +101,19 @@ class Spots(Result):
             found["vignetted"] = int((self.arrivals.status[f, w] == STATUS.index("vignetted")).sum())
         return {**found, "launched": self.launched}
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         """A row for each spot, and one for each field of several wavelengths together."""
         waves = [f"{wavelength:g}" for wavelength in self.lens.wavelengths.tolist()]
-        several, whole = len(waves) > 1, _figures(self.whole)
-        colours = [*waves, *["all"] * several]
-        places = [(field, k < len(waves)) for field in self.fields.unbind(1) for k in range(len(colours))]
-        listed = {"field_y": [name_of_field(field) if single else "" for field, single in places]}
-        listed["wavelength"] = colours * self.fields.shape[1]
-        for name, values in _figures(self.each).items():
-            listed[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten().tolist()
-        rays = zip(listed.pop("rays"), places, strict=True)
-        listed["lost"] = [f"{self.launched - count}" if single else "" for count, (_, single) in rays]
-        return "\n".join(line.rstrip() for line in text_table({self.column(n): v for n, v in listed.items()}))
+        several = len(waves) > 1
+        together = [""] * several
+        whole, each = _figures(self.whole), _figures(self.each)
+        fields, lost = map(name_of_field, self.fields.unbind(1)), (self.launched - each.pop("rays")).tolist()
+        columns = {"field_y": [text for field in fields for text in (*[field] * len(waves), *together)]}
+        columns["wavelength"] = [*waves, *["all"] * several] * self.fields.shape[1]
+        for name, values in each.items():
+            columns[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten()
+        columns["lost"] = [text for row in lost for text in (*map(str, row), *together)]
+        return [Table(columns)]
 
     @style.styled
     def draw(self):
@@ -188,7 +182,7 @@ def spot(
     """The spot of every field and wavelength on the sensor, differentiable in every number of the lens.
 
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; wavelengths: µm, alike in weight,
-    the first one primary, by default the lens's. sampling, rings, points, seed: as for `pupil.sampled`; rays: instead,
+    the first one primary, by default the lens's. sampling, rings, points, seed: as for `sampled`; rays: instead,
     so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
     and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
     weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
@@ -206,11 +200,11 @@ def spot(
         how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}
         return _of_many(lens, fields, rays, "random" if sampling == "random" else "sobol", progress, **how)
     like = lens.surfaces[-2].thickness
-    at, shares = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    at, shares = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     if weights == "equal":
         shares = torch.full_like(shares, 1 / len(shares))
     else:  # the rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss
-        at, shares = pupil.with_rim(at, shares)
+        at, shares = with_rim(at, shares)
     each = iter if progress is None else lambda work: progress(work, "field")
     found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
@@ -243,7 +237,7 @@ def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray
     else:
         with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
             each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
-    tried = pupil.sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
+    tried = sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
     warn_of_failures(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
     return Spots(lens, fields, each, whole)
 

@@ -12,9 +12,9 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths import zernike
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Column, cell
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.result import Column, Table
+from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
@@ -67,21 +67,23 @@ class WavefrontMap(Analysis):
         measures = {name: getattr(self, name) for name in ("rms", "peak_to_valley", "strehl")}
         return {**self.heads(wavelength=self.wavelengths), **measures}
 
-    def __str__(self) -> str:
-        listed = [self._listed(f) for f in range(self.fields.shape[1])] if self.listed else []
-        return "\n\n".join([self.table(self.summary()), *listed])
-
-    def _listed(self, field: int) -> str:
-        """The coefficients of one field: a row for each term, a column for each wavelength."""
+    def tables(self) -> list[Table]:
+        """The summary, and if `listed` the coefficients of each field: a row for each term, a column a wavelength."""
+        tables = [Table(self.summary())]
         order, unity = zernike.NUMBERINGS[self.numbering]
-        name = f"{self.numbering.capitalize()} coefficients of field {field_words(self.lens, self.fields[:, field])}"
-        heads = "".join(f"{f'{wavelength:g} µm':>14}" for wavelength in self.wavelengths.tolist())
-        lines = [f"{name}, {_UNITS[unity]}", f"{'j':>3} {'n':>3} {'m':>3}  {'term':<26}{heads}"]
-        for j, row in enumerate(self.coefficients[field].T.tolist(), 1):
-            n, m = order(j)
-            cells = "".join(cell(c, ">14.8f") for c in row)
-            lines.append(f"{j:>3} {n:>3} {m:>3}  {zernike.WORDS.get((n, m), ''):<26}{cells}")
-        return "\n".join(lines)
+        for field, values in zip(self.fields.T, self.coefficients, strict=True) if self.listed else ():
+            terms = range(1, values.shape[-1] + 1)
+            n, m = zip(*map(order, terms), strict=True)
+            columns = {
+                Column("j"): terms,
+                Column("n"): n,
+                Column("m"): m,
+                Column("term", form="<"): [zernike.WORDS.get(nm, "") for nm in zip(n, m, strict=True)],
+                **self.by_wavelength(values.T, form=".8f"),
+            }
+            name = f"{self.numbering.capitalize()} coefficients of field {field_words(self.lens, field)}"
+            tables.append(Table(columns, ["", f"{name}, {_UNITS[unity]}"]))
+        return tables
 
     @styled
     def draw(self):

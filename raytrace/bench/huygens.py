@@ -13,8 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.maths.grid import Grid
-from raytrace.maths.pupil import gauss_rings, square
+from raytrace.maths.sampling import Grid, gauss_rings, square
 from raytrace.psf_models.dft import huygens, sub_pixels
 from raytrace.tracing.scene import Scene, trace_scene
 from raytrace.tracing.wavefront import wavefront_of

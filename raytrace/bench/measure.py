@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
-from raytrace.maths.pupil import sobol
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import sobol
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays

@@ -36,8 +36,8 @@ from torch import Tensor
 from raytrace.bench.measure import DTYPES, name_of, nothing, shape_of, squared_radius, variables
 from raytrace.bench.psf import Truth
 from raytrace.bench.psf_cases import Case, Method
-from raytrace.maths.grid import Grid
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import Grid
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays

@@ -22,9 +22,8 @@ from raytrace.bench.measure import clock, name_of, nothing, with_leaves
 from raytrace.bench.psf_cases import PIXELS, USUAL, Case, Method, cases, methods
 from raytrace.bench.report import Measured, Request, clock_of, in_words, milliseconds, table, yes
 from raytrace.cli.progress import progress
-from raytrace.maths.grid import Grid
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import MODELS, NotConverged, Psf, drt, paraxial, wave
 from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
 from raytrace.psf_models.pixels import gaussian_pixels

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.grid import Grid, grid
+from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, Psf, drt, paraxial, psf
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.psf_models.result import Kernels

@@ -33,8 +33,8 @@ from raytrace.bench.measure import (
 from raytrace.bench.report import Measured, Request, clock_of, finite, in_words, significant, table
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
-from raytrace.maths.pupil import sobol
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
+from raytrace.maths.sampling import sobol
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.prescription import lens as lens_of

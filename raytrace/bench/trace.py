@@ -26,7 +26,7 @@ from raytrace.bench.measure import (
 from raytrace.bench.report import Measured, Request, clock_of, digits, in_words, table
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 

@@ -49,7 +49,7 @@ def _models() -> Iterable[str]:
 
 
 def _default_merits() -> Iterable[str]:
-    from raytrace.optimization.default_merit import KINDS
+    from raytrace.optimization.merit import KINDS
 
     return KINDS
 

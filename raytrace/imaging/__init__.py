@@ -15,8 +15,8 @@
 | wave_design     | design of the phase element                                                             |
 | descent         | L-BFGS-B with exact gradients                                                           |
 
-The only `nn.Module`s are here. Tests: tests/test_MODULE.py, test_held (thickness limits), test_deconvolve
-(restoration), test_study (co-design), test_edof* (phase elements).
+The only `nn.Module`s are here. Tests: tests/test_MODULE.py, test_imaging_variables (thickness limits), test_restoration
+(restoration), test_wave_* (phase elements).
 """
 
 from raytrace.imaging.camera import Camera as Camera

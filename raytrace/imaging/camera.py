@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.variables import Variables
-from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide
+from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, gaussian, model_of, psf
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.system.lens import Lens, field_points

@@ -13,8 +13,8 @@ from raytrace.imaging.camera import Camera
 from raytrace.imaging.pictures import Pictures, crop
 from raytrace.imaging.restoration import kernel_error, power_spectrum
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings
-from raytrace.optimization.solver import TensorDescent, minimise_tensors
+from raytrace.maths.sampling import gauss_rings
+from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance

@@ -33,10 +33,9 @@ from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
 from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
-from raytrace.maths import pupil
-from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.optimization.solver import NoOptimum
+from raytrace.maths.sampling import grid, hexapolar, sobol
+from raytrace.optimization.least_squares import NoOptimum
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
@@ -102,8 +101,8 @@ def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor |
         rings = 1
         while 1 + 3 * rings * (rings + 1) < count:
             rings += 1
-        return pupil.hexapolar(rings)[0]
-    return pupil.sobol(count, seed=seed)[0]
+        return hexapolar(rings)[0]
+    return sobol(count, seed=seed)[0]
 
 
 def camera(lens: Lens, settings: CodesignSettings) -> Camera:

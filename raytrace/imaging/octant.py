@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.restoration import depth_invariant_density
-from raytrace.maths.grid import grid
+from raytrace.maths.sampling import grid
 from raytrace.psf_models.radial import radii_of_waves, reach, unfold
 from raytrace.wave_optics import propagation
 from raytrace.wave_optics.plan import Plan

@@ -8,9 +8,7 @@ Several processes (`raytrace.shards`) share every batch: each takes its samples,
 them. Only the first process writes.
 """
 
-import csv
 import io
-import json
 import math
 import time
 import warnings
@@ -22,11 +20,14 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
-from raytrace.files import append_text, write_atomically
+from raytrace.files import write_atomically
 from raytrace.shards import Share, share, total
-from raytrace.stores import DamagedLine, anything, mapped, read_document
+from raytrace.stores import DamagedLine, Folder, Kind, Table, Unfit, anything, mapped, read_document, read_file
 from raytrace.tracing.compiled import prepare
 from raytrace.words import calling_level
+
+_MOST = 1 << 34  # bytes of a checkpoint
+_ANEW = "remove it to begin anew"
 
 #: Numbers of a step by the name of their column in the log.
 Record = dict[str, float]
@@ -44,24 +45,45 @@ class DamagedRun(ValueError):
     """A file of a run cannot be read."""
 
 
+RUN = Kind(
+    DamagedRun,
+    "remove the folder to begin anew",
+    OtherSettings,
+    "{path} holds another run: {difference}; choose another folder",
+)
+
+
 def read_state(path: Path) -> dict:
     """The contents of a file of `torch.save`, on the processor: tensors and plain values only, nothing is executed.
 
     The archive is checked before torch reads it: lengths of its entries and their checksums. Raises DamagedRun.
     """
+
+    def decode(content: bytes) -> dict:
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                if any(part.compress_type or part.file_size > len(content) for part in archive.infolist()):
+                    raise Unfit("its entries are longer than the file")
+                if wrong := archive.testzip():
+                    raise Unfit(f"{wrong} does not match its checksum")
+            state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+            if not isinstance(state, dict):
+                raise Unfit(f"it holds a {type(state).__name__}")
+        except Exception as error:  # zipfile and torch raise errors of any class
+            raise Unfit(f"no checkpoint, or a damaged one ({_in_line(error) or type(error).__name__})") from error
+        return state
+
     try:
-        with zipfile.ZipFile(path) as archive:
-            if any(part.compress_type or part.file_size > path.stat().st_size for part in archive.infolist()):
-                raise DamagedRun("its entries are longer than the file")
-            if wrong := archive.testzip():
-                raise DamagedRun(f"{wrong} does not match its checksum")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(state, dict):
-            raise DamagedRun(f"it holds a {type(state).__name__}")
-    except Exception as error:  # zipfile and torch raise errors of any class
-        reason = _words(error) or type(error).__name__
-        raise DamagedRun(f"{path}: no checkpoint, or a damaged one ({reason}); remove it to begin anew") from error
-    return state
+        return read_file(path, decode, DamagedRun, "remove it to begin anew", _MOST)
+    except OSError as error:
+        raise DamagedRun(
+            f"{path}: no checkpoint, or a damaged one ({error.strerror}); remove it to begin anew"
+        ) from error
+
+
+def write_state(path: Path, state: dict) -> None:
+    """Replace a file that `read_state` reads."""
+    write_atomically(path, lambda file: torch.save(state, file))
 
 
 def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.optim.Optimizer | None = None) -> int:
@@ -74,11 +96,11 @@ def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.opti
         if optimizer is not None:
             optimizer.load_state_dict(state["optimizer"])
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
-        raise DamagedRun(f"{path}: not a checkpoint of this run ({_words(error)}); choose another folder") from error
+        raise DamagedRun(f"{path}: not a checkpoint of this run ({_in_line(error)}); choose another folder") from error
     return step
 
 
-class Run:
+class Run(Folder):
     """A folder of a training run.
 
     settings: whatever decides the result, as JSON; a folder with others is refused with OtherSettings. usual: defaults
@@ -86,105 +108,51 @@ class Run:
     """
 
     def __init__(self, folder: str | Path, settings: Mapping, *, usual: Mapping = MappingProxyType({})):
-        self.folder = Path(folder)
-        settings, usual = (json.loads(json.dumps(dict(values))) for values in (settings, usual))
-        self.folder.mkdir(parents=True, exist_ok=True)
-        file = self.folder / "settings.json"
-        if not file.exists():
-            if share().rank == 0:
-                write_atomically(file, lambda stream: stream.write(json.dumps(settings, indent=1).encode()))
-            return
-        before = {key: value for key, value in usual.items() if key in settings} | read_json(file)
-        differ = [
-            f"{_words(key)} was {before.get(key)!r}, now {settings.get(key)!r}"
-            for key in sorted({*before, *settings})
-            if before.get(key) != settings.get(key)
-        ]
-        if differ:
-            raise OtherSettings(f"{self.folder} holds another run: {'; '.join(differ)}; choose another folder")
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.folder / "checkpoint.pt"
-
-    @property
-    def log(self) -> Path:
-        return self.folder / "log.csv"
+        super().__init__(folder, settings, RUN, usual=usual)
+        self.checkpoint, self.log = self.path / "checkpoint.pt", self.path / "log.csv"
 
     def save(self, state: dict) -> None:
-        write_atomically(self.checkpoint, lambda file: torch.save(state, file))
+        write_state(self.checkpoint, state)
 
     def load(self) -> dict | None:
         """The last checkpoint, on the processor, or None."""
         return read_state(self.checkpoint) if self.checkpoint.exists() else None
 
     def rows(self) -> list[dict[str, float]]:
-        """The log, a dict for every step."""
+        """The log, a dict for every step. Raises DamagedRun."""
         return read_log(self.log) if self.log.exists() else []
 
     def forget_after(self, step: int) -> None:
         """Drop rows of the log from `step` on: those that an interrupted run wrote after its last checkpoint."""
-        if not self.log.exists():
-            return
-        header, *rows = _lines(self.log)
-        kept = []
-        for line, row in enumerate(rows, 2):
-            if _numbers(row, len(header)) is not None:
-                kept += [row] if int(row[0]) < step else []
-            elif line <= len(rows):  # the last one may be incomplete
-                words = f"found {_words(','.join(row))!r}, expected {len(header)} numbers; the line is dropped"
-                warnings.warn(f"{self.log}, line {line}: {words}", DamagedLine, stacklevel=calling_level())
-        write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
+        if self.log.exists():
+            log = Table(self.log)
+            header, rows, damaged = log.scan(RUN.damaged, RUN.advice)
+            for words in damaged:
+                warnings.warn(f"{words}; the line is dropped", DamagedLine, stacklevel=calling_level())
+            log.begin(header or [], *(row for _, row in rows if row[0] < step))
 
     def append(self, rows: list[tuple[int, Record]]) -> None:
         if rows:
+            log = Table(self.log)
             header = [] if self.log.exists() else [["step", *rows[0][1]]]
-            append_text(self.log, _csv(header + [[step, *map(repr, record.values())] for step, record in rows]))
+            log.append(*header, *([step, *map(float, record.values())] for step, record in rows))
 
 
 def read_log(path: Path) -> list[dict[str, float]]:
     """A log, a dict for every step. Raises DamagedRun."""
-    header, *rows = _lines(path)
-    records = []
-    for line, row in enumerate(rows, 2):
-        if (numbers := _numbers(row, len(header))) is None:
-            expected = f"expected {len(header)} numbers, of {_words(','.join(header))}"
-            raise DamagedRun(f"{path}, line {line}: found {_words(','.join(row))!r}, {expected}")
-        records.append(dict(zip(header, numbers, strict=True)))
-    return records
-
-
-def _numbers(row: list[str], count: int) -> list[float] | None:
-    """A row of a log, whose first number is its step; None of a damaged one."""
-    try:
-        numbers = list(map(float, row))
-    except ValueError:
-        return None
-    is_whole = len(numbers) == count and not any(map(math.isnan, numbers)) and row[0].isdecimal()
-    return numbers if is_whole else None
-
-
-def _lines(path: Path) -> list[list[str]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.reader(file)) or [[]]
-    except (ValueError, csv.Error) as error:
-        raise DamagedRun(f"{path}: no table of steps ({_words(error)})") from error
+    header, rows, damaged = Table(path).scan(RUN.damaged, RUN.advice)
+    if damaged:
+        raise DamagedRun(damaged[0])
+    return [dict(zip(header, row, strict=True)) for _, row in rows]
 
 
 def read_json(path: Path) -> dict:
     """A document of settings or results. Raises DamagedRun."""
-    return read_document(path, mapped(anything), DamagedRun, "remove the folder to begin anew")
+    return read_document(path, mapped(anything), RUN.damaged, RUN.advice)
 
 
-def _words(error: object) -> str:
+def _in_line(error: object) -> str:
     return " ".join(str(error).split())[:400]
-
-
-def _csv(rows: list[list]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
 
 
 def train(

@@ -20,9 +20,9 @@ from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
-from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.optimization.solver import NoOptimum
+from raytrace.maths.sampling import grid
+from raytrace.optimization.least_squares import NoOptimum
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf

@@ -16,17 +16,16 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from raytrace.files import write_atomically
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
-from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train
+from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train, write_state
 from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored, restored, scene, transfer
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
-from raytrace.maths.value import detached
-from raytrace.optimization.solver import minimise_tensors
+from raytrace.maths.numerics import detached
+from raytrace.optimization.least_squares import minimise_tensors
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
@@ -203,7 +202,7 @@ def begin(
     Raises training.OtherSettings if the folder was started with others.
     """
     run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(config), "pictures": pictures})
-    file = run.folder / "start.pt"
+    file = run.path / "start.pt"
     if file.exists():
         variables = start(dataclasses.replace(settings, starts=0), config, spectrum)
         state = read_state(file)
@@ -216,7 +215,7 @@ def begin(
     else:
         variables = start(settings, config, spectrum, progress=progress)
         state = {"start": variables.start, "change": variables.change.detach()}
-        write_atomically(file, lambda stream: torch.save(state, stream))
+        write_state(file, state)
     network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
     return WaveCamera(variables, config, spectrum, restoration=settings.restoration, network=network), run
 

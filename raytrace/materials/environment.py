@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import FORMULAS, Glass, is_air, refractive_index
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, value
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)

@@ -18,8 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.words import calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------

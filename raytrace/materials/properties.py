@@ -29,8 +29,8 @@ from raytrace.materials.glass import (
     nd,
     refractive_index,
 )
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Result, number
-from raytrace.maths.value import value
 from raytrace.words import calling_level
 
 

@@ -17,13 +17,23 @@ from raytrace.plotting import style
 class Column(NamedTuple):
     """A column of a table: its name in JSON, CSV and frames, and its unit there and in text.
 
-    form, heading: in text, the format of its numbers with their width, and one line or two; by default the name.
+    form, heading: in text, the format of its numbers, < in front to align it left, and one line or two; by default the
+    name.
     """
 
     name: str
     unit: str = ""
     form: str = ".6g"
     heading: str = ""
+
+
+class Table(NamedTuple):
+    """A table of a text. columns: numbers or texts, by the name of the column or by a `Column` of the text alone;
+    title, notes: lines above and below."""
+
+    columns: Mapping[str | Column, Tensor | Sequence]
+    title: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 #: Columns of several results; the unit of fields is the lens's, other names end in their unit (SUFFIXES).
@@ -45,8 +55,8 @@ SUFFIXES = {"_percent": "%", "_um": "µm"}
 class Result:
     """A result of a public function; a class of results defines its columns, and `draw` if it has a figure.
 
-    columns: a table; to_frame: the same for pandas; document: of `--json`; str: the text that the command prints;
-    plot: the figure; save: what `-o` writes.
+    columns: a table; to_frame: the same for pandas; document: of `--json`; str: the text that the command prints, of
+    `tables`; plot: the figure; save: what `-o` writes.
     """
 
     __slots__ = ()
@@ -72,9 +82,13 @@ class Result:
         if column := next((column for column in self.COLUMNS if column.name == name), None):
             return column
         if name in ("field_x", "field_y"):
-            return Column(name, self.lens.fields.unit)
+            return Column(name, self.lens.fields.unit, heading="field")
         ending = next((unit for suffix, unit in SUFFIXES.items() if name.endswith(suffix)), "")
         return Column(name, COLUMNS.get(name, ending))
+
+    def tables(self) -> Sequence[Table]:
+        """The tables of the text."""
+        return [Table(self.columns())]
 
     def units(self) -> dict[str, str]:
         """Units of columns by their names, of those that have one; `to_frame` has them in `attrs`."""
@@ -108,13 +122,28 @@ class Result:
             style.save(figure, path)
         return figure
 
+    def __str__(self) -> str:
+        return "\n".join(line for t in self.tables() for line in (*t.title, *self._lines(t.columns), *t.notes))
+
     def __repr__(self) -> str:
         return str(self)
+
+    def _lines(self, columns: Mapping[str | Column, Tensor | Sequence]) -> list[str]:
+        """Columns as text; x and y of a field share a column."""
+        listed, words = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}, self.words()
+        if "field_x" in listed and "field_y" in listed:
+            listed["field_y"] = [*map(point_text, listed.pop("field_x"), listed["field_y"])]
+        found = {}
+        for name, values in listed.items():
+            known = name in words and name in columns and isinstance(columns[name], Tensor)
+            column = self.column(name) if isinstance(name, str) else name
+            found[column] = [words[name][int(value)] for value in values] if known else values
+        return text_table(found)
 
 
 def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
     """Columns as flat arrays of one length, in the order of their common shape."""
-    shape = broadcast_shape(*(column.shape for column in columns.values()))
+    shape = broadcast_shape(*(column.shape for column in columns.values())) if columns else ()
     return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
 
 
@@ -156,23 +185,30 @@ def plain(document):
     return number(document) if isinstance(document, float) else document
 
 
+def point_text(x: float, y: float) -> str:
+    """A field point: its y alone on the axis of x."""
+    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
 def cell(value: float, form: str) -> str:
-    """A number in a table of text, or - of the same width where there is none."""
+    """A number in a table of text, or - where there is none."""
     if not math.isfinite(value):
-        return f"{'-':>{len(f'{0.0:{form}}')}}"
-    shown = f"{value:{form}}"
-    return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
+        return "-" if math.isnan(value) else str(float(value))
+    shown = f"{value:{form.removeprefix('<')}}"
+    return shown if float(shown) else f"{0.0:{form.removeprefix('<')}}"  # what rounds to 0 has no sign
 
 
-def text_table(columns: Mapping[Column, Sequence], gap: str = " ") -> list[str]:
+def text_table(columns: Mapping[Column, Sequence]) -> list[str]:
     """Lines of columns of numbers, or of texts, under their headings and units."""
     texts = []
     for (name, unit, form, heading), values in columns.items():
-        shown = [value if isinstance(value, str) else cell(value, form) for value in values]
-        width = len(f"{0.0:{form}}") if form.startswith(">") else max(len(name), 9)
         first, _, second = (heading or name).partition("\n")
-        texts.append([f"{text:>{width}}" for text in (first, ", ".join(filter(None, (second, unit))), *shown)])
-    return [gap.join(row) for row in zip(*texts, strict=True)]
+        shown = [value if isinstance(value, str) else cell(value, form) for value in values]
+        shown = [first, ", ".join(filter(None, (second, unit))), *shown]
+        width = max(map(len, shown))
+        texts.append([text.ljust(width) if form.startswith("<") else text.rjust(width) for text in shown])
+    lines = ["  ".join(row).rstrip() for row in zip(*texts, strict=True)]
+    return lines if lines[1] else [lines[0], *lines[2:]]
 
 
 def object_text(distance: float) -> str:

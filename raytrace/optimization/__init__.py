@@ -1,1 +1,20 @@
-"""Optimisation: numbers of a lens moved to where its merit function is least."""
+"""Optimisation of a lens by its merit function.
+
+variables         variable syntax; `Model`: the lens as a function of its variables
+lens_state        the lens at given variables: numbers, solves, first-order data and rays, with derivatives
+operands/         operands of merit functions, a file a family; `operand`: their definition; `table`: all of them
+merit             default merit functions, merit functions as values, their evaluation with the Jacobian
+evaluate          the value of a merit function row by row, with its table and figure
+problem           constraint syntax; merit function and constraints as the sum of squares of the solver
+least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B
+optimize          `optimize`: opening, descent, targets and attained values, report
+checkpoint        state of a descent, from which it resumes
+glass_choice      variable glasses of catalogs
+search            `search`: minima found globally; `search_tasks`, `saddle_points`: its parts
+file_check        `check`: what was read of a lens file, and which operands are evaluated
+
+A new operand is a function of an `EvaluationContext` and a row of the table at the end of its family's file; its test
+compares it with the analysis of the same quantity (`tests/test_merit_*.py`). A number of a surface that
+`system.parameter_paths` lists is a variable. Tests of the descent: `tests/test_optimize.py`, `test_hold.py`,
+`test_bounds.py`, `test_checkpoint.py`; of search: `tests/test_search.py`.
+"""

@@ -2,19 +2,31 @@
 
 import dataclasses
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.files import NotWritten, append_text, write_json, write_text
 from raytrace.maths.result import plain
-from raytrace.optimization.solver import PATHS, Cycle, PathState, SolverState
-from raytrace.stores import Unfit, anything, either, exactly, listed, mapped, number, read_document, record, text, whole
+from raytrace.optimization.least_squares import PATHS, Cycle, PathState, SolverState
+from raytrace.stores import (
+    Document,
+    Kind,
+    Store,
+    Table,
+    Unfit,
+    anything,
+    either,
+    exactly,
+    listed,
+    mapped,
+    number,
+    record,
+    text,
+    whole,
+)
 from raytrace.system.identity import unlike
-from raytrace.words import calling_level
 
 EVERY = 2.0  # s between two checkpoints
 #: Why a descent ends.
@@ -27,7 +39,6 @@ STOPPED = {
     "interrupted": "interrupted; this is the best so far",
 }
 _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "seconds", "limits")
-_ADVICE = "expected what `checkpoint` wrote; start anew without `resume`"
 
 
 class BadCheckpoint(ValueError):
@@ -49,6 +60,17 @@ class Stored(NamedTuple):
     evaluated: np.ndarray = np.zeros((0, 0))
 
 
+_CHECKPOINT = Kind(
+    BadCheckpoint,
+    "expected what `checkpoint` wrote; start anew without `resume`",
+    BadCheckpoint,
+    "{path}: a checkpoint of {difference}; resume with the options that it was made with",
+    unlike,
+    "the optimisation continues, but cannot resume from here",
+)
+_LOG = dataclasses.replace(_CHECKPOINT, lost="the log ends here")
+
+
 class Checkpoint:
     """A file of the state of an optimisation, replaced as a whole.
 
@@ -58,11 +80,12 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | PathLike | None, of: Mapping, names: Sequence[str]):
-        self.path, self.of, self.names, self.last, self.more = path, of, names, -np.inf, {}
+        self.store, self.names, self.last, self.more = Document(path, of, _CHECKPOINT), names, -np.inf, {}
 
     def write_glasses(self, stored: Stored, merit: float) -> None:
         """Write a state of the choice of glasses; later states repeat these glasses."""
-        self.more = {"glasses": {str(k): list(one) for k, one in stored.glasses.items()}, "tested": list(stored.tested)}
+        glasses = {str(k): list(glass) for k, glass in stored.glasses.items()}
+        self.more = {"glasses": glasses, "tested": list(stored.tested)}
         self.write(stored.x, merit, 0, now=True)
 
     def write(
@@ -79,10 +102,10 @@ class Checkpoint:
 
         Warns NotWritten where the file cannot be written; the optimisation continues.
         """
-        if self.path is None or (not now and time.monotonic() < self.last + EVERY):
+        if self.store.path is None or (not now and time.monotonic() < self.last + EVERY):
             return
         variables = dict(zip(self.names, x.tolist(), strict=True))
-        document = {"of": self.of, "merit": merit, "cycles": cycles, "variables": variables, **self.more}
+        document = {"merit": merit, "cycles": cycles, "variables": variables, **self.more}
         if descent is not None:
             state = descent.solver
             document["descent"] = {
@@ -101,12 +124,7 @@ class Checkpoint:
             }
         if evaluated:
             document["evaluated"] = [plain(one.tolist()) for one in evaluated]
-        try:
-            write_json(self.path, document)
-        except OSError as error:
-            words = f"{self.path}: {error.strerror}; the optimisation continues, but cannot resume from here"
-            warnings.warn(words, NotWritten, stacklevel=calling_level())
-            self.path = None
+        self.store.write(document)
         self.last = time.monotonic()
 
 
@@ -134,7 +152,7 @@ _DESCENT = record(
     }
 )
 _DOCUMENT = record(
-    {"of": mapped(anything), "variables": mapped(number()), "cycles": whole()},
+    {"variables": mapped(number()), "cycles": whole()},
     {
         "glasses": mapped(listed(text, 2, 2)),
         "tested": listed(whole()),
@@ -148,11 +166,7 @@ def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> 
     """The checkpoint of this optimisation. Raises BadCheckpoint and OSError."""
 
     def check(value: object) -> Stored:
-        if isinstance(value, dict) and "of" not in value and "variables" in value:
-            raise Unfit("does not say which lens it is of; an older version wrote it")
         document = _DOCUMENT(value)
-        if words := unlike(document["of"], of):
-            raise BadCheckpoint(f"{path}: a checkpoint of {words}; resume with the options that it was made with")
         if set(document["variables"]) != set(names):
             raise Unfit(f"variables: found {', '.join(document['variables'])}, expected {', '.join(names)}")
         glasses = document.get("glasses", {})
@@ -170,7 +184,7 @@ def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> 
             np.array(evaluated, dtype=float),
         )
 
-    return read_document(path, check, BadCheckpoint, _ADVICE)
+    return Document(path, of, _CHECKPOINT).read(check)
 
 
 def _path_state(stored: Mapping, count: int) -> PathState:
@@ -201,22 +215,17 @@ class Log:
     """A file of comma-separated values, a line for every cycle; rewritten with the cycles so far."""
 
     def __init__(self, path: str | PathLike | None, cycles: Sequence[Cycle] = ()):
-        self.path = path
+        self.store = Store(path, {}, _LOG)
         if path is not None:
-            write_text(path, "".join([",".join(_COLUMNS) + "\n", *map(_line, cycles)]))
+            self.table = Table(path)
+            self.table.begin(_COLUMNS, *map(_cells, cycles))
 
     def add(self, cycle: Cycle) -> None:
         """Add a cycle. Warns NotWritten where the file cannot be written; the optimisation continues."""
-        if self.path is None:
-            return
-        try:
-            append_text(self.path, _line(cycle), sync=False)
-        except OSError as error:
-            warnings.warn(f"{self.path}: {error.strerror}; the log ends here", NotWritten, stacklevel=calling_level())
-            self.path = None
+        self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
 
 
-def _line(cycle: Cycle) -> str:
-    numbers = map(repr, map(float, (cycle.merit, cycle.missed, cycle.step, cycle.damping)))
-    words = [str(cycle.number), *numbers, str(cycle.evaluations), f"{cycle.seconds:.3f}"]
-    return ",".join([*words, cycle.limits.replace(",", ";")]) + "\n"
+def _cells(cycle: Cycle) -> list:
+    numbers = map(float, (cycle.merit, cycle.missed, cycle.step, cycle.damping))
+    seconds, limits = f"{cycle.seconds:.3f}", cycle.limits.replace(",", ";")
+    return [cycle.number, *numbers, cycle.evaluations, seconds, limits]

@@ -7,13 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, cell, rows
-from raytrace.maths.value import value
-from raytrace.optimization.default_merit import DefaultMerit
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for
-from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.variables import Model
 from raytrace.plotting.style import FAINT, field_colours, new_figure, number_text, styled
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from raytrace.io import ImportReport, LensFileError, Substitute, read_lens_with_report
 from raytrace.io.source import Place
-from raytrace.optimization.context import SETTINGS
+from raytrace.optimization.operands.operand import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import check as check_lens
 from raytrace.system.lens import check_media

@@ -29,10 +29,9 @@ from scipy.spatial import ConvexHull, QhullError
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization.least_squares import State, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.solver import State, least_squares
-from raytrace.optimization.variables import GLASS, Freedom, followers
+from raytrace.optimization.variables import GLASS, Freedom, Model, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 

@@ -1,22 +1,258 @@
-"""Merit functions as values: the rows of a file, of a list or of a default, which can be joined and reweighted.
+"""Merit functions: default ones of spots, wavefronts, directions or MTF, rows as values, and their evaluation.
 
 rt.Merit.of(lens)                      the merit function of the file
 rt.Merit.default(lens, "spot")         a default one, of the settings `DefaultMerit`
 merit + other, 2 * merit               joined; with all weights doubled
 merit.with_weights(EFFL=1)             of all rows of an operand; with_targets likewise
+
+The merit M and the Jacobian of all rows (operand, arguments, target, weight) follow from the values v and targets t:
+
+    M² = Σ w (v - t)² / Σ w
+
+over rows with a weight. A row whose ray is lost counts as an error of `LOST` units.
+
+The weight of a ray of a default merit function, of the Gaussian rule of n rings and m arms, is
+
+    w = π g v f / (W F a)
+
+with g the weight of its ring (Σ g = 1), v and f the weights of its wavelength and field, W and F their numbers, and a
+the number of arms that are traced: of a lens of revolution one for the field on the axis, half of them for a field on
+y, else all. They lie half a step off the y axis. The weights v and f are those of the lens, not normalised.
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from graphlib import CycleError, TopologicalSorter
+from numbers import Integral
 
-from raytrace.optimization.context import Line
-from raytrace.optimization.conventions import Conventions, conventions_of
-from raytrace.optimization.default_merit import BadMerit, Boundaries, DefaultMerit, boundary_rows
+import numpy as np
+
+from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.sampling import gauss_legendre
+from raytrace.optimization.operands.operand import (
+    SETTINGS,
+    Conventions,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Planner,
+    RowValues,
+    conventions_of,
+    need,
+    need_all,
+)
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.system.lens import Lens
+from raytrace.optimization.variables import Model
+from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import parse_range
 from raytrace.words import did_you_mean
+
+# -- default merit functions -------------------------------------------------------------------------------------------
+
+#: Most rows of a default merit function: each is a ray, with its derivatives by all variables.
+MOST_ROWS = 100_000
+
+REFERENCES = ("centroid", "chief")
+
+
+class BadMerit(ValueError):
+    """A merit function that cannot be made; the message says what was found and what was expected."""
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum at the edge.
+
+    None: no such row. `edge` is of glass; the minimum of air also holds at its edge. The space before the image has
+    no maximum.
+    """
+
+    glass: tuple[float, float] | None = None
+    air: tuple[float, float] | None = None
+    edge: float | None = None
+
+    @classmethod
+    def of(
+        cls, glass_thickness: str | tuple[float, float] | None, air_thickness: str | tuple[float, float] | None, edge
+    ) -> "Boundaries":
+        """From ranges, which may be text as "2:15", or "2" without a maximum. Raises ValueError."""
+        ranges = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+        return cls(*ranges, edge)
+
+    def rows(self, lens: Lens) -> Iterator[Row]:
+        """The rows, each over all surfaces."""
+        last = len(lens.surfaces) - 2
+        bounds = (
+            *(("MNCA", last, self.air and self.air[0]), ("MXCA", last - 1, self.air and self.air[1])),
+            *(("MNEA", last, self.air and self.air[0]), ("MNCG", last, self.glass and self.glass[0])),
+            *(("MXCG", last, self.glass and self.glass[1]), ("MNEG", last, self.edge)),
+        )
+        for operand, end, target in bounds:
+            if target is not None and np.isfinite(target) and end > 0:
+                yield Row(operand, (1, end), target=float(target), weight=1.0)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of default merit function: its operand for each reference, how its rows are made, and its description."""
+
+    operands: dict[str, str]
+    rows: "Callable[[Lens, str, DefaultMerit], Iterator[Row]]"
+    text: str
+
+
+@dataclass(frozen=True)
+class DefaultMerit:
+    """Settings of a default merit function, as in OpticStudio's wizard of sequential merit functions.
+
+    kind: "spot", "wavefront", "angular" or "mtf"; rings, arms (even): of Gaussian quadrature of the pupil; reference:
+    "centroid" or "chief" ray; frequencies: cycles/mm, of "mtf"; field_weights (F,), wavelength_weights (W,): by default
+    those of the lens. glass_thickness, air_thickness: (minimum, maximum) on the axis, mm, or text "2:15"; edge: minimum
+    thickness of glass at its edge, mm: boundary rows in addition. conventions: of operands, as "opd_tilt=common"
+    (`Conventions`). Raises BadMerit, ValueError.
+    """
+
+    kind: str = "spot"
+    _: KW_ONLY
+    rings: int = 3
+    arms: int = 6
+    reference: str = "centroid"
+    frequencies: Sequence[float] = ()
+    field_weights: Sequence[float] | None = None
+    wavelength_weights: Sequence[float] | None = None
+    glass_thickness: str | tuple[float, float] | None = None
+    air_thickness: str | tuple[float, float] | None = None
+    edge: float | None = None
+    conventions: Conventions | str | Sequence[str] | None = None
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise BadMerit(f"`merit={self.kind}`: expected one of {', '.join(KINDS)}{did_you_mean(self.kind, KINDS)}")
+        if self.reference not in REFERENCES:
+            raise BadMerit(f"`reference={self.reference}`: expected one of {', '.join(REFERENCES)}")
+        whole = isinstance(self.rings, Integral) and isinstance(self.arms, Integral)
+        if not whole or self.rings < 1 or self.arms < 2 or self.arms % 2:
+            raise BadMerit(f"`rings={self.rings}` and `arms={self.arms}`: expected 1 or more, and an even number")
+        object.__setattr__(self, "frequencies", tuple(np.atleast_1d(self.frequencies).astype(float).tolist()))
+        if not all(0 <= frequency < np.inf for frequency in self.frequencies):
+            raise BadMerit(f"`frequencies={self.frequencies}`: expected finite numbers, 0 or more, cycles/mm")
+        if bool(self.frequencies) != (self.kind == "mtf"):
+            raise BadMerit("`merit=mtf` goes with `frequencies`, cycles/mm, and no other merit does")
+        object.__setattr__(self, "conventions", conventions_of(self.conventions))
+
+    @property
+    def boundaries(self) -> Boundaries:
+        return Boundaries.of(self.glass_thickness, self.air_thickness, self.edge)
+
+    def rows(self, lens: Lens, configurations: Sequence[int] | None = None) -> tuple[Row, ...]:
+        """The rows for a lens, lengths in mm, in these configurations (from 1; by default all, with equal weight).
+
+        Raises BadMerit.
+        """
+        kind = KINDS[self.kind]
+        operand = kind.operands.get(self.reference) or next(iter(kind.operands.values()))
+        about = f"{self.kind}, from the {self.reference}" if len(kind.operands) > 1 else self.kind
+        rows = [Row("DMFS"), Row("BLNK", text=f"{about}: {kind.text}")]
+        for setting, configured in _configurations(lens, configurations):
+            rows += (*setting, *self.boundaries.rows(configured), *kind.rows(configured, operand, self))
+        return tuple(rows)
+
+
+def boundary_rows(lens: Lens, boundaries: Boundaries) -> tuple[Row, ...]:
+    """The rows of boundaries alone, in every configuration."""
+    rows: list[Row] = []
+    for setting, configured in _configurations(lens, None):
+        limits = tuple(boundaries.rows(configured))
+        rows += (*setting, *limits) if limits else ()
+    return tuple(rows)
+
+
+def _configurations(lens: Lens, chosen: Sequence[int] | None) -> Iterator[tuple[tuple[Row, ...], Lens]]:
+    """The row CONF of each configuration, if there are several, and the lens in it."""
+    for number in range(1, len(lens.configurations) + 1) if chosen is None else chosen:
+        yield ((Row("CONF", (number, 0)),), lens.configuration(number)) if lens.operands else ((), lens)
+
+
+def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
+    """A row for every ray, by field, wavelength, arm and ring."""
+    fields, colours = (
+        _fields(lens, settings),
+        _weights(lens.wavelength_weights, settings.wavelength_weights, "wavelength"),
+    )
+    count = sum(_arm_count(lens, field, settings.arms) for field, _ in fields) * len(colours) * settings.rings
+    _refuse_many(count, f"`rings={settings.rings}` and `arms={settings.arms}`")
+    nodes, weights = gauss_legendre(settings.rings)
+    for field, field_weight in fields:
+        angles = _arms(lens, field, settings.arms)
+        for wavelength, weight in enumerate(colours, 1):
+            share = np.pi * weight * field_weight / (len(colours) * len(fields) * len(angles))
+            for angle in angles if share else ():
+                for radius, g in zip(np.sqrt(0.5 * (nodes + 1)), 0.5 * weights, strict=True):
+                    pupil = (round(float(radius * part), 15) + 0.0 for part in (np.cos(angle), np.sin(angle)))
+                    yield Row(operand, (0, wavelength), (*field, *pupil), weight=float(share * g))
+
+
+def _by_frequencies(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
+    """A row for every field and frequency, all wavelengths together, with a target of 1."""
+    fields = _fields(lens, settings)
+    _refuse_many(len(fields) * len(settings.frequencies), f"{len(settings.frequencies)} `frequencies`")
+    for number, (_, weight) in enumerate(fields, 1):
+        for frequency in settings.frequencies if weight else ():
+            share = weight / (len(fields) * len(settings.frequencies))
+            yield Row(operand, (1, 0), (float(number), float(frequency), 0.0, 0.0), target=1.0, weight=share)
+
+
+def _fields(lens: Lens, settings: DefaultMerit) -> list[tuple[tuple[float, float], float]]:
+    """(Hx, Hy) as parts of the largest field, and its weight, of every field."""
+    points = np.stack([lens.fields.x.detach().numpy(), lens.fields.y.detach().numpy()], -1)
+    largest = np.hypot(*points.T).max()
+    points = (points / largest if largest > 0 else points) + 0.0
+    weights = _weights(lens.fields.weight, settings.field_weights, "field")
+    return [(tuple(point), weight) for point, weight in zip(points.tolist(), weights, strict=True)]
+
+
+def _weights(of_lens, weights: Sequence[float] | None, kind: str) -> list[float]:
+    """The weights of fields or wavelengths, by default those of the lens. Raises BadMerit."""
+    if weights is None:
+        return of_lens.detach().tolist()
+    weights = np.atleast_1d(weights).astype(float).tolist()
+    if len(weights) != len(of_lens):
+        raise BadMerit(f"`{kind}_weights`: {len(weights)} weights, and the lens has {len(of_lens)} {kind}s")
+    if not (min(weights) >= 0 and sum(weights) > 0):
+        raise BadMerit(f"`{kind}_weights`: expected 0 or more, not all of them 0")
+    return weights
+
+
+def _refuse_many(rows: int, what: str) -> None:
+    """Raise BadMerit for more rows than MOST_ROWS, before one is made."""
+    if rows > MOST_ROWS:
+        raise BadMerit(f"{what}: {rows:,} rows of a merit function, expected at most {MOST_ROWS:,}; ask for fewer")
+
+
+def _arm_count(lens: Lens, field: tuple[float, float], arms: int) -> int:
+    """Number of arms traced at a field: of a lens of revolution half of them, and one on the axis."""
+    if not is_round_about_axis(lens) or bool(lens.fields.x.any()):
+        return arms
+    return arms // 2 if field != (0.0, 0.0) else 1
+
+
+def _arms(lens: Lens, field: tuple[float, float], arms: int) -> np.ndarray:
+    """The angles of the arms in radians, clockwise from the first right of the y axis."""
+    count = _arm_count(lens, field, arms)
+    return np.deg2rad(90 - (np.arange(count) + 0.5) * (360 / arms)) if count > 1 else np.zeros(1)
+
+
+KINDS = {
+    "spot": Kind({"centroid": "TRAC", "chief": "TRAR"}, _by_rays, "where rays land on the image"),
+    "wavefront": Kind({"centroid": "OPDX", "chief": "OPDC"}, _by_rays, "optical path differences in waves"),
+    "angular": Kind({"centroid": "ANAC", "chief": "ANAR"}, _by_rays, "directions of rays behind the lens, as cosines"),
+    "mtf": Kind({"": "MTFA"}, _by_frequencies, "mean of tangential and sagittal MTF"),
+}
+
+
+# -- merit functions as values -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -34,7 +270,7 @@ class Merit:
     _: KW_ONLY
     conventions: Conventions | str | Sequence[str] | None = None
     skip_unknown: bool = False
-    boundaries: Boundaries = field(default_factory=Boundaries)
+    boundaries: Boundaries = dataclasses.field(default_factory=Boundaries)
 
     def __post_init__(self):
         object.__setattr__(self, "conventions", conventions_of(self.conventions))
@@ -194,3 +430,210 @@ def _moved(row: Row, by: int) -> Row:
     taken = operand.refers(Line(3, Row(row.operand, (1, 2)), 0), probe)  # [1], or [1, 2] of two rows and of a range
     first, second = row.integers
     return dataclasses.replace(row, integers=(first + by, second + by if len(taken) > 1 else second))
+
+
+# -- evaluation --------------------------------------------------------------------------------------------------------
+
+#: Error of a row whose ray is lost, in the row's unit.
+LOST = 10.0
+
+
+class UnknownOperand(ValueError):
+    """A row with weight whose operand is not known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluated:
+    """A merit function at given variables.
+
+    values: (R,) of all rows, nan for text and rows of unknown operands; lost: (R,) bool. residuals: (m,) whose squares
+    sum up to M²; jacobian: (m, n) their derivatives by the variables; of_row: (m,) the row, from 0, of each.
+    sides: of one-sided rows, whose residual is Σ max(0, e), by operand: the rows (K,), e (K,), by the variables (K, n),
+    and the surfaces (K,).
+    """
+
+    values: np.ndarray
+    lost: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray | None
+    of_row: np.ndarray
+    sides: tuple[tuple, ...] = ()
+
+    @property
+    def merit(self) -> float:
+        return float(np.sqrt(self.residuals @ self.residuals))
+
+
+class Circle(ValueError):
+    """Rows that take values of one another in a circle."""
+
+
+class Evaluation:
+    """The rows of a merit function over a model: planned once, then called with variables (n,)."""
+
+    def __init__(
+        self,
+        model: Model,
+        rows: Sequence[Row],
+        *,
+        unit: float = 1.0,
+        skip_unknown: bool = False,
+        conventions: Conventions | None = None,
+    ):
+        """unit: mm in the unit of length of the rows; conventions: of operands. Raises UnknownOperand."""
+        self.model, self.rows, self.unit = model, tuple(rows), unit
+        self.conventions = conventions or Conventions()
+        self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
+        self.planners: list[tuple[int, Planner]] = []
+        self.skipped = tuple(self._plan(skip_unknown))
+        self.units = np.array([unit ** OPERANDS[r.operand].length if r.operand in OPERANDS else 1.0 for r in self.rows])
+        counted = np.zeros(len(self.rows), dtype=bool)
+        counted[[line.number - 1 for _, lines, _ in self.groups for line in lines]] = True
+        self.weights = np.where(counted, [row.weight for row in self.rows], 0.0)
+        total = self.weights[self.weights > 0].sum()
+        self.factors = np.sqrt(np.abs(self.weights) / total) if total > 0 else np.zeros(len(self.rows))
+        self.targets = np.array([row.target for row in self.rows])
+
+    def _plan(self, skip_unknown: bool) -> list[int]:
+        """Plan all rows, those of arithmetic last and in the order of their references. Returns the skipped rows."""
+        placed = {line.number: (settings, line) for settings, line in self._lines()}
+        referred, skipped = self._referred(placed, skip_unknown)
+        planners: dict[tuple[int, int], Planner] = {}
+        groups: dict[tuple, list[Line]] = {}
+        order = [number for number in placed if number not in referred] + in_order(referred)
+        for number in (number for number in order if number not in skipped):
+            settings, line = placed[number]
+            operand = OPERANDS[line.row.operand]
+            if settings not in planners:
+                configuration, primary = settings
+                view = self.model.views[configuration - 1]
+                planners[settings] = Planner(view, primary, self.conventions, self.unit, self.rows)
+            need_all(line, operand, planners[settings].lens)
+            groups.setdefault((settings, line.row.operand, number if operand.refers else 0), []).append(line)
+        for (settings, name, _), lines in groups.items():
+            planner = planners[settings]
+            self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
+        self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
+        #: Rows that others take values of.
+        self.needed = frozenset(row for rows in referred.values() for row in rows)
+        #: Rows with a weight, and all that rows of arithmetic among them take values of.
+        self.counted: set[int] = set()
+        left = [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
+        while left:
+            number = left.pop()
+            if number not in self.counted:
+                self.counted.add(number)
+                left += referred.get(number, ())
+        return sorted(skipped)
+
+    def _lines(self):
+        """Rows that have a value, each with the configuration and the primary wavelength of the settings above it."""
+        lens = self.model.lens
+        configuration, primary = lens.current_configuration, lens.primary_wavelength - 1
+        for number, row in enumerate(self.rows, 1):
+            line = Line(number, row, row.integers[1] - 1 if row.integers[1] > 0 else primary)
+            if row.operand == "CONF":
+                configuration = need(line, "configuration", row.integers[0], lens)
+            elif row.operand == "PRIM":
+                primary = need(line, "primary", row.integers[1], lens) - 1
+            elif row.operand not in SETTINGS:
+                yield (configuration, primary), line
+
+    def _referred(self, placed: dict, skip_unknown: bool) -> tuple[dict[int, Sequence[int]], set[int]]:
+        """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
+        referred, skipped = {}, set()
+
+        def skip(line: Line, why: str) -> None:
+            if line.row.weight != 0 and not skip_unknown:
+                raise UnknownOperand(
+                    f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out"
+                )
+            skipped.add(line.number)
+
+        for number, (_, line) in placed.items():
+            name = line.row.operand
+            if name not in OPERANDS:
+                skip(line, f"operand {name} is not known")
+            elif OPERANDS[name].refers:
+                referred[number] = OPERANDS[name].refers(line, self.rows)
+        for number in in_order(referred):
+            if missing := skipped.intersection(referred[number]):
+                line, first = placed[number][1], min(missing)
+                value = f"the value of row {first}, {self.rows[first - 1].operand}, which has none"
+                skip(line, f"{line.row.operand} takes {value}")
+        return referred, skipped
+
+    def __call__(self, variables: np.ndarray, *, derivatives: bool = False, shown: bool = True) -> Evaluated:
+        """All rows at variables; derivatives: with the Jacobian; shown: also operands without a row that counts."""
+        count = len(variables)
+        x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
+        values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
+        numbers, sides = {}, []
+        states = {configuration: self.model.views[configuration - 1].state(x) for configuration, _ in self.planners}
+        contexts = {
+            id(planner): EvaluationContext(planner, states[configuration], numbers)
+            for configuration, planner in self.planners
+        }
+        for planner, lines, evaluate in self.groups:
+            if not (shown or any(line.number in self.counted for line in lines)):
+                continue
+            places = np.array([line.number - 1 for line in lines])
+            units = self.units[places]
+            group = evaluate(contexts[id(planner)])
+            sides += self._sides(group, places, units, count if derivatives else None)
+            all_values, parts = group.values / units, [part / units for part in group.parts]
+            values[places] = value_of(all_values)
+            numbers |= {line.number: all_values[k] for k, line in enumerate(lines) if line.number in self.needed}
+            counted = self.factors[places] > 0
+            in_parts = counted & bool(parts) & (self.targets[places] == 0)
+            targets = self.targets[places]
+            for number, chosen, target in (
+                (all_values, counted & ~in_parts, targets),
+                *((part, in_parts, np.zeros_like(targets)) for part in parts),
+            ):
+                if not chosen.any():
+                    continue
+                factor = self.factors[places][chosen]
+                errors = factor * (value_of(number)[..., chosen] - target[chosen])
+                residuals.append(errors.ravel())
+                if derivatives:
+                    slopes.append((factor * slope_of(number, count)[..., chosen]).reshape(count, -1).T)
+                of_row.append(np.broadcast_to(places[chosen], errors.shape).ravel())
+        of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)
+        residual = np.concatenate(residuals) if residuals else np.zeros(0)
+        gone = ~np.isfinite(residual)
+        parts = np.bincount(of_row, minlength=len(self.rows))[of_row]
+        residual = np.where(gone, LOST * self.factors[of_row] / np.sqrt(np.maximum(parts, 1)), residual)
+        jacobian = None
+        if derivatives:
+            jacobian = np.concatenate(slopes) if slopes else np.zeros((0, count))
+            jacobian = np.where(gone[:, None], 0.0, jacobian)
+        lost = np.zeros(len(self.rows), dtype=bool)
+        lost[of_row[gone]] = True
+        return Evaluated(values, lost, residual, jacobian, of_row, tuple(sides))
+
+    def _sides(self, group: RowValues, places: np.ndarray, units: np.ndarray, count: int | None):
+        """One-sided rows of an operand, as in `Evaluated.sides`, except those that are nan."""
+        if not group.sides:
+            return
+        rows, excess, surfaces = group.sides
+        undefined = np.bincount(rows, np.isnan(value_of(excess)), minlength=len(places)) > 0
+        chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
+        if chosen.any():
+            scale = (self.factors[places] / units)[rows[chosen]]
+            slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
+            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen]
+
+
+def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
+    """Rows of arithmetic, each after those that it takes values of. Raises Circle.
+
+    referred: the rows whose values each takes, by its own number.
+    """
+    try:
+        return [row for row in TopologicalSorter(referred).static_order() if row in referred]
+    except CycleError as error:
+        circle = " → ".join(map(str, reversed(error.args[1])))
+        raise Circle(
+            f"rows {circle} of the merit function take values of one another in a circle: no row may wait for itself"
+        ) from None

@@ -2,43 +2,41 @@
 
 Opening: where most rays of the initial design fail, it descends first on the rays of a small part of pupil and field,
 through which light passes every lens. The part grows until no ray of the whole beam fails.
+
+Conditions c_i = 0 or ≤ 0 exclude one another, with the bounds of the variables, if multipliers w_i exist for which
+Σ w_i c_i does not depend on the free variables, or is bounded by them, and is above 0 (Farkas). They come from the
+linear program of minimum total miss
+
+    minimise Σ t_i  with  |c_i + a_i p| ≤ t_i  or  c_i + a_i p ≤ t_i,  lower ≤ x + p ≤ upper,
+
+a_i the derivatives of c_i. At one point the result concerns the linear model. If the sum moves at other points as the
+model predicts, it concerns the conditions themselves.
 """
 
 import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from os import PathLike
 
 import numpy as np
 import torch
+from scipy.optimize import linprog
 from torch import Tensor
 
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.analysis.panels import first_order_text
+from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.files import check_output
 from raytrace.io import write_lens
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, cell, number, plain
-from raytrace.maths.value import value
-from raytrace.optimization.attained import NotReached, Reached, reached, refuse_contradictions
 from raytrace.optimization.checkpoint import STOPPED, BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
-from raytrace.optimization.default_merit import DefaultMerit
 from raytrace.optimization.glass_choice import Choice, GlassStep, catalogs_of, pool_of
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.merit import Merit, configurations_of, merit_for
-from raytrace.optimization.merit_rows import Evaluated
-from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import (
-    Condition,
-    FunctionMerit,
-    NoProblem,
-    Problem,
-    conditions_in_unit,
-    optimization_data_of,
-    typical_of,
-)
-from raytrace.optimization.report import optimize_report
-from raytrace.optimization.solver import (
+from raytrace.optimization.least_squares import (
     BestDescent,
     Cycle,
     PathState,
@@ -47,15 +45,478 @@ from raytrace.optimization.solver import (
     least_squares,
     minimise,
 )
-from raytrace.optimization.variables import bounds_of, freedom, name_of, without_glass
+from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, arguments, configurations_of, merit_for
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.problem import (
+    RELATIONS,
+    Condition,
+    FunctionMerit,
+    NoProblem,
+    Problem,
+    conditions_in_unit,
+    optimization_data_of,
+    typical_of,
+)
+from raytrace.optimization.variables import Model, bounds_of, freedom, name_of, without_glass
+from raytrace.plotting import style
 from raytrace.system.identity import digest, identity
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level
+
+# -- conditions: what is required, and what is reached -----------------------------------------------------------------
+
+EXACT = 1e-6  # tolerance of a condition, relative to its target, or to 1
+SOFT = 1e-3  # tolerance of a boundary in the merit function, relative to its target, or 1 µm
+_EXCLUDED = 1e-7  # total miss of the linear program, conditions by their slopes
+_COUNTS = 1e-6  # multipliers that count
+_ELSEWHERE = 0.03  # relative to the scale of the variables: distance at which a contradiction is checked
+_TRIES = 4
+_NAMED = 4  # variables in one sentence
+
+
+class NotReached(UserWarning):
+    """A condition or a boundary that the optimised lens does not meet."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reached:
+    """One condition or boundary of an optimisation.
+
+    name: of the condition, or of the operand and its arguments; relation: =, <= or >=; asked, reached: the target and
+    the value, in mm of conditions, in the unit of the row of rows; row: in the merit function, from 1; 0 of `hold`;
+    configuration: 0 for a lens of one; surface: the one that passes a boundary most, 0 for none; why: the reason.
+    """
+
+    name: str
+    relation: str
+    asked: float
+    reached: float
+    met: bool
+    row: int = 0
+    configuration: int = 0
+    surface: int = 0
+    why: str = ""
+
+    @property
+    def words(self) -> str:
+        """The condition, as "efl=100"."""
+        if self.row:
+            return f"{self.name} {self.relation} {self.asked:.6g} (row {self.row})"
+        return f"{self.name}{self.relation}{self.asked:.6g}"
+
+    @property
+    def place(self) -> str:
+        parts = {"surface": self.surface, "configuration": self.configuration}
+        return ", ".join(f"{name} {number}" for name, number in parts.items() if number)
+
+    def document(self) -> dict:
+        return {**dataclasses.asdict(self), "reached": self.reached if np.isfinite(self.reached) else None}
+
+    def __str__(self) -> str:
+        where = f" ({self.place})" if self.place else ""
+        reached = f"{self.reached:.6g}" if np.isfinite(self.reached) else "undefined"
+        return f"{self.words} is not reached: {reached}{where}{f'; {self.why}' if self.why else ''}"
+
+
+def reached(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> tuple[Reached, ...]:
+    """Every condition, then every boundary of the merit function, at variables (n,) between bounds (n,)."""
+    results = [*_conditions(problem, x), *_boundaries(problem, x)]
+    if all(result.met for result in results):
+        return tuple(results)
+    reasons, rows = _reasons(problem, x, lower, upper), [*_held_rows(problem), *_bounding_rows(problem)]
+    return tuple(
+        result if result.met else dataclasses.replace(result, why=reasons.get(row) or _default_reason(result))
+        for row, result in zip(rows, results, strict=True)
+    )
+
+
+def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raise NoProblem for conditions that no lens meets between the bounds, as far as that is certain."""
+    held = _held_rows(problem)
+    needs = [need for need in _needs(problem, x) if need.number in held] if held else []
+    conflict = _conflict(problem, needs, x, lower, upper)
+    if conflict is None or not _holds_elsewhere(problem, conflict, x, lower, upper):
+        return
+    named = [_condition_text(problem, number) for number in conflict.numbers]
+    values = {condition.words: condition.reached for condition in _conditions(problem, x)}
+    listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
+    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
+
+
+# -- values ------------------------------------------------------------------------------------------------------------
+
+
+def _held_rows(problem: Problem) -> list[int]:
+    """Places of the conditions in all rows."""
+    rows = problem.evaluation.rows
+    return [k for k in range(len(problem.rows), len(rows)) if rows[k].weight < 0]
+
+
+def _bounding_rows(problem: Problem) -> list[int]:
+    """Places of rows of the merit function that must be met: with a weight below 0, or boundaries."""
+    weights = problem.evaluation.weights
+    return [
+        k
+        for k, row in enumerate(problem.rows)
+        if weights[k] and (weights[k] < 0 or (row.operand in OPERANDS and OPERANDS[row.operand].bounds))
+    ]
+
+
+def _conditions(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+    values, model = problem.evaluated(x).values, problem.model
+    for k, condition in zip(_held_rows(problem), problem.conditions, strict=True):
+        unit = problem.unit ** OPERANDS[condition.row.operand].length
+        relation, target, number = condition.relation, unit * problem.evaluation.rows[k].target, unit * float(values[k])
+        missed = abs(number - target) if relation == "=" else RELATIONS[relation] * (number - target)
+        met = bool(missed <= EXACT * max(abs(target), 1.0))
+        configuration = (condition.configuration or model.lens.current_configuration) if len(model.views) > 1 else 0
+        yield Reached(_name(condition), relation, target, number, met, configuration=configuration)
+
+
+def _name(condition: Condition) -> str:
+    at = f"@{condition.configuration}" if condition.configuration else ""
+    return f"{condition.name or condition.row.name}{at}"
+
+
+def _boundaries(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+    evaluation, evaluated = problem.evaluation, problem.evaluated(x)
+    largest: dict[int, tuple[float, int]] = {}  # excess of every one-sided row, and its surface
+    for rows, excesses, _, surfaces in evaluated.sides:
+        for row, excess, surface in zip(rows.tolist(), excesses.tolist(), surfaces.tolist(), strict=True):
+            if row not in largest or excess > largest[row][0]:
+                largest[row] = excess, surface
+    configurations = {
+        line.number - 1: planner.view.configuration for planner, lines, _ in evaluation.groups for line in lines
+    }
+    several = len(problem.model.views) > 1
+    for k in _bounding_rows(problem):
+        row, operand = problem.rows[k], OPERANDS[problem.rows[k].operand]
+        relation, number, surface = operand.bounds or "=", float(evaluated.values[k]), 0
+        side = -1.0 if relation == ">=" else 1.0
+        if k in largest:
+            excess, surface = largest[k]
+            number = row.target + side * excess / evaluation.factors[k]
+            surface = surface if excess > 0 else 0
+        elif operand.bounds and operand.refers:
+            number = float(evaluated.values[row.integers[0] - 1])
+            number = abs(number) if row.operand.startswith("AB") else number
+        missed = abs(number - row.target) if relation == "=" else side * (number - row.target)
+        tolerance = EXACT if evaluation.weights[k] < 0 else SOFT
+        least = 1e-3 / problem.unit if tolerance == SOFT and operand.length == 1 else tolerance
+        met = bool(missed <= max(tolerance * abs(row.target), least))
+        name = f"{row.name} {arguments(row)}".strip()
+        yield Reached(name, relation, row.target, number, met, k + 1, configurations[k] if several else 0, surface)
+
+
+def _default_reason(result: Reached) -> str:
+    if not np.isfinite(result.reached):
+        return "a ray that it needs is lost"
+    if result.row:
+        return "the rest of the merit function outweighs it: give it more weight"
+    return "the descent ended first: allow more cycles, or begin nearer to it"
+
+
+# -- reasons -----------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class _Need:
+    """c + a p = 0, or ≤ 0; number: place of its row among all rows; part: its number within the row."""
+
+    number: int
+    miss: float
+    slope: np.ndarray
+    equal: bool
+    part: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Conflict:
+    """Needs that exclude one another, their multipliers, and the variables whose bounds take part."""
+
+    needs: tuple[_Need, ...]
+    weights: np.ndarray
+    bounded: tuple[int, ...]
+
+    @property
+    def numbers(self) -> list[int]:
+        return [*dict.fromkeys(need.number for need in self.needs)]
+
+    def words(self, problem: Problem) -> str:
+        names = [name_of(problem.model.variables[k]) for k in self.bounded]
+        listed = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+        if not any(need.slope.any() for need in self.needs):
+            return "no variable moves it"
+        several = len(self.numbers) > 1
+        if names:
+            return f"{'they exclude one another' if several else 'it is out of reach'} within the bounds of {listed}"
+        return "they exclude one another" if several else "it is out of reach"
+
+
+def _condition_text(problem: Problem, number: int) -> str:
+    """A condition in the syntax of `hold`, or a row of the merit function by its number."""
+    held = _held_rows(problem)
+    if number in held:
+        condition = problem.conditions[held.index(number)]
+        unit = problem.unit ** OPERANDS[condition.row.operand].length
+        return f"{_name(condition)}{condition.relation}{unit * problem.evaluation.rows[number].target:.6g}"
+    row = problem.rows[number]
+    relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
+    return f"{row.name} {arguments(row)}".strip() + f" {relation} {row.target:.6g} (row {number + 1})"
+
+
+def _needs(problem: Problem, x: np.ndarray) -> list[_Need]:
+    """All conditions and boundaries at x, in units of the rows; none of rows without a value."""
+    evaluated, evaluation = problem.evaluated(x, True), problem.evaluation
+    sided = {int(row) for rows, *_ in evaluated.sides for row in rows}
+    needs, parts = [], Counter()
+
+    def add(k: int, miss: float, slope: np.ndarray, sign: float, equal: bool) -> None:
+        scale = sign / evaluation.factors[k]
+        needs.append(_Need(k, scale * miss, scale * slope, equal, parts[k]))
+        parts[k] += 1
+
+    for k, residual, slope in zip(evaluated.of_row.tolist(), evaluated.residuals, evaluated.jacobian, strict=True):
+        if evaluation.weights[k] < 0 and k not in sided and not evaluated.lost[k]:
+            sign = int(problem.signs[k])
+            add(k, residual, slope, sign or 1, sign == 0)
+    for rows, excesses, slopes, _ in evaluated.sides:
+        for k, excess, slope in zip(rows.tolist(), excesses, slopes, strict=True):
+            add(k, excess, slope, 1, False)
+    return needs
+
+
+def _scale(problem: Problem, x: np.ndarray) -> np.ndarray:
+    typical = typical_of(problem.model)
+    return np.where(np.isfinite(typical), typical, np.maximum(np.abs(x), 1e-3))
+
+
+def _conflict(problem: Problem, needs: Sequence[_Need], x: np.ndarray, lower, upper) -> _Conflict | None:
+    """Needs that exclude one another within the bounds by the linear model."""
+    if not needs:
+        return None
+    scale = _scale(problem, x)
+    slopes = np.array([need.slope for need in needs]) * scale
+    sizes = np.linalg.norm(slopes, axis=1)
+    misses = np.array([need.miss for need in needs])
+    sizes = np.where(sizes > 1e-12 * np.maximum(np.abs(misses), 1.0), sizes, 0.0)
+    slopes = np.where(sizes[:, None] > 0, slopes, 0.0)
+    units = np.where(sizes > 0, sizes, np.maximum(np.abs(misses), 1e-300))
+    small = (sizes == 0) & (np.abs(misses) <= EXACT)
+    slopes, misses = slopes / units[:, None], np.where(small, 0.0, misses / units)
+    equal = np.array([need.equal for need in needs])
+    count, size = len(needs), len(x)
+    rows = np.concatenate([slopes, -slopes[equal]])
+    slack = np.concatenate([-np.eye(count), -np.eye(count)[equal]])
+    right = np.concatenate([-misses, misses[equal]])
+    ends = [*zip((lower - x) / scale, (upper - x) / scale, strict=True), *[(0.0, np.inf)] * count]
+    cost = np.concatenate([np.zeros(size), np.ones(count)])
+    solution = linprog(cost, A_ub=np.hstack([rows, slack]), b_ub=right, bounds=ends, method="highs")
+    if solution.status != 0 or solution.fun <= _EXCLUDED:
+        return None
+    signed = -solution.ineqlin.marginals[:count]
+    signed[equal] += solution.ineqlin.marginals[count:]
+    at_bound = (np.abs(solution.lower.marginals) + np.abs(solution.upper.marginals))[:size] > _COUNTS
+    chosen = np.flatnonzero(np.abs(signed) > _COUNTS).tolist()
+    weights = (signed / units)[chosen]
+    return _Conflict(tuple(needs[k] for k in chosen), weights, tuple(np.flatnonzero(at_bound).tolist()))
+
+
+def _holds_elsewhere(problem: Problem, conflict: _Conflict, x: np.ndarray, lower, upper) -> bool:
+    """Whether the weighted sum of the needs moves at other points as their linear model predicts."""
+    draw, scale, checked = np.random.default_rng(0), _scale(problem, x), 0
+    for _ in range(_TRIES):
+        step = np.clip(x + _ELSEWHERE * scale * draw.normal(size=len(x)), lower, upper) - x
+        there = {(need.number, need.part): need.miss for need in _needs(problem, x + step)}
+        if any((need.number, need.part) not in there for need in conflict.needs):
+            continue
+        moved = np.array([there[need.number, need.part] for need in conflict.needs])
+        model = np.array([need.miss + need.slope @ step for need in conflict.needs])
+        size = np.abs(conflict.weights) @ np.maximum(np.abs(moved), np.abs([need.miss for need in conflict.needs]))
+        if abs(conflict.weights @ (moved - model)) > 1e-8 * size:
+            return False
+        checked += 1
+    return checked >= 2
+
+
+def _reasons(problem: Problem, x: np.ndarray, lower, upper) -> dict[int, str]:
+    """Why rows are missed, by their place, if conditions, boundaries and bounds exclude one another at x."""
+    conflict = _conflict(problem, _needs(problem, x), x, lower, upper)
+    if conflict is None:
+        return {}
+    reasons = {}
+    for k in conflict.numbers:
+        others = [_condition_text(problem, other) for other in conflict.numbers if other != k]
+        listed = ", ".join(others[:_NAMED]) + (", …" if len(others) > _NAMED else "")
+        words = f"it and {listed} exclude one another" if others else conflict.words(problem)
+        reasons[k] = f"near this lens {words}"
+    return reasons
+
+
+# -- report ------------------------------------------------------------------------------------------------------------
+
+_MOST_FIELDS = 5
+_MOST_BARS = 10
+_MOST_CONFIGURATIONS = 4
+_BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
+
+
+@style.styled
+def optimize_report(found):
+    """One page: the lens and its spots before and after in its configurations, on one scale, the merit by cycle, the
+    operands that are left, and what conditions and boundaries asked for and reached."""
+    each, conditions = _configurations(found), found.shown_conditions()
+    count, below = len(each), 0.16 * (len(conditions) + 3) if conditions else 0.0
+    heights = [2.8 * count, 4.2 * count, 2.9, *([below] if conditions else [])]
+    figure = style.new_figure(10.0, 0.3 + sum(heights))
+    name = style.fill(found.lens.name, figure.get_figwidth(), 12, bold=True) or "Lens"
+    figure.suptitle(name, fontsize=12, fontweight="bold")
+    top, middle, bottom, *last = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0.02)
+    for row, (label, before, after) in zip(top.subplots(count, 2, squeeze=False), each, strict=True):
+        for axes, lens, when, merit in (
+            (row[0], before, "Before", found.merit_before),
+            (row[1], after, "After", found.merit_after),
+        ):
+            _draw_lens(axes, lens, f"{when}, {label}" if label else f"{when}: merit {style.number_text(merit)}")
+        on_one_scale(row)
+    _draw_spots(middle, each)
+    left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
+    _draw_history(left, found)
+    _draw_left(right, found)
+    if conditions:
+        _draw_conditions(last[0].add_subplot(), found)
+    return figure
+
+
+def _configurations(found) -> list[tuple[str, Lens, Lens]]:
+    """The configurations that are drawn, spread over all: label, before and after; one alone has no label."""
+    pairs = [*zip(found.before.configurations, found.lens.configurations, strict=True)]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_CONFIGURATIONS)).round().astype(int))
+    several = len(pairs) > 1
+    return [
+        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(detached(one) for one in pairs[k]))
+        for k in chosen.tolist()
+    ]
+
+
+def _draw_conditions(axes, found) -> None:
+    """The table of what was asked for and what was reached, what is not met in red."""
+    lines, shown = found.conditions_in_words(), found.shown_conditions()
+    axes.axis("off")
+    axes.set_title("Asked and reached", fontweight="bold", loc="left")
+    for k, line in enumerate(lines):
+        missed = 0 < k <= len(shown) and not shown[k - 1].met
+        axes.annotate(
+            line, (0.0, 1.0), (0, -11 * k - 4), xycoords="axes fraction", textcoords="offset points", va="top",
+            fontsize=7.5, family="monospace", color="#b00020" if missed else style.INK,
+        )  # fmt: skip
+
+
+def _draw_lens(axes, lens: Lens, title: str) -> None:
+    draw_layout(axes, lens, fields=drawn_fields(lens), rays=5)
+    axes.set_title(f"{title}\n", fontweight="bold", pad=4)
+    axes.annotate(
+        first_order_text(lens), (0.5, 1.0), (0, 5), xycoords="axes fraction",
+        textcoords="offset points", ha="center", fontsize=7.5, color=style.GREY,
+    )  # fmt: skip
+
+
+def drawn_fields(lens: Lens):
+    """The fields that are drawn (2, F): all, or as many as stay legible, spread over all."""
+    points = torch.stack([lens.fields.x, lens.fields.y])
+    count = points.shape[1]
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_FIELDS)).round().astype(int))
+    return points[:, chosen.tolist()]
+
+
+def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
+    """A row of spots before and one after, of every configuration, on one scale; small ones are enlarged in a corner
+    of their panel."""
+    panels = page.subplots(2 * len(each), max(drawn_fields(after).shape[1] for _, _, after in each), squeeze=False)
+    first = each[0][2]
+    wavelengths, airy = style.array(first.wavelengths), float(airy_radius(first))
+    states = []
+    for label, *both in each:
+        spots = [field_spots(lens, fields=drawn_fields(lens)) for lens in both]
+        half = panel_size(np.concatenate([style.array(whole.geometric_radius) for whole, _ in spots]), airy)
+        states += [(label, *state, half) for state in zip(both, spots, ("before", "after"), strict=True)]
+    for row, (label, lens, (whole, dots), when, half) in zip(panels, states, strict=True):
+        fields = drawn_fields(lens)
+        look = {"wavelengths": style.array(lens.wavelengths), "airy": float(airy_radius(lens)), "half": half}
+        for f, panel in enumerate(row):
+            if f >= fields.shape[1]:
+                panel.axis("off")
+                continue
+            draw_spot_to_scale(panel, whole, dots, f, **look)
+            if when == "before":
+                colour = style.field_colours(len(row))[f]
+                panel.set_title(field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
+        row[0].set_ylabel(f"Spots {when}" + (f"\n{label}" if label else ""), fontweight="bold")
+    page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
+
+
+def _draw_history(axes, found) -> None:
+    merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
+    axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
+    _scale_merit(axes, merit)
+    axes.locator_params(axis="x", integer=True)
+    axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
+    axes.set_ylabel("merit")
+    axes.set_title("Merit function", fontweight="bold")
+    axes.annotate(
+        STOPPED[found.stopped], (0.98, 0.94), xycoords="axes fraction", ha="right", fontsize=7.5, color=style.GREY
+    )
+    axes.grid(alpha=0.25)
+
+
+def _scale_merit(axes, merit: np.ndarray) -> None:
+    """Logarithmic over more than a factor of three, else linear; a small change is drawn about a printed value."""
+    least, most = float(np.min(merit)), float(np.max(merit))
+    if least > 0 and most > 3 * least:
+        axes.set_yscale("log")
+    elif most - least <= 1e-9 * most:
+        axes.set_ylim(0.9 * least, 1.1 * most or 1.0)
+    else:
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=True)
+
+
+def _draw_left(axes, found) -> None:
+    """What the square of the merit is made of now, and was."""
+    shares: dict[str, np.ndarray] = {}
+    for i, name in _groups(found):
+        pair = np.array([float(c[i - 1]) for c in (found.contributions_before, found.contributions)])
+        shares[name] = shares.get(name, 0) + pair
+    names = sorted(shares, key=lambda name: -shares[name][1])[:_MOST_BARS]
+    places = np.arange(len(names))
+    axes.barh(places - 0.2, [100 * shares[n][0] for n in names], height=0.36, color=_BEFORE, label="before")
+    axes.barh(places + 0.2, [100 * shares[n][1] for n in names], height=0.36, color=_AFTER, label="after")
+    axes.set_yticks(places, names)
+    axes.invert_yaxis()
+    axes.set_xlabel("part of the square of the merit, %")
+    axes.set_title("What is left", fontweight="bold")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
+
+
+def _groups(found) -> list[tuple[int, str]]:
+    """Rows with weight and the names of their bars: each its own, or by operand and field, or by operand, if few."""
+    counts = [i for i in found.rows if found.merit[i - 1].weight != 0]
+    rows = {i: found.merit[i - 1] for i in counts}
+    field = {i: "".join(f" {h:.3g}" for h in row.numbers[:2]) if any(row.numbers) else "" for i, row in rows.items()}
+    names = (
+        {i: f"{row.name} {i}" for i, row in rows.items()},
+        {i: row.name + field[i] for i, row in rows.items()},
+        {i: row.name for i, row in rows.items()},
+    )
+    chosen = next((one for one in names if len(set(one.values())) <= _MOST_BARS), names[-1])
+    return [*chosen.items()]
+
+
+# -- result ------------------------------------------------------------------------------------------------------------
 
 _SHOWN = 12  # rows of the merit function in the text, those of largest contribution
 

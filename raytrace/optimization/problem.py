@@ -25,16 +25,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.conventions import Conventions
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.lens_state import LensState
-from raytrace.optimization.merit import in_unit
-from raytrace.optimization.merit_rows import LOST, Evaluated, Evaluation
+from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.optimization.least_squares import Sides, State
+from raytrace.optimization.lens_state import Bundle, LensState, Ray
+from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit
+from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.ray_bundle import Bundle, Ray
-from raytrace.optimization.solver import Sides, State
-from raytrace.optimization.variables import BadHold, constraint_words, has_power, split_constraint
+from raytrace.optimization.variables import BadHold, Model, constraint_words, has_power, split_constraint
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from raytrace.materials.glass import is_air
+from raytrace.optimization.least_squares import SolverOptions, State
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem
@@ -39,7 +40,6 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.solver import SolverOptions, State
 from raytrace.optimization.variables import Freedom
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary

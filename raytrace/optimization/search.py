@@ -21,14 +21,12 @@ from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, cell
-from raytrace.maths.value import detached, value
-from raytrace.optimization.attained import refuse_contradictions
-from raytrace.optimization.default_merit import KINDS, DefaultMerit
-from raytrace.optimization.merit import Merit, merit_for
-from raytrace.optimization.optimize import opened
+from raytrace.optimization.least_squares import SolverOptions
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
+from raytrace.optimization.optimize import drawn_fields, opened, refuse_contradictions
 from raytrace.optimization.problem import Condition, NoProblem, Problem, conditions_in_unit, optimization_data_of
-from raytrace.optimization.report import drawn_fields
 from raytrace.optimization.saddle_points import Insertion, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
@@ -43,7 +41,6 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.solver import SolverOptions
 from raytrace.optimization.variables import bounds_of, freedom
 from raytrace.plotting import style
 from raytrace.shards import Share

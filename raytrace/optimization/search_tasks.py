@@ -22,14 +22,12 @@ import numpy as np
 import torch
 from scipy.stats import qmc
 
-from raytrace.files import NotWritten
-from raytrace.optimization.lens_model import Model
+from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.solver import SolverOptions, least_squares
-from raytrace.optimization.variables import Freedom, name_of
+from raytrace.optimization.variables import Freedom, Model, name_of
 from raytrace.shards import agreeing, share, total
-from raytrace.stores import DamagedLine, Lines, anything, listed, mapped, number, record, text
+from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, text
 from raytrace.system.identity import identity, unlike
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import sensor
@@ -38,7 +36,6 @@ from raytrace.words import calling_level
 # -- the journal -------------------------------------------------------------------------------------------------------
 
 FILE = "search.jsonl"
-_ADVICE = "it keeps no search: name a new folder"
 _TASK = record(
     {"task": text, "x": listed(number()), "seconds": number(0)}
     | dict.fromkeys(("lost", "missed", "merit"), number(0, infinite=True))
@@ -72,6 +69,16 @@ class TaskResult(NamedTuple):
         return self.lost == 0 and self.missed <= 1e-6 and bool(np.isfinite(self.merit))
 
 
+_JOURNAL = Kind(
+    BadSearch,
+    "it keeps no search: name a new folder",
+    BadSearch,
+    "`folder`: {path} keeps a search of {difference}; name a new folder",
+    unlike,
+    "the search continues, but cannot resume from here",
+)
+
+
 class Journal:
     """Results of tasks, in a file of a folder or, without one, in memory alone."""
 
@@ -80,28 +87,19 @@ class Journal:
 
         Raises BadSearch.
         """
-        self.path = None if folder is None else Path(folder) / FILE
-        self.until, self.known, self.lines, self.store = until, {}, {}, None
-        if self.path is None:
-            return
-        self.store = Lines(self.path, _TASK, head=mapped(anything))
-        before, records = self.store.read(BadSearch, _ADVICE)
-        if before is None:
-            if not share().rank:
-                self.store.begin(about)
-            return
-        if words := unlike(before, about):
-            raise BadSearch(f"`folder`: {self.path} keeps a search of {words}; name a new folder")
-        for line, one in records:
-            self.lines[one["task"]] = line
-            self.known[one["task"]] = TaskResult(*(one[name] for name in TaskResult._fields[:4]), np.array(one["x"]))
+        self.until, self.known, self.lines = until, {}, {}
+        self.store = Records(None if folder is None else Path(folder) / FILE, about, _JOURNAL, _TASK)
+        for line, result in self.store.read():
+            numbers = (result[name] for name in TaskResult._fields[:4])
+            self.known[result["task"]] = TaskResult(*numbers, np.array(result["x"]))
+            self.lines[result["task"]] = line
 
     def each(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]], count: int) -> list[TaskResult]:
         """Results of tasks, a key and a function each, at (count,) variables. Raises SearchStopped."""
         for key, _ in tasks:
             if key in self.known and len(self.known[key].x) != count:  # of another number of variables
                 words = f"x: found a list of {len(self.known.pop(key).x)}, expected {count} of them"
-                place = f"{self.path}, line {self.lines[key]}"
+                place = f"{self.store.path}, line {self.lines[key]}"
                 warnings.warn(f"{place}: {words}; the line is ignored", DamagedLine, stacklevel=calling_level())
         left = [(key, task) for key, task in tasks if key not in self.known]
         mine = share()
@@ -131,15 +129,8 @@ class Journal:
 
     def _add(self, key: str, result: TaskResult) -> None:
         self.known[key] = result
-        if self.store is None or share().rank:
-            return
         numbers = dict(zip(TaskResult._fields[:4], map(float, result[:4]), strict=True))
-        try:
-            self.store.append({"task": key, **numbers, "x": result.x.tolist()})
-        except OSError as error:
-            self.store = None
-            words = f"{self.path}: {error.strerror}; the search continues, but cannot resume from here"
-            warnings.warn(words, NotWritten, stacklevel=calling_level())
+        self.store.append({"task": key, **numbers, "x": result.x.tolist()})
 
 
 # -- minima ------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
     psf(lens, model="gaussian", fields=…, object_distances=…, pixel=0.005, size=21, tol=1e-3) -> Psf
 
-`models.py` has the call, the table of the models and the choice of an order; `sharing.py` the work of several
+`models.py` has the call, the table of the models, the choice of an order and the work of several
 processes.
 
 | model    | data of the lens                                                                | module         |
@@ -14,8 +14,8 @@ processes.
 | wave     | the traced wavefront: diffraction with the true aberrations                     | wave.py        |
 """
 
-from raytrace.psf_models.closeup import CloseUp as CloseUp
-from raytrace.psf_models.closeup import close_up as close_up
+from raytrace.psf_models.figures import CloseUp as CloseUp
+from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import DRT as DRT
 from raytrace.psf_models.models import MODELS as MODELS
 from raytrace.psf_models.models import Execution as Execution

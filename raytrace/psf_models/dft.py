@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford, piece
-from raytrace.maths.grid import Grid, centres
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import Grid, centres, gauss_rings
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
 from raytrace.words import calling_level

@@ -26,10 +26,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford
-from raytrace.maths import pupil
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide, varies
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, value, varies
+from raytrace.maths.sampling import Grid, sobol
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf_models.result import Kernels, centroid_and_covariance
 from raytrace.system.apertures import Aperture, clearance
@@ -227,13 +225,13 @@ def kernels_of_rays(
     *,
     order: int = 4,
     rays: int | None = None,
-    sampling: Callable[..., tuple[Tensor, Tensor]] = pupil.sobol,
+    sampling: Callable[..., tuple[Tensor, Tensor]] = sobol,
     width: float = 0.25,
 ) -> Kernels:
     """PSFs of traced rays, without the polynomial map; differentiable in the lens, the sensor distance and the grid.
 
     order: 0 … 10; each has twice the rays of the one before, and half its error. rays: instead, that many independent
-    rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by `splat_smooth` of half width `width` pixels; 0
+    rays of `sampling` (`sobol`, `random`), each blurred by `splat_smooth` of half width `width` pixels; 0
     is the histogram, without derivative. A kernel that no ray reaches has energy 0 and gradient 0.
     """
     if rays is None:

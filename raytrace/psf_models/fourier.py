@@ -19,9 +19,8 @@ from torch import Tensor
 
 from raytrace.budget import piece
 from raytrace.maths import zernike as polynomials
-from raytrace.maths.grid import Grid
-from raytrace.maths.pupil import gauss_rings, with_rim
-from raytrace.maths.value import to, value
+from raytrace.maths.numerics import to, value
+from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.psf_models import dft
 from raytrace.psf_models.paraxial import chief_ray_height, need_one_focus
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves, reach

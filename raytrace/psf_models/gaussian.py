@@ -9,10 +9,8 @@ import torch
 from numpy.polynomial import legendre
 from torch import Tensor
 
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings, sobol
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.psf_models.drt import histogram
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search

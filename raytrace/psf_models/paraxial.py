@@ -5,18 +5,17 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.value import detached
+from raytrace.maths.numerics import detached, safe_divide
+from raytrace.maths.sampling import Grid
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media
 from raytrace.system.surface import is_round
-from raytrace.tracing.aiming import Bent, is_bent, need_axis
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order, signed, system_matrix
 from raytrace.tracing.scene import Scene, is_on_axis
+from raytrace.tracing.trace import Bent, is_bent, need_axis
 
 _ALIKE = 1e-3  # of the power: sections that differ by less have one focus
 

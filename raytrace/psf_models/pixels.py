@@ -11,8 +11,8 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.grid import Grid, centres, edges
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.sampling import Grid, centres, edges
 
 #: Standard deviations beyond which a normal distribution is 0 in float64.
 _FAR = 40.0

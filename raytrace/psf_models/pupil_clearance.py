@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_legendre
+from raytrace.maths.sampling import gauss_legendre
 from raytrace.psf_models.drt import trace_apertures
 from raytrace.system.apertures import clearance
 from raytrace.tracing.scene import Scene
@@ -50,7 +50,7 @@ def between(inner: Tensor, outer: Tensor, unit: Tensor, *, rings: int) -> tuple[
 
         ∫ f r dr ≈ (o - i) Σ_n w_n f(r_n) r_n,   r_n = i + (o - i) t_n,   with Gauss-Legendre nodes t_n
 
-    `rings` nodes on each part, those of one ring together. Rings of equal steps in r² (`pupil.gauss_rings`) need
+    `rings` nodes on each part, those of one ring together. Rings of equal steps in r² (`sampling.gauss_rings`) need
     opposite arms of the same length: else odd powers of r, roots of r², do not cancel. The weights of a clear pupil
     sum to 1.
     """

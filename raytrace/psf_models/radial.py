@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford, forewarn
-from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, varies
+from raytrace.maths.sampling import Grid
 from raytrace.tracing.scene import Scene
 
 _STEPS = 64  # of the table of g in a pixel

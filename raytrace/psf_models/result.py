@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from raytrace.files import write_atomically
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Column, Result, axis, flat, number, numbers, text_table
-from raytrace.maths.value import value
-from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.tracing.spot import where_lit
+from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.result import Column, Result, Table, axis, number, numbers
+from raytrace.maths.sampling import Grid
+from raytrace.system.lens import Lens
 
 #: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
 _BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
@@ -126,18 +124,14 @@ class Psf(Result):
 
         return psf_grid(self, **options)
 
-    @property
-    def COLUMNS(self) -> Sequence[Column]:
-        field = FIELD_UNITS[self.lens.fields.kind]
-        return (
-            Column("object_distance", "mm", ">12g", "object"), Column("field_x", field),
-            Column("field_y", field, ">9g", "field"), Column("wavelength", "µm", ">9g", "λ"),
-            *(Column(f"centroid_{a}", "mm", ">12.6f", f"centroid {a}") for a in "xy"),
-            *(Column(f"sigma_{a}_um", "µm", ">9.4f", f"σ {a}") for a in "xy"),
-            *(Column(f"ray_sigma_{a}_um", "µm", ">9.4f", f"rays' σ {a}") for a in "xy"),
-            Column("energy", "", ">8.4f", "energy\nwindow"), Column("error", "", ">9.1e", "error\nest."),
-            Column("rays", "", ">7.0f"),
-        )  # fmt: skip
+    COLUMNS = (
+        Column("object_distance", "mm", "g", "object"), Column("wavelength", "µm", "g", "λ"),
+        *(Column(f"centroid_{a}", "mm", ".6f", f"centroid {a}") for a in "xy"),
+        *(Column(f"sigma_{a}_um", "µm", ".4f", f"σ {a}") for a in "xy"),
+        *(Column(f"ray_sigma_{a}_um", "µm", ".4f", f"rays' σ {a}") for a in "xy"),
+        Column("energy", "", ".4f", "energy\nwindow"), Column("error", "", ".1e", "error\nest."),
+        Column("rays", "", ".0f"),
+    )  # fmt: skip
 
     def columns(self) -> dict[str, Tensor]:
         """A row for every kernel: widths of the light before pixels, of waves also those of their rays."""
@@ -192,20 +186,15 @@ class Psf(Result):
         arrays = {name: t.detach().cpu().numpy() if isinstance(t, Tensor) else t for name, t in arrays.items()}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         pitch = 1000 * float(self.grid.pitch)
         lines = [f"{self.model} PSF, {self.grid.columns} × {self.grid.rows} pixels of {pitch:g} µm, {self._colours()}"]
         lines += [self.reason] if self.reason else []
         if self.waves:
             lines.append("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
-        listed = flat(self.columns())
-        fields = torch.stack([*map(torch.as_tensor, (listed.pop("field_x"), listed["field_y"]))], 1)
-        listed["field_y"] = [*map(name_of_field, fields)]
-        listed["object_distance"] = [f"{distance:g}" for distance in listed["object_distance"]]
-        lines += text_table({self.column(name): values for name, values in listed.items()})
-        if bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any()):
-            lines.append("kernels of energy 0: their light lies outside the window; --center chief moves it there")
-        return "\n".join(lines)
+        outside = bool(((self.energy < 1e-6) & (self.ray_covariance > 0).any(0)).any())
+        remark = "kernels of energy 0: their light lies outside the window; --center chief moves it there"
+        return [Table(self.columns(), lines, [remark] if outside else [])]
 
     def _colours(self) -> str:
         """The wavelengths in words, and whether they are summed."""
@@ -278,8 +267,8 @@ def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
         dark_of_all = f"{int(dark.sum())} of {dark.numel()}"
         raise EmptyPsf(f"no ray reaches the sensor in {dark_of_all} PSFs, those of index {places}")
-    lit = where_lit(~dark, *moments.values(), empty=empty)
-    return dataclasses.replace(psfs, **dict(zip(moments, lit, strict=True)))
+    shown = {name: torch.where(dark, torch.nan, moment) for name, moment in moments.items()}
+    return dataclasses.replace(psfs, **shown)
 
 
 def _is_dark(light: Kernels | Psf, centroid: Tensor, covariance: Tensor, *, of_waves: bool) -> Tensor:

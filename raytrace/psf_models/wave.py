@@ -18,10 +18,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to, value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, to, value
+from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import dft
 from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_sqrt, value
 
 
 @value

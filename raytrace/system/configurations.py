@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import Glass, label
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 
 Whole = TypeVar("Whole")
 

@@ -16,13 +16,14 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
-from raytrace.maths.value import check_precision, value
+from raytrace.maths.numerics import check_precision, value
+from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface, medium_surfaces
+from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean
 
 #: Units of a field point by the kind of field.
@@ -405,8 +406,7 @@ def with_field_kind(lens: Lens, kind: str) -> Lens:
 
 def name_of_field(field: Tensor) -> str:
     """A field point (2,) in words: its y alone on the axis of x."""
-    x, y = field.tolist()
-    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+    return point_text(*field.tolist())
 
 
 def field_label(lens: Lens, field: Sequence[float]) -> str:
@@ -523,3 +523,8 @@ def _check_cone(lens: Lens) -> None:
         index = float(index_behind(lens, 0, lens.primary))
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")
+
+
+def is_round_about_axis(lens: Lens) -> bool:
+    """Whether the lens is rotationally symmetric, by the kinds and poses of its surfaces, whatever their values."""
+    return all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)

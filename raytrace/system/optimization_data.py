@@ -91,7 +91,7 @@ class Row:
     """One row of a merit function: an operand, its arguments, target and weight.
 
     operand: its name, as "TRAC", a key of `optimization.operands.table.OPERANDS` if it is known, or a function from a
-        lens to a tensor () or (k,), which may be a `optimization.operands.custom.Measure`; `name` names either.
+        lens to a tensor () or (k,), which may be a `optimization.operands.operand.Measure`; `name` names either.
     integers, numbers: its arguments in the order of OpticStudio: surfaces, a wavelength (from 1, 0 the primary one) or
         rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.

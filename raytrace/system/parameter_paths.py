@@ -30,6 +30,11 @@ class ParameterPath(NamedTuple):
     path: tuple[str, ...]
     entry: int | None = None
 
+    @property
+    def steps(self) -> tuple:
+        """The path as that of `configurations.part`."""
+        return self.path if self.entry is None else (*self.path, (self.entry,))
+
 
 def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
     """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of sag terms, a phase and the poses.

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.bivariate import fringe_to_powers, polynomial_xy
-from raytrace.maths.numerics import dot, polynomial
-from raytrace.maths.value import value
+from raytrace.maths.numerics import dot, polynomial, value
 
 _MICROMETRE = 1e-3  # mm
 

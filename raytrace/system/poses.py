@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 
 
 @value

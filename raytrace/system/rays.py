@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import unit, with_batch_axes
-from raytrace.maths.value import value
+from raytrace.maths.numerics import unit, value, with_batch_axes
 
 #: Columns of a table of rays: mm in the frame of a surface, and direction cosines.
 COLUMNS = ("x", "y", "z", "l", "m", "n")

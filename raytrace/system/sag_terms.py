@@ -22,8 +22,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
-from raytrace.maths.numerics import polynomial
-from raytrace.maths.value import value
+from raytrace.maths.numerics import polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
 

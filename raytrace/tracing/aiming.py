@@ -1,27 +1,20 @@
-"""Ray aiming: rays through given points of the stop, chief rays to given image points, and whether the axis bends.
+"""Ray aiming: rays through given points of the stop, and chief rays to given image points.
 
 Roots of traced residuals are found by Newton's method from the paraxial rays; where it fails, by continuation from the
 axis to the full field. Each root is independent of the others of a batch.
 """
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from itertools import islice
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, safe_divide, varies, with_batch_axes
-from raytrace.maths.value import detached
-from raytrace.system.lens import Lens, media
-from raytrace.system.phases import kind_of
+from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
-from raytrace.tracing.trace import lens_steps, trace_surfaces
-from raytrace.words import named
+from raytrace.tracing.trace import at_stop, points_at
 
 _STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
 _STEPS = 8  # Newton steps at each stage
@@ -34,12 +27,6 @@ _length = partial(torch.linalg.vector_norm, dim=0)
 
 #: Residuals (n, ...) of unknowns (n, ...) at a fraction of the field, and whether the rays reach the target surface.
 Residual = Callable[[Tensor, float], tuple[Tensor, Tensor]]
-
-
-def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
-    (stop,), arrives = _crossings(lens, rays, wavelength, (lens.stop,))
-    return stop, arrives
 
 
 def aim_at_stop(
@@ -99,7 +86,7 @@ def aim_at_image(
     def missed(unknown: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
         pupil = torch.zeros_like(unknown[:2]) if radius is None else unknown[2:]
         rays = through(unknown[:2], pupil)
-        (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
+        (stop, image), arrives = points_at(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
         off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
         if radius is not None:  # at the stop, chief rays of all heights may share one point
             off = torch.broadcast_tensors(*off, *(at / radius for at in stop))
@@ -109,26 +96,6 @@ def aim_at_image(
     given = lens, height, through(start[:2].detach(), torch.zeros_like(start[:2])), radius
     unknown, found = _root(missed, start, origin=torch.zeros_like, given=given)
     return torch.where(found, unknown[:2], 0.0), found
-
-
-def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
-    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
-    indices = media(lens, wavelength)
-    unclipped = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces]
-    rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
-    for last in numbers:
-        rays = trace_surfaces(
-            unclipped[first + 1 : last + 1],
-            rays,
-            indices=indices[first : last + 1],
-            wavelength=wavelength,
-            side=side,
-            gap=gap_behind(lens.surfaces[first]) if first else None,
-        )
-        side = -side if sum(surface.is_mirror for surface in unclipped[first + 1 : last + 1]) % 2 else side
-        points.append(rays.position[:2])
-        first = last
-    return points, rays.valid
 
 
 def _root(
@@ -249,70 +216,3 @@ def _solve(rows: list[Tensor], error: Tensor) -> Tensor:
     usable = ((singular == 0) & torch.isfinite(trial).all(-1).all(-1))[..., None, None]
     safe = torch.where(usable, matrix, torch.eye(len(rows), dtype=matrix.dtype, device=matrix.device))
     return torch.linalg.solve_ex(safe, torch.where(usable, error, 0.0))[0][..., 0].movedim(-1, 0)
-
-
-_STRAIGHT = 1e-9  # mm and direction cosines: smaller deviations of an axial ray are ignored
-
-
-def is_round_about_axis(lens: Lens) -> bool:
-    """Whether the lens is rotationally symmetric, by the kinds and poses of its surfaces, whatever their values."""
-    return all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
-
-
-def is_bent(lens: Lens) -> bool:
-    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
-    return _bends(lens, lens.surfaces)
-
-
-def aiming_of(lens: Lens) -> str:
-    """The ray aiming of a lens, "off", "paraxial" or "real".
-
-    "auto" resolves to "real" if a surface in front of the stop bends the axis, or the stop is tilted or decentred (the
-    straightened entrance pupil is then no image of the stop), and else to "off".
-    """
-    if lens.ray_aiming != "auto":
-        return lens.ray_aiming
-    stop = lens.surfaces[lens.stop]
-    moved = stop.is_break or stop.before is not None
-    return "real" if moved or _bends(lens, lens.surfaces[: lens.stop]) else "off"
-
-
-def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
-    """Whether the first surfaces of a lens, which these are, bend its axis."""
-    if any(map(is_posed, surfaces)):
-        return True
-    if all(map(is_round, surfaces)):
-        return False
-    if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
-        # Values are hidden inside a transform.
-        phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
-        return any(not kind.is_round and not kind.slopes for kind in phases)
-    with torch.no_grad():
-        lens = detached(lens)
-        axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
-        off = [0 * axis[:2]]
-        for crossing in islice(lens_steps(lens, Rays(0 * axis, axis, axis[2] > 0), lens.primary), len(surfaces) - 1):
-            off += [crossing.rays.position[:2], crossing.rays.direction[:2]]
-        return bool((torch.stack(off).abs() > _STRAIGHT).any())
-
-
-class Bent(ValueError):
-    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
-
-
-def need_axis(lens: Lens, what: str, instead: str = "") -> None:
-    """Raise Bent for a lens whose axis bends. what: the quantity; instead: an alternative for the message."""
-    if not is_bent(lens):
-        return
-    posed = [k for k, surface in enumerate(lens.surfaces) if is_posed(surface)]
-    other = [k for k, surface in enumerate(lens.surfaces) if not is_round(surface)]
-    reason = "it bends"
-    if posed:
-        surface = lens.surfaces[posed[0]]
-        reason = f"surface {posed[0]} is " + ("a coordinate break" if surface.is_break else "tilted or decentred")
-    elif other:
-        surface = lens.surfaces[other[0]]
-        part = surface.sag_terms if surface.phase is None else surface.phase
-        reason = f"surface {other[0]} ({named(part)}) takes light off it"
-    message = f"{what} needs one straight axis, but {reason}"
-    raise Bent(f"{message}; {instead}" if instead else message)

@@ -15,15 +15,14 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit, varies
-from raytrace.maths.value import value
+from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit, value, varies
 from raytrace.system.lens import Lens, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
-from raytrace.tracing.aiming import aim_at_middle, is_bent
+from raytrace.tracing.aiming import aim_at_middle
 from raytrace.tracing.paraxial import cone_angle, first_order, object_distance_of
-from raytrace.tracing.trace import steps
+from raytrace.tracing.trace import is_bent, steps
 
 _PARALLEL = 1e-15  # rad per mm, and other quantities that are 0 but for rounding
 _FIGURES = 8  # of the ray: two coordinates on the stop, three on the image, three of its direction there

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from raytrace.system.lens import Lens, media
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import is_bent
 
 
 def working_f_number(lens: Lens) -> Tensor:

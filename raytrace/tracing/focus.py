@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import (
     Lens,
     with_object_distance,
@@ -22,10 +22,10 @@ from raytrace.system.lens import (
 )
 from raytrace.system.poses import direction_in
 from raytrace.system.rays import Rays
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
+from raytrace.tracing.trace import is_bent
 
 _RINGS = 12  # of the pupil, where focus on the axis is found
 

@@ -13,7 +13,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from raytrace.maths.value import detached, value
+from raytrace.maths.numerics import detached, value
 from raytrace.system.lens import Lens, media
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS

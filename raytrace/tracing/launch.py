@@ -23,10 +23,19 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.dual import select
-from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit, varies
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import detached, value
+from raytrace.maths.numerics import (
+    broadcast_shape,
+    detached,
+    dot,
+    dot_2,
+    safe_divide,
+    safe_sqrt,
+    select,
+    unit,
+    value,
+    varies,
+)
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,
@@ -38,9 +47,10 @@ from raytrace.system.lens import (
 )
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
-from raytrace.tracing.aiming import aim_at_image, aim_at_stop, aiming_of, at_stop, is_bent
+from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
+from raytrace.tracing.trace import aiming_of, at_stop, is_bent
 from raytrace.words import calling_level, named_value
 
 

@@ -9,20 +9,20 @@ from torch import Tensor
 
 from raytrace.materials.environment import in_words
 from raytrace.materials.glass import label
+from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, number, numbers
-from raytrace.maths.value import detached, value
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, media
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
-from raytrace.tracing.aiming import aiming_of
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import aiming_of
 
 #: Descriptions of phases and sag terms with their numbers; others are described by their class alone.
 _WORDS = {

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import quotient, select, value_of
-from raytrace.maths.value import value
+from raytrace.maths.numerics import quotient, select, value, value_of
 from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford
-from raytrace.maths.pupil import hexapolar
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from raytrace.files import write_atomically
 from raytrace.io.ray_tables import read_rays
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, media, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 from raytrace.tracing.launch import rays as launched

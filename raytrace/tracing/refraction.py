@@ -17,8 +17,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import dot
-from raytrace.maths.value import to
+from raytrace.maths.numerics import dot, to
 from raytrace.system.intersection import normal
 from raytrace.system.phases import Added, added_path, ideal_path, kind_of, path_of
 from raytrace.system.surface import SHAPE, Surface

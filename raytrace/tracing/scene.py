@@ -15,13 +15,11 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import RAY_BYTES, afford
-from raytrace.maths.numerics import broadcast_shape, varies
-from raytrace.maths.value import value
+from raytrace.maths.numerics import broadcast_shape, value, varies
 from raytrace.system.apertures import SHAPES
-from raytrace.system.lens import Lens, media, with_object_distance
+from raytrace.system.lens import Lens, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
-from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.trace import Crossing, lens_steps, sequence_of, steps, trace_lens, trace_surfaces
 

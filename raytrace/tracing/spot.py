@@ -9,15 +9,13 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
-from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
-from raytrace.tracing.trace import lens_steps, sequence_of, trace_surfaces
+from raytrace.tracing.trace import is_bent, lens_steps, sequence_of, trace_surfaces
 
 
 @value

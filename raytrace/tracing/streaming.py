@@ -12,17 +12,15 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths import pupil
-from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.value import to, value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, to, value
+from raytrace.maths.sampling import random, with_rim
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_searched
-from raytrace.tracing.aiming import aiming_of
 from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 from raytrace.tracing.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.tracing.spot import where_lit
-from raytrace.tracing.trace import sequence_of, trace_surfaces
+from raytrace.tracing.trace import aiming_of, sequence_of, trace_surfaces
 
 MAX_BYTES = 256 * 2**20
 _CHUNK = {"cpu": 2**15}  # rays whose temporaries stay in the caches of a core
@@ -97,7 +95,7 @@ class StreamedSpot:
 def pupil_chunks(
     rays: int, size: int, *, sampling: str = "sobol", seed: int = 0, like: Tensor, cut: int | None = None
 ) -> Iterator[Tensor]:
-    """The points of `pupil.sobol` or `pupil.random` in chunks (2, ≤ size) of `like`'s dtype and device.
+    """The points of `sampling.sobol` or `sampling.random` in chunks (2, ≤ size) of `like`'s dtype and device.
 
     size: a power of two; cut: a number of rays at which a chunk also ends. After all 2³⁰ Sobol points, those of the
     next seed follow. Raises ValueError for another sampling.
@@ -110,7 +108,7 @@ def pupil_chunks(
         last = min((first // size + 1) * size, rays)
         last = cut if cut is not None and first < cut < last else last
         if sampling == "random":
-            yield pupil.random(last - first, generator=generator, dtype=like.dtype, device=like.device)[0]
+            yield random(last - first, generator=generator, dtype=like.dtype, device=like.device)[0]
         else:
             if block != first // _SOBOL_POINTS:
                 block = first // _SOBOL_POINTS
@@ -287,7 +285,7 @@ def stream_spots(
     """Spots (F, W), and those (F,) of all wavelengths together by their weights. No derivatives.
 
     fields: (2, F) and wavelengths: (W,) µm as for `launch`; sampling: "sobol" or "random"; rim: number of rays on the
-    rim that count for the largest radius alone, as in `pupil.with_rim`; max_bytes: of additional memory; progress:
+    rim that count for the largest radius alone, as in `sampling.with_rim`; max_bytes: of additional memory; progress:
     called with the number of rays traced since the last call; empty: as for `spot_of`.
     """
     shots, shape, weights = shots_of(lens, rays, fields, wavelengths, wavelength_weights, ray_aiming)
@@ -303,7 +301,7 @@ def stream_spots(
     sums = [nothing(like)] * len(shots)
     far = [[_Far(r, r, like.new_zeros(())) for r in both] for both in references]
     if rim:
-        edge = pupil.with_rim(like.new_zeros(2, 0), like.new_zeros(0), rim)[0]
+        edge = with_rim(like.new_zeros(2, 0), like.new_zeros(0), rim)[0]
         far = [[farthest.or_of(*hits(s, edge)) for farthest in both] for s, both in zip(shots, far, strict=True)]
     for part in pupil_chunks(rays, size, **points):
         for k, s in enumerate(shots):

@@ -2,29 +2,45 @@
 
 The trace is a generator: to record, draw or find where a ray failed, consume `steps`; to resume from stored rays, pass
 them with the remaining surfaces. `trace_surfaces` and `trace_lens` return the last rays only, through the compiled
-engine where that is available and pays.
+engine where that is available and pays. `hit_jacobian` has the derivatives of the last hits by all variables in one
+pass: in the compiled engine each ray carries its derivatives from surface to surface, and no graph is made.
 """
 
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import dot
-from raytrace.maths.value import value
+from raytrace.maths.numerics import detached, dot, value
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
 from raytrace.system.lens import Lens, media
-from raytrace.system.phases import IdealLens
+from raytrace.system.phases import IdealLens, kind_of
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind
-from raytrace.tracing.compiled import is_expressible, trace_compiled, uses_compiled
+from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
+from raytrace.tracing.compiled import (
+    Pushed,
+    Task,
+    forward,
+    is_expressible,
+    push,
+    task_of,
+    trace_compiled,
+    uses_compiled,
+    with_numbers,
+)
 from raytrace.tracing.paraxial import power, signed, ynu
 from raytrace.tracing.refraction import deflect
+from raytrace.words import named
+
+_STRAIGHT = 1e-9  # mm and direction cosines: smaller deviations of an axial ray are ignored
 
 
 @value
@@ -249,3 +265,186 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
             surface = dataclasses.replace(surface, phase=dataclasses.replace(surface.phase, vergence=vergence))
         sequence.append(surface)
     return tuple(sequence)
+
+
+def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
+    (stop,), arrives = points_at(lens, rays, wavelength, (lens.stop,))
+    return stop, arrives
+
+
+def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
+    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
+    indices = media(lens, wavelength)
+    unclipped = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces]
+    rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
+    for last in numbers:
+        rays = trace_surfaces(
+            unclipped[first + 1 : last + 1],
+            rays,
+            indices=indices[first : last + 1],
+            wavelength=wavelength,
+            side=side,
+            gap=gap_behind(lens.surfaces[first]) if first else None,
+        )
+        side = -side if sum(surface.is_mirror for surface in unclipped[first + 1 : last + 1]) % 2 else side
+        points.append(rays.position[:2])
+        first = last
+    return points, rays.valid
+
+
+def is_bent(lens: Lens) -> bool:
+    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
+    return _bends(lens, lens.surfaces)
+
+
+def aiming_of(lens: Lens) -> str:
+    """The ray aiming of a lens, "off", "paraxial" or "real".
+
+    "auto" resolves to "real" if a surface in front of the stop bends the axis, or the stop is tilted or decentred (the
+    straightened entrance pupil is then no image of the stop), and else to "off".
+    """
+    if lens.ray_aiming != "auto":
+        return lens.ray_aiming
+    stop = lens.surfaces[lens.stop]
+    moved = stop.is_break or stop.before is not None
+    return "real" if moved or _bends(lens, lens.surfaces[: lens.stop]) else "off"
+
+
+def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
+    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    if any(map(is_posed, surfaces)):
+        return True
+    if all(map(is_round, surfaces)):
+        return False
+    if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
+        # Values are hidden inside a transform.
+        phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
+        return any(not kind.is_round and not kind.slopes for kind in phases)
+    with torch.no_grad():
+        lens = detached(lens)
+        axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
+        off = [0 * axis[:2]]
+        for crossing in islice(lens_steps(lens, Rays(0 * axis, axis, axis[2] > 0), lens.primary), len(surfaces) - 1):
+            off += [crossing.rays.position[:2], crossing.rays.direction[:2]]
+        return bool((torch.stack(off).abs() > _STRAIGHT).any())
+
+
+class Bent(ValueError):
+    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
+
+
+def need_axis(lens: Lens, what: str, instead: str = "") -> None:
+    """Raise Bent for a lens whose axis bends. what: the quantity; instead: an alternative for the message."""
+    if not is_bent(lens):
+        return
+    posed = [k for k, surface in enumerate(lens.surfaces) if is_posed(surface)]
+    other = [k for k, surface in enumerate(lens.surfaces) if not is_round(surface)]
+    reason = "it bends"
+    if posed:
+        surface = lens.surfaces[posed[0]]
+        reason = f"surface {posed[0]} is " + ("a coordinate break" if surface.is_break else "tilted or decentred")
+    elif other:
+        surface = lens.surfaces[other[0]]
+        part = surface.sag_terms if surface.phase is None else surface.phase
+        reason = f"surface {other[0]} ({named(part)}) takes light off it"
+    message = f"{what} needs one straight axis, but {reason}"
+    raise Bent(f"{message}; {instead}" if instead else message)
+
+
+def hit_jacobian(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    variables: Sequence[Tensor],
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
+) -> Tensor:
+    """∂(x, y)/∂v (V, 2, ...) of the hits on the last surface by every entry of the variables, in their order.
+
+    variables: tensors that require a gradient, which numbers of the surfaces or indices are or depend on; V counts all
+    their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0] held fixed.
+    Failed rays have derivatives 0. Raises ValueError for surfaces that the compiled trace does not support (height
+    maps, more than 16 terms), and for numbers of a lens that vary along the last axis of the rays.
+    """
+    known = all(map(is_expressible, surfaces))
+    task = task_of(surfaces, rays, indices=indices, wavelength=wavelength) if known else None
+    if task is None:
+        raise ValueError(
+            "no Jacobian for height maps, more than 16 terms, numbers of another dtype than "
+            "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
+        )
+    return pushed(surfaces, task, _changes(task.inputs[3], variables)).by_position[:2].transpose(0, 1)
+
+
+def pushed(
+    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
+) -> Pushed:
+    """`compiled.push` by the engine that is chosen; surfaces: those that the task was made of."""
+    if _is_compiled(surfaces, task):
+        return push(task, changes, start)
+    return _pushed_by_torch(surfaces, task, changes, start)
+
+
+def pushed_everywhere(
+    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
+) -> Pushed | None:
+    """`compiled.push` behind every row where the compiled trace carries these rays; None where torch has to."""
+    return push(task, changes, start, everywhere=True) if _is_compiled(surfaces, task) else None
+
+
+def ends(surfaces: Sequence[Surface], task: Task) -> Rays:
+    """The rays behind the last surface alone, by the engine that is chosen."""
+    return forward(task) if _is_compiled(surfaces, task) else _behind(surfaces, task, *task.inputs)
+
+
+def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
+    position, direction, opl, table = task.inputs
+    return uses_compiled(Rays(position, direction, task.valid, opl), table, len(surfaces))
+
+
+def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
+    shape = *task.valid.shape[:-1], 1
+    numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
+    own, indices, gap = with_numbers(task.structure, surfaces, numbers)
+    return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
+
+
+def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
+    """∂table/∂v (V, rows, K)."""
+    every = torch.eye(table.numel(), dtype=table.dtype, device=table.device)
+    found = torch.autograd.grad(
+        table.reshape(-1), list(variables), every, retain_graph=True, is_grads_batched=True, allow_unused=True
+    )
+    columns = [
+        table.new_zeros(v.numel(), table.numel()) if g is None else g.reshape(table.numel(), -1).T
+        for v, g in zip(variables, found, strict=True)
+    ]
+    return torch.cat(columns).reshape(-1, *table.shape)
+
+
+def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
+    *rays, table = (part.detach() for part in task.inputs if part is not None)
+    traces_path = len(rays) == 3
+
+    def behind(position: Tensor, direction: Tensor, *others: Tensor) -> tuple:
+        end = _behind(surfaces, task, position, direction, *(others if traces_path else (None, *others)))
+        return (end.position, end.direction, *([end.opl] if traces_path else [])), end.valid
+
+    slopes = []
+    for number, change in enumerate(changes):
+        steps = [
+            torch.zeros_like(part) if start is None else start[k].select(int(k < 2), number)
+            for k, part in enumerate(rays)
+        ]
+        ends, slope, valid = torch.func.jvp(behind, (*rays, table), (*steps, change), has_aux=True)
+        slopes.append(slope)
+    by_position, by_direction, *by_opl = (torch.stack(parts) for parts in zip(*slopes, strict=True))
+    return Pushed(
+        *ends[:2],
+        ends[2] if traces_path else None,
+        valid,
+        by_position.transpose(0, 1),
+        by_direction.transpose(0, 1),
+        by_opl[0] if traces_path else None,
+    )

@@ -10,16 +10,14 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.dual import root
-from raytrace.maths.numerics import dot, safe_divide, safe_sqrt, unit
-from raytrace.maths.value import value
+from raytrace.maths.numerics import dot, root, safe_divide, safe_sqrt, unit, value
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, beam_share, trace_scene
 from raytrace.tracing.spot import where_lit
+from raytrace.tracing.trace import is_bent
 
 _WORST_CONDITION = 1e4  # of a fit of Zernike polynomials: beyond, its coefficients say nothing of the pupil
 

@@ -20,8 +20,8 @@ from raytrace.analysis.mtf import geometric_mtf, mtf, transfer
 from raytrace.analysis.setting import field_range
 from raytrace.analysis.spot_diagram import airy_radius, field_spots
 from raytrace.materials.glass import label
-from raytrace.maths.pupil import hexapolar
-from raytrace.maths.value import detached
+from raytrace.maths.sampling import hexapolar
+from raytrace.maths.numerics import detached
 from raytrace.plotting import style
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Lens, field_label, field_points
 from raytrace.system.parameter_paths import number_at, parameter_paths
@@ -41,10 +41,10 @@ FIRST_ORDER: tuple[tuple[str, str, Callable[[FirstOrder], Tensor]], ...] = (
     ("BFD", "mm", lambda one: one.back_focal_distance),
     ("F/#", "", lambda one: one.f_number),
     ("working F/#", "", lambda one: one.paraxial_working_f_number),
-    ("entrance pupil", "mm", lambda one: one.entrance_pupil_diameter),
+    ("EPD", "mm", lambda one: one.entrance_pupil_diameter),
     ("exit pupil", "mm", lambda one: one.exit_pupil_diameter),
-    ("magnification", "", lambda one: one.magnification),
-    ("paraxial image", "mm", lambda one: one.paraxial_image_distance),
+    ("m", "", lambda one: one.magnification),
+    ("image at", "mm", lambda one: one.paraxial_image_distance),
 )
 
 

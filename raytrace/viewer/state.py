@@ -56,7 +56,7 @@ def initial(lens: Lens) -> State:
     data = lens.optimization_data
     words = dict.fromkeys(map(word_of, data.variables if data else ()))
     try:
-        highest = style.round_length(2 * float(frequency_range(lens, shown_fields(lens), 2)[-1]))
+        highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
         highest = 100.0
     return State(lens, lens, tuple(words), "" if data and data.merit else "spot", frequency=highest)

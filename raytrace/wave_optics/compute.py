@@ -18,9 +18,9 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import afford, allowed_bytes, forewarn
 from raytrace.files import write_atomically
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_table
-from raytrace.maths.grid import Grid, centres, grid
-from raytrace.maths.result import Column, Result, flat, number, rows, text_table
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.result import Column, Result, Table, masked, number, rows
+from raytrace.maths.sampling import Grid, centres, grid
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
@@ -47,9 +47,9 @@ class ElementPsf(Result):
     """
 
     COLUMNS = (
-        Column("depth", "mm", ">12g", "object"), Column("wavelength", "µm", ">11g"),
-        Column("energy", "", ">8.4f", "energy\nwindow"), Column("peak", "", ">10.6f", "peak\npixel"),
-        Column("half_energy_radius_um", "µm", ">12.2f", "half-energy\nradius"),
+        Column("depth", "mm", "g", "object"), Column("wavelength", "µm", "g"),
+        Column("energy", "", ".4f", "energy\nwindow"), Column("peak", "", ".6f", "peak\npixel"),
+        Column("half_energy_radius_um", "µm", ".2f", "half-energy\nradius"),
     )  # fmt: skip
 
     kernel: Tensor
@@ -102,12 +102,13 @@ class ElementPsf(Result):
         return torch.where(inside < len(distance), distance[inside.clamp(max=len(distance) - 1)], math.inf)
 
     def columns(self) -> dict[str, Tensor]:
+        radius = self.half_energy_radius
         return {
             "depth": self.depths[:, None],
             "wavelength": self.wavelengths,
             "energy": self.energy,
             "peak": self.peak,
-            "half_energy_radius_um": 1e3 * self.half_energy_radius,
+            "half_energy_radius_um": 1e3 * masked(radius, radius.isfinite()),
         }
 
     def document(self) -> dict:
@@ -128,7 +129,7 @@ class ElementPsf(Result):
         across, z = 2 * float(aperture(self.scene)), float(self.scene.sensor_distance)
         return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         lines = [self.title]
         for element in self.scene.elements:
             (low, high), material = height_range(element), element.glass.name or "constant index"
@@ -137,9 +138,7 @@ class ElementPsf(Result):
             f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
             f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
         ]
-        listed = flat(self.columns())
-        listed["depth"] = [f"{depth:g}" for depth in listed["depth"]]
-        return "\n".join([*lines, *text_table({self.column(name): values for name, values in listed.items()})])
+        return [Table(self.columns(), lines)]
 
     def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
         """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import Glass, constant, index
-from raytrace.maths.numerics import polynomial
-from raytrace.maths.value import value
+from raytrace.maths.numerics import polynomial, value
 from raytrace.maths.zernike import noll, norm
 from raytrace.wave_optics.element import ETCHED, TURNED, Element, EvenPowers, Rings, Zernike, fabricated_height, period
 from raytrace.wave_optics.fabrication import as_rings, features, wrapped

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import Glass, index
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.zernike import noll, polynomials
 
 #: Sizes of features, mm: diamond turning of PMMA, and etching of fused silica.

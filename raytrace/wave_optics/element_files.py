@@ -15,7 +15,7 @@ import torch
 from raytrace.files import read_bytes, write_json
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import FORMULAS, Glass
-from raytrace.maths.value import to
+from raytrace.maths.numerics import to
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat
 from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped

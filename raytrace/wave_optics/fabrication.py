@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import index
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 from raytrace.wave_optics.element import (
     Element,
     Pixels,

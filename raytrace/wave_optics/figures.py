@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.grid import centres
+from raytrace.maths.sampling import centres
 from raytrace.plotting import style
 from raytrace.plotting.style import array, framed, new_figure, styled
 from raytrace.wave_optics.element import Element, height, is_flat, is_smooth

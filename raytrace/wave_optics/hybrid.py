@@ -19,11 +19,9 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import index
-from raytrace.maths.grid import Grid
-from raytrace.maths.grid import grid as make_grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to
+from raytrace.maths.numerics import safe_divide, to
+from raytrace.maths.sampling import Grid, gauss_rings
+from raytrace.maths.sampling import grid as make_grid
 from raytrace.maths.zernike import noll
 from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
 from raytrace.psf_models.dft import bessel_j0, phasor
 from raytrace.wave_optics.element import Element, is_radial, is_smooth, path
 from raytrace.wave_optics.propagation import phasors, slope, to_radii

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to, value
+from raytrace.maths.numerics import to, value
+from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms, sub_pixels
 from raytrace.psf_models.models import NotConverged
 from raytrace.psf_models.radial import is_centred, reach

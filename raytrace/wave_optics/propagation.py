@@ -25,8 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.psf_models.dft import bessel_j0, phasor
 from raytrace.psf_models.radial import radii_of_waves, unfold
 from raytrace.wave_optics.element import Rings, designed_height, path

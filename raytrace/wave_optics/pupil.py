@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.value import value
+from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.psf_models.dft import phasor, sub_pixels
 from raytrace.psf_models.radial import is_centred
 from raytrace.wave_optics.element import is_smooth, path

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import check_unit, index
-from raytrace.maths.grid import Grid
-from raytrace.maths.value import value
+from raytrace.maths.numerics import value
+from raytrace.maths.sampling import Grid
 from raytrace.wave_optics.element import Element, is_radial, path
 
 

@@ -1,13 +1,12 @@
-"""The configurations of a .zmx file: its multi-configuration operands, a row each, as those of a lens.
+"""The configurations of a .zmx file: its multi-configuration operands, as those of a lens.
 
     THIC   6   2 -2.0E+001 0 0 0 2 2 1.0E+000 0.0E+000 0
 
 An operand gives its surface (field, wavelength), the configuration, the value, its status (1 variable, 2 pickup), and
 its second argument, which is the number of the parameter for PRAM; then the numbers of a pickup from another
-configuration. The value is the solved one. An operand puts a word into a record, as if the file had been saved in that
-configuration, so that every type of surface reads it; pickups of the surfaces are followed. The place of an operand in
-the lens is found by reading the file with it at other values: so a pickup is one more place. An operand that changes
-nothing is reported.
+configuration. The value is the solved one. Its row in `surfaces.ROWS`, or that of the type of its surface, gives the
+path in the lens and the power of length. A pickup of a surface is a further path. An operand without a path is
+reported.
 
 Temperature and pressure: ENVD gives those of the lens (°C, atm, and whether indices follow them; 0: those of the
 catalogs). TEMP and PRES of the multi-configuration table hold for the surfaces that the operands after them name (CRVT,
@@ -17,14 +16,15 @@ stored image distance of OpticStudio's sample of an evacuated cell is reproduced
 
 import dataclasses
 import itertools
+import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import environment_at
+from raytrace.io.assembly import clear_aperture, environment_at
 from raytrace.io.source import (
     IGNORED,
     READ,
@@ -36,30 +36,52 @@ from raytrace.io.source import (
     Record,
     by_word,
     double,
-    exact,
+    integer,
     is_infinite,
     is_number,
+    number,
     plain,
     shown,
 )
-from raytrace.io.zemax.surfaces import FIELD_LISTS, Sections, aperture_keywords, glass_source, is_blank
+from raytrace.io.zemax.surfaces import (
+    AIMING,
+    AIMINGS,
+    GLASS,
+    INVERSE,
+    NUMBER,
+    ROWS,
+    SIZE,
+    SWITCH,
+    TEXT,
+    Numbers,
+    Sections,
+    SurfaceType,
+    ValueRow,
+    aperture_keywords,
+    glass_source,
+    in_millimetres,
+    inverse,
+    is_blank,
+    numbers_of,
+    type_name,
+    types,
+)
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.environment import REFERENCE, Environment
-from raytrace.materials.glass import Glass
+from raytrace.materials.glass import AIR, Glass
 from raytrace.system import configurations
-from raytrace.system.configurations import Operand, Path, ScaledPath, differences, part, same, taken, with_part
+from raytrace.system.apertures import SHAPES
+from raytrace.system.configurations import Operand, Path, ScaledPath, part, same, taken, with_part
 from raytrace.system.lens import Lens, unknown_changes
+from raytrace.system.optimization_data import Solve, Vary
+from raytrace.system.parameter_paths import ParameterPath, parameter_paths
+from raytrace.system.poses import Pose
+from raytrace.system.sag_terms import IrregularSag
 from raytrace.system.surface import Surface
 
 #: More configurations, and more operands, than any file has.
 MOST_CONFIGURATIONS, MOST_CELLS = 200, 2000
-
-#: Values at which the place of an operand is sought: far from those of lenses, and exact in binary.
-_PROBES = ("0.34375", "0.40625", "0.46875")
-
-#: In place of a temperature or pressure of a surface that is the lens's.
-OF_LENS = "-"
 
 #: At this distance an operand has the object at infinity.
 FAR = 1e10
@@ -68,66 +90,6 @@ FAR = 1e10
 ENVIRONMENT_OPERANDS = {"TEMP": "temperature", "PRES": "pressure"}
 _NAMING = ("CRVT", "THIC", "GLSS")
 
-
-class OperandRow(NamedTuple):
-    """The record that an operand changes.
-
-    of: the meaning of its first argument: "surface", "field", "wavelength" or "" of the system.
-    keyword, position: the record and the word of it that the value is; a keyword that ends in # is one of several
-        numbered records, and a position of None is counted by the argument.
-    path: of a value that is not a number, its path in the lens, or in its surface.
-    refracts: whether the paraxial rays at other surfaces depend on it, and with them the solves there.
-    """
-
-    of: str
-    keyword: str
-    position: int | None = 0
-    path: str = ""
-    refracts: bool = False
-
-
-def _field(name: str) -> OperandRow:
-    return OperandRow("field", FIELD_LISTS[name].keywords[0], None)
-
-
-#: The operands that are followed.
-ROWS = {
-    "THIC": OperandRow("surface", "DISZ", refracts=True),
-    "CRVT": OperandRow("surface", "CURV", refracts=True),
-    "CONN": OperandRow("surface", "CONI"),
-    "GLSS": OperandRow("surface", "GLAS", path="glass", refracts=True),
-    "MIND": OperandRow("surface", "GLAS", 3, refracts=True),
-    "MABB": OperandRow("surface", "GLAS", 4),
-    "MDPG": OperandRow("surface", "GLAS", 5),
-    "PRAM": OperandRow("surface", "PARM#", 1),
-    **{f"PAR{j}": OperandRow("surface", "PARM#", 1) for j in range(1, 9)},
-    "EDVA": OperandRow("surface", "XDAT#", 1),
-    "SDIA": OperandRow("surface", "DIAM", path="semi_diameter"),
-    "APMN": OperandRow("surface", "APERTURE", 0),
-    "APMX": OperandRow("surface", "APERTURE", 1),
-    "APDX": OperandRow("surface", "OBDC", 0),
-    "APDY": OperandRow("surface", "OBDC", 1),
-    **{
-        f"C{side}{axis}": OperandRow("surface", f"SCBD{number}", 3 + k)
-        for number, side in ((1, "B"), (2, "A"))
-        for k, axis in enumerate(("DX", "DY", "TX", "TY", "TZ"))
-    },
-    "MCOM": OperandRow("surface", "COMM", path="comment"),
-    "XFIE": _field("x"),
-    "YFIE": _field("y"),
-    "FLWT": _field("weight"),
-    **{f"F{name}": _field(name) for name in ("VDX", "VDY", "VCX", "VCY", "VAN")},
-    "WAVE": OperandRow("wavelength", "WAVM#", 1, refracts=True),
-    "WLWT": OperandRow("wavelength", "WAVM#", 2),
-    "PRWV": OperandRow("", "PWAV", path="primary_wavelength", refracts=True),
-    "APER": OperandRow("", "SIZE", refracts=True),
-    "STPS": OperandRow("", "STOP", path="stop", refracts=True),
-    "TELE": OperandRow("", "FTYP", 1, path="fields.telecentric"),
-    "RAAM": OperandRow("", "RAIM", 1, path="ray_aiming"),
-    "TEMP": OperandRow("", "ENVD", 0, refracts=True),
-    "PRES": OperandRow("", "ENVD", 1, refracts=True),
-    "LTTL": OperandRow("", "NAME", path="name"),
-}
 
 #: Operands that change no ray and are kept with the lens: a comment, the weight of a configuration.
 KEPT = ("MOFF", "CWGT")
@@ -160,8 +122,8 @@ _REFUSED = by_word(
 class Cell(NamedTuple):
     """One line of the table: an operand's value in one configuration, as text.
 
-    covered: the surfaces that have a temperature or pressure of their own; None for the lens's.
-    rule: the words behind the value: its status (1 variable, 2 a pickup) …
+    row: of the table, from 1. covered: the surfaces that have a temperature or pressure of their own; None for the
+    lens's. rule: the words behind the value: its status (1 variable, 2 a pickup) …
     """
 
     name: str
@@ -170,63 +132,53 @@ class Cell(NamedTuple):
     configuration: int
     value: str
     record: Record
+    row: int
     covered: tuple[int, ...] | None = None
     rule: tuple[str, ...] = ()
-
-    @property
-    def key(self) -> tuple[str, int, int]:
-        return self.name, self.number, self.parameter
 
 
 _CELL = re.compile(r'\s*(-?\d{1,6})\s+(-?\d{1,6})\s+("[^"]*"|\S+)(.*)', re.ASCII)
 
 
-def cell_of(record: Record) -> Cell | None:
-    """The cell of a record after MNUM; None if it is no operand."""
-    match = _CELL.fullmatch(record.text)
-    if not match or not re.fullmatch(r"[A-Z][A-Z0-9]{3}", record.keyword):
-        return None
-    rest = match[4].split()
-    parameter = int(rest[1]) if len(rest) > 1 and re.fullmatch(r"-?\d{1,6}", rest[1]) else 0
-    if re.fullmatch(r"PAR[1-8]", record.keyword):
-        parameter = int(record.keyword[3])
-    elif record.keyword not in ("PRAM", "EDVA") and record.keyword in ROWS:
-        parameter = 0
-    number, configuration, value = int(match[1]), int(match[2]), match[3].strip('"')
-    return Cell(record.keyword, number, parameter, configuration, value, record, None, tuple(rest))
-
-
 def _cells(records: Iterable[Record], count: int, report: Draft) -> list[Cell]:
     """The cells of the lines after MNUM, every line reported."""
-    cells = []
+    cells, row, before = [], 0, (None, 0)
     for record in records:
-        cell, word = cell_of(record), record.keyword
-        if cell is None or word in _LEFT_OUT:
-            report.met(word[:40], IGNORED, record.place, _LEFT_OUT.get(word, "no multi-configuration operand"))
+        match, word = _CELL.fullmatch(record.text), record.keyword
+        if not match or not re.fullmatch(r"[A-Z][A-Z0-9]{3}", word):
+            report.met(word[:40], IGNORED, record.place, "no multi-configuration operand")
+            continue
+        number, configuration, rest = int(match[1]), int(match[2]), match[4].split()
+        parameter = int(rest[1]) if len(rest) > 1 and re.fullmatch(r"-?\d{1,6}", rest[1]) else 0
+        if re.fullmatch(r"PAR[1-8]", word):
+            parameter = int(word[3])
+        elif word not in ("PRAM", "EDVA") and word in ROWS:
+            parameter = 0
+        key = (word, number, parameter)
+        row += before[0] != key or before[1] >= configuration
+        before = key, configuration
+        if word in _LEFT_OUT:
+            report.met(word, IGNORED, record.place, _LEFT_OUT[word])
         elif word not in ROWS and word not in KEPT and word not in _REFUSED:
             report.met(word, UNKNOWN, record.place)
         else:
             report.met(word, READ, record.place)
-            if 1 <= cell.configuration <= count:
-                cells.append(cell)
+            if 1 <= configuration <= count:
+                value = match[3].strip('"')
+                cells.append(Cell(*key, configuration, value, record, row, None, tuple(rest)))
             else:
-                report.warn(f"{word} of configuration {cell.configuration}, of {count}: left out", record.place)
+                report.warn(f"{word} of configuration {configuration}, of {count}: left out", record.place)
         if len(cells) > MOST_CELLS:
             raise LensFileError(f"more than {MOST_CELLS} multi-configuration operands", record.place)
     return cells
 
 
 def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cell, ...]]:
-    """The cells of each operand, one a configuration. A missing configuration has the value of the first.
+    """The cells of each row, one a configuration. A missing configuration has the value of the first.
 
     Operands of an environment other than the lens's have the surfaces that it covers.
     """
-    groups: list[list[Cell]] = []
-    for cell in cells:
-        if groups and groups[-1][-1].key == cell.key and groups[-1][-1].configuration < cell.configuration:
-            groups[-1].append(cell)
-        else:
-            groups.append([cell])
+    groups = [[*group] for _, group in itertools.groupby(cells, key=lambda cell: cell.row)]
     operands = []
     for group in groups:
         by_number = {cell.configuration: cell for cell in group}
@@ -245,183 +197,40 @@ def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cel
     return operands
 
 
-# -- the records of a file with an operand applied --------------------------------------------------------------------
-
-
-def applied(sections: Sections, cell: Cell, value: str) -> Sections:
-    """The records with an operand of ROWS at a value. Raises LensFileError for a surface (field …) not present."""
-    row, surfaces, last = ROWS[cell.name], list(sections.surfaces), len(sections.surfaces) - 1
-    if row.keyword == "STOP":
-        number = int(plain(value)) if is_number(value) else -1
-        if not 0 < number < last:
-            raise LensFileError(f"STPS is {shown(value)}; expected a surface from 1 to {last - 1}", cell.record.place)
-        surfaces = [_with_record(block, old, None) if (old := block.last("STOP")) else block for block in surfaces]
-        stop = Record("STOP", (), "", cell.record.place._replace(surface=number), True)
-        surfaces[number] = _with_record(surfaces[number], None, stop)
-        return sections._replace(surfaces=surfaces)
-    if row.of != "surface" and cell.covered is None:
-        return sections._replace(system=_put(sections.system, cell, value))
-    for k in (cell.number,) if cell.covered is None else cell.covered:
-        if not 0 <= k <= last:
-            raise LensFileError(f"{cell.name} of surface {k}; expected one from 0 to {last}", cell.record.place)
-    if cell.covered is None:
-        surfaces[cell.number] = _put(surfaces[cell.number], cell, value)
-        return sections._replace(surfaces=_followed(surfaces, sections.surfaces))
-    for k in cell.covered:
-        old = surfaces[k].last("ENVD")
-        words = list(old.words if old else (OF_LENS, OF_LENS))
-        words[row.position] = value
-        new = Record("ENVD", tuple(words), " ".join(words), cell.record.place._replace(surface=k), True)
-        surfaces[k] = _with_record(surfaces[k], old, new)
-    return sections._replace(surfaces=surfaces)
-
-
-def word_of(sections: Sections, cell: Cell) -> str | None:
-    """The word of the records that is an operand's value; None where there is none."""
-    row = ROWS[cell.name]
-    if row.keyword == "STOP":
-        return next((str(k) for k, block in enumerate(sections.surfaces) if block.last("STOP")), None)
-    block = sections.surfaces[cell.number] if row.of == "surface" else sections.system
-    record, position, _ = _target(block, cell)
-    if row.keyword in ("NAME", "COMM"):
-        return record.text.strip() if record else ""
-    return record.words[position] if record and position < len(record.words) else None
-
-
-def _put(block: Block, cell: Cell, value: str) -> Block:
-    """A block with another word in the record of an operand, which is added where it is missing."""
-    record, position, blank = _target(block, cell)
-    keyword = record.keyword if record else blank[0]
-    place = cell.record.place._replace(surface=block.place.surface)
-    if keyword == "GLAS" and position == 0:
-        if record and record.words and record.words[0].upper() == value.upper():
-            return block  # of the same name, with the indices that the file has for it
-        if not value:
-            return _with_record(block, record, None) if record else block
-        words = (value, "0", "0", "1.5", "40")
-        return _with_record(block, record, Record("GLAS", words, " ".join(words), place, True))
-    if keyword == "GLAS" and record is None:
-        raise LensFileError(f"{cell.name} of surface {cell.number}, which has no glass", cell.record.place)
-    if keyword == "DISZ" and cell.number == 0 and is_number(value) and plain(value) >= FAR:
-        value = "INFINITY"
-    if is_infinite(value) and not (keyword == "DISZ" and cell.number == 0):
-        raise LensFileError(f"{cell.name} is {shown(value)}; only the object may be at infinity", cell.record.place)
-    words = list(record.words if record else blank[1:])
-    words += ["0"] * (position + 1 - len(words))
-    words[position] = value
-    text = value if keyword in ("NAME", "COMM") else " ".join(words)
-    return _with_record(block, record, Record(keyword, tuple(words), text, place, True))
-
-
-def _target(block: Block, cell: Cell) -> tuple[Record | None, int, tuple[str, ...]]:
-    """The record of an operand, the position of its word, and the record to add where there is none."""
-    row = ROWS[cell.name]
-    position = cell.number - 1 if row.position is None else row.position
-    if row.keyword == "SIZE":
-        return block.last("ENPD", "FNUM", "OBNA"), 0, ("ENPD",)
-    if row.keyword == "APERTURE":
-        apertures = block.all(*(keyword for keyword in aperture_keywords() if keyword != "FLAP"))
-        return (apertures[-1] if apertures else None), position, ("CLAP", "0", "0")
-    if row.keyword.startswith("SCBD"):
-        side = row.keyword[4:]
-        return _numbered(block, "SCBD", side), position, ("SCBD", side, *"0000000")
-    if row.keyword.endswith("#"):
-        keyword, number = row.keyword[:-1], str(cell.parameter if row.of == "surface" else cell.number)
-        return _numbered(block, keyword, number), position, (keyword, number, "0", "1")
-    return block.last(row.keyword), position, (row.keyword,)
-
-
-def _numbered(block: Block, keyword: str, number: str) -> Record | None:
-    records = reversed(block.all(keyword))
-    return next((record for record in records if record.words and record.words[0] == number), None)
-
-
-def _with_record(block: Block, old: Record | None, new: Record | None) -> Block:
-    """A block with one record in place of another; `old` None: added; `new` None: removed."""
-    changed, keyword = Block(block.place), (new or old).keyword
-    listed = [new if record is old else record for record in block.records.get(keyword, ())]
-    listed = [record for record in (*listed, *([new] if old is None else [])) if record is not None]
-    changed.records = {**block.records, keyword: listed}
-    if not listed:
-        del changed.records[keyword]
-    return changed
-
-
-# -- pickups and solves of the surfaces -------------------------------------------------------------------------------
-
-
-#: Pickups of numbers: by the keyword of the rule, that of the number, its word, and the first word of the rule.
-#: PPAR j surface factor offset: parameter j; PZUP surface factor offset: thickness; CURV c 4 surface factor.
-_PICKUPS = {"PPAR": ("PARM", 1, 1), "PZUP": ("DISZ", 0, 0), "CURV": ("CURV", 0, 2)}
-
-
-def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
-    """The surfaces with pickups of changed surfaces, from the object on, as a pickup looks back.
-
-    A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
-    """
-
-    def holder(block: Block, keyword: str, number: str) -> Record | None:
-        return _numbered(block, keyword, number) if keyword == "PARM" else block.last(keyword)
-
-    for k, block in enumerate(surfaces):
-        for rule in before[k].all(*_PICKUPS):
-            keyword, position, first = _PICKUPS[rule.keyword]
-            numbers = [plain(word) for word in rule.words[first : first + 3] if is_number(word)]
-            if len(numbers) < 2 or (keyword == "CURV" and (rule.words[1] != "4" or any(numbers[2:]))):
-                continue
-            source, factor, offset = int(numbers[0]), numbers[1], sum(numbers[2:])
-            if source != numbers[0] or not 0 <= source < k or surfaces[source] is before[source]:
-                continue
-            blocks = before[k], before[source], surfaces[source]
-            records = [holder(each, keyword, rule.words[0]) for each in blocks]
-            texts = [record.words[position] if record and position < len(record.words) else "" for record in records]
-            if not all(map(is_number, texts)):
-                continue
-            stored, *sources = map(plain, texts)
-            old, new = (factor * number + offset for number in sources)
-            if old != new and abs(stored - old) <= 1e-9 * abs(old) + 1e-300:
-                words = list(records[0].words)
-                words[position] = repr(new)
-                block = _with_record(block, records[0], records[0]._replace(words=tuple(words)))
-        surfaces[k] = _with_picked_glass(block, surfaces, before)
-    return surfaces
-
-
-def _with_picked_glass(block: Block, surfaces: Sequence[Block], before: Sequence[Block]) -> Block:
-    """A surface with the glass that it picks up from a changed surface."""
-    record, source = block.last("GLAS"), glass_source(block)
-    if source is None or surfaces[source] is before[source]:
-        return block
-    old, new = (blocks[source].last("GLAS") for blocks in (before, surfaces))
-    named_alike = bool(old) and old.words[:1] == record.words[:1]
-    if not (named_alike or is_blank(record)) or (new and old and new.words[:1] == old.words[:1]):
-        return block
-    return _with_record(block, record, new._replace(place=record.place) if new else None)
-
-
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-Rebuild = Callable[[Sections], Lens]
+class LensFile(NamedTuple):
+    """A file with its lens as stored: sections, mm in its unit of length, and the medium of a GLAS record."""
+
+    sections: Sections
+    lens: Lens
+    millimetres: float
+    medium: Callable[[Record], Glass]
+
+    def typed(self, k: int) -> tuple[SurfaceType, Numbers]:
+        """The type of a surface, and its numbers."""
+        row = types()[type_name(self.sections.surfaces[k])]
+        return row, numbers_of(self.sections.surfaces[k], row, self.millimetres)
 
 
 class PlacedOperand(NamedTuple):
-    """An operand with the lines it comes from, and a lens in which all of its places are modelled."""
+    """An operand with the lines it comes from, and a lens in which all of its paths are modelled."""
 
     operand: Operand
     cells: tuple[Cell, ...]
     like: Lens
 
 
-def read(sections: Sections, lens: Lens, rebuild: Rebuild, report: Draft, configuration: int | None) -> Lens:
+def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens, list[Vary | Solve]]:
     """The lens, as its surfaces are stored, with its operands, and in the requested configuration.
 
-    rebuild: the lens of changed records.
+    And the variables and pickups of the numbers that its operands set.
     """
+    sections, lens = file.sections, file.lens
     head = sections.system.last("MNUM")
     if head is None:
-        return lens if configuration is None else lens.configuration(configuration)
+        return (lens if configuration is None else lens.configuration(configuration)), []
     count = head.integer(0, "number of configurations", 1)
     if not 1 <= count <= MOST_CONFIGURATIONS:
         raise LensFileError(f"MNUM is {count}, expected 1 to {MOST_CONFIGURATIONS} configurations", head.place)
@@ -429,11 +238,10 @@ def read(sections: Sections, lens: Lens, rebuild: Rebuild, report: Draft, config
     groups = _grouped(_cells(tail, count, report), count, report)
     stated = head.integer(1, "active configuration", 0) if count > 1 else 1
     is_stated = 1 <= stated <= count
-    environments = [group[(stated if is_stated else 1) - 1] for group in groups if group[0].covered is not None]
-    for cell in environments:  # only operands give the environments of surfaces
-        sections = applied(sections, cell, cell.value)
-    lens = rebuild(sections) if environments else lens
-    operands = [_placed_operand(group, sections, lens, rebuild) for group in groups]
+    covering = [group[(stated if is_stated else 1) - 1] for group in groups if group[0].covered is not None]
+    lens = _with_environments(lens, covering)
+    file = file._replace(lens=lens)
+    operands = [_placed_operand(group, file) for group in groups]
     agreeing = [k for k in range(1, count + 1) if all(_agrees(placed, lens, k) is not False for placed in operands)]
     active = stated if is_stated else agreeing[0] if agreeing else 1
     if count > 1:
@@ -456,82 +264,65 @@ def read(sections: Sections, lens: Lens, rebuild: Rebuild, report: Draft, config
             if part(lens, place.path) is None:
                 lens = with_part(lens, place.path, double(0.0), like=placed.like)
     # the surfaces have more digits than the operands, where both agree
-    listed = [taken(p.operand, lens, active - 1) if _agrees(p, lens, active) else p.operand for p in operands]
-    listed = tuple(o for o in listed if o.name != "MOFF" or o.numbers is not None or any(map(any, o.words)))
+    operands = [
+        p._replace(operand=taken(p.operand, lens, active - 1)) if _agrees(p, lens, active) else p for p in operands
+    ]
+    operands = [
+        p
+        for p in operands
+        if p.operand.name != "MOFF" or p.operand.numbers is not None or any(map(any, p.operand.words))
+    ]
+    listed = tuple(placed.operand for placed in operands)
     if count > 1 and not listed:
         listed = (Operand("MOFF", words=(("",),) * count),)  # keeps the count
     lens = dataclasses.replace(lens, operands=listed, current_configuration=active)
     try:
-        return lens if configuration is None else lens.configuration(configuration)
+        chosen = lens if configuration is None else lens.configuration(configuration)
     except ValueError as error:
         raise LensFileError(str(error), head.place) from error
+    return chosen, list(_rules(operands, lens))
 
 
-def _placed_operand(cells: tuple[Cell, ...], sections: Sections, lens: Lens, rebuild: Rebuild) -> PlacedOperand:
-    """The operand of these cells with its places in the lens, or the reason why it is not followed."""
-    first, values = cells[0], tuple(cell.value for cell in cells)
-    texts = tuple((value,) for value in values)
-
-    def placed(like: Lens = lens, **fields) -> PlacedOperand:
-        return PlacedOperand(Operand(first.name, first.number, first.parameter, **fields), cells, like)
-
-    numbers = double([plain(value) for value in values]) if all(map(is_number, values)) else None
-    unplaced = placed(words=texts) if numbers is None else placed(numbers=numbers)
-    if first.name in KEPT:
-        return unplaced
-    if first.name in _REFUSED:
-        return placed(words=texts, refusal=_REFUSED[first.name])
-    try:
-        lenses = {value: rebuild(applied(sections, cell, value)) for cell, value in zip(cells, values, strict=True)}
-    except (LensFileError, UnknownGlass) as error:
-        return placed(words=texts, refusal=str(error))
-    row, probes = ROWS[first.name], []
-    if not row.path:
-        try:
-            probes = [rebuild(applied(sections, first, value)) for value in _PROBES]
-        except (LensFileError, UnknownGlass):
-            probes = []  # it is no number
-    start = ("surfaces", first.number) if row.of == "surface" else ()
-    paths = [(*start, *row.path.split("."))] if row.path else []
-    readings = probes or [lens, *lenses.values()]
-    paths += [path for other in readings[1:] for path in differences(readings[0], other)]
-    paths = list(dict.fromkeys(paths))
-    if not paths:
-        return unplaced
-    held = [[part(lenses[value], path) for path in paths] for value in values]
-    if scaled_paths := _linear_paths(paths, probes, held):
-        numbers = torch.stack([double(0.0) if parts[0] is None else parts[0] for parts in held])
-        return placed(probes[0], paths=scaled_paths, numbers=numbers)
-    for *owner, end in paths:
-        if part(lens, (*owner, end)) is None and not (isinstance(end, str) and part(lens, tuple(owner)) is not None):
-            return placed(words=texts, refusal="the lens as stored has no such part, an aperture for example")
-    scaled_paths = tuple(map(ScaledPath, paths))
-    if all(isinstance(parts[0], Glass) and all(same(parts[0], other) for other in parts) for parts in held):
-        return placed(paths=scaled_paths, media=tuple(parts[0] for parts in held))
-    return placed(paths=scaled_paths, words=tuple(map(tuple, held)))
+#: Status of a number of a configuration: 1 is a variable.
+VARIABLE, STATUSES = 1, {2: "pickup", 4: "thermal"}
 
 
-def _linear_paths(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[ScaledPath, ...]:
-    """The places of a number, each linear in the first; none where they are no numbers, or not linear."""
+def _rules(operands: Sequence[PlacedOperand], lens: Lens) -> Iterator[Vary | Solve]:
+    """The variables and pickups of the numbers of configurations, by the status in their lines."""
+    indices = {placed.cells[0].row: index for index, placed in enumerate(operands)}
+    for index, (operand, cells, _) in enumerate(operands):
+        path = operand.paths[0].path if operand.paths else ()
+        number, name = cells[0].number, ""
+        if len(path) > 2 and path[0] == "surfaces":  # the quantity of that surface
+            names = {place.steps: name for name, place in parameter_paths(lens.surfaces[path[1]]).items()}
+            number, name = path[1], names.get(path[2:], "thickness" if path[2] == "thickness" else "")
+        for k, cell in enumerate(cells, 1):
+            status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
+            if not status or cell.configuration != k:
+                continue
+            where = {"configuration": k, "operand": index}
+            if status == VARIABLE:
+                yield Vary(number, name, **where) if name else Solve(cell.number, cell.name, "variable", **where)
+                continue
+            numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
+            source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
+            followed = (float(indices[int(row)]),) if row == int(row) and int(row) in indices else ()
+            pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
+            yield Solve(cell.number, name or cell.name, STATUSES.get(status, f"status {status}"), **pickup, **where)
 
-    def is_scalar(value) -> bool:
-        return isinstance(value, Tensor) and value.ndim == 0
 
-    if not probes or any(not (value is None or is_scalar(value)) for row in held for value in row):
-        return ()
-    parts = [[part(lens, path) for path in paths] for lens in probes]
-    if not all(is_scalar(value) for row in parts for value in row):
-        return ()
-    probed = [[float(value) for value in row] for row in parts]
-    scaled_paths = [ScaledPath(paths[0])]
-    for position, path in enumerate(paths[1:], 1):
-        rise = (probed[1][position] - probed[0][position]) / (probed[1][0] - probed[0][0])
-        scaled_paths.append(ScaledPath(path, rise, probed[0][position] - rise * probed[0][0]))
-    for row in (*probed, *([0.0 if value is None else float(value) for value in row] for row in held)):
-        for number, place in zip(row, scaled_paths, strict=True):
-            if abs(place.factor * row[0] + place.offset - number) > 1e-12 * abs(number):
-                return ()
-    return tuple(scaled_paths)
+def _with_environments(lens: Lens, covering: Sequence[Cell]) -> Lens:
+    """The lens with the environments of surfaces, which only operands give: cells of TEMP and PRES."""
+    surfaces = list(lens.surfaces)
+    for cell in covering if lens.environment is not None else ():
+        value = number(cell.value, cell.name, cell.record.place)
+        for k in cell.covered:
+            if 0 <= k < len(surfaces):
+                air = surfaces[k].environment or lens.environment
+                air = dataclasses.replace(air, **{ENVIRONMENT_OPERANDS[cell.name]: double(value)})
+                environment_at((float(air.temperature), float(air.pressure)), cell.record.place)
+                surfaces[k] = dataclasses.replace(surfaces[k], environment=air)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | None:
@@ -550,6 +341,297 @@ def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | Non
         return same(stored, wanted)
     number, wanted = 0.0 if stored is None else float(stored), float(operand.numbers[k])
     return number == wanted or abs(number - wanted) <= 1e-9 * abs(wanted)
+
+
+# -- an operand, placed -----------------------------------------------------------------------------------------------
+
+
+def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
+    """The operand of these cells with its paths in the lens, or the reason why it is not followed."""
+    first, values = cells[0], tuple(cell.value for cell in cells)
+    texts = tuple((value,) for value in values)
+
+    def placed(like: Lens = file.lens, **fields) -> PlacedOperand:
+        return PlacedOperand(Operand(first.name, first.number, first.parameter, **fields), cells, like)
+
+    unplaced = placed(words=texts)
+    if all(map(is_number, values)):
+        unplaced = placed(numbers=double([plain(value) for value in values]))
+    if first.name in KEPT:
+        return unplaced
+    if first.name in _REFUSED:
+        return placed(words=texts, refusal=_REFUSED[first.name])
+    row, last = ROWS[first.name], len(file.lens.surfaces) - 1
+    try:
+        for k in (first.number,) if row.of == "surface" else first.covered or ():
+            if not 0 <= k <= last:
+                raise LensFileError(f"{first.name} of surface {k}; expected one from 0 to {last}", first.record.place)
+        paths, like = _paths_of_parameter(first, row, file) if not row.path else _paths(first, row, file)
+        if not paths:
+            return unplaced
+        if row.kind == NUMBER:
+            # the lens holds factor times the number of the file, of terms that are normalised by a radius
+            factor, numbers = paths[0].factor, double([_number(cell, row, file) for cell in cells])
+            paths = tuple(ScaledPath(path, f / factor, offset) for path, f, offset in paths)
+            return placed(like, paths=paths, numbers=numbers if factor == 1 else factor * numbers)
+        if any(part(file.lens, scaled.path[:-1]) is None for scaled in paths):
+            raise LensFileError("the lens as stored has no such part, an aperture for example", first.record.place)
+        if row.kind == GLASS:
+            return placed(paths=paths, media=tuple(_medium(cell, row, file) for cell in cells))
+        words = [_words(cell, row, file, paths) for cell in cells]
+        varied = [j for j in range(len(paths)) if not j or any(not same(each[j], words[0][j]) for each in words)]
+        return placed(
+            paths=tuple(paths[j] for j in varied), words=tuple(tuple(each[j] for j in varied) for each in words)
+        )
+    except (LensFileError, UnknownGlass) as error:
+        return placed(words=texts, refusal=str(error))
+
+
+# -- paths ------------------------------------------------------------------------------------------------------------
+
+
+def _paths(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
+    """The path of a row and those that follow it, none of a value that the lens lacks; and a lens that models them."""
+    lens, k, path = file.lens, cell.number, row.path_in_lens(cell.number)
+    paths, like = [path], lens
+    if row.path.startswith("environment"):
+        paths = _environment_paths(cell, path, lens)
+    elif row.of in ("field", "wavelength"):
+        count = len(lens.fields.x if row.of == "field" else lens.wavelengths)
+        paths = paths if 1 <= k <= count else []
+        if "vignetting" in path and lens.fields.vignetting is None:
+            like = with_part(lens, ("fields", "vignetting"), lens.fields.x.new_zeros(5, count))
+    elif row.of == "":
+        paths += [("aperture", "value")] if row.path == "stop" and lens.aperture.kind == "float_by_stop" else []
+    else:
+        return _paths_in_surface(cell, row, file)
+    return tuple(map(ScaledPath, paths)), like
+
+
+def _paths_in_surface(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
+    """`_paths` of a value of a surface."""
+    lens, k, path, (kind, _) = file.lens, cell.number, row.path_in_lens(cell.number), file.typed(cell.number)
+    block, surface = file.sections.surfaces[k], file.lens.surfaces[k]
+    is_missing = {
+        "CURV": "curvature" not in kind.holds,
+        "CONI": "conic" not in kind.holds,
+        "GLAS": kind.is_break,
+        "SCBD": kind.is_break and path[2] == "before",
+        "CLAP": any(SHAPES[clear.shape].sizes is None for clear in surface.apertures),
+    }
+    if is_missing.get(row.keyword):
+        return (), lens
+    paths, like = [ScaledPath(path)], lens
+    if row.kind == GLASS:
+        record = block.last("GLAS")
+        if row.word > 1 and record is None:
+            raise LensFileError(f"{cell.name} of surface {k}, which has no glass", cell.record.place)
+        if row.word > 1 and not is_blank(record) and record.integer(1, "flag", 0) != 1:
+            return (), lens
+        paths += _picked_glasses(k, file) if row.word == 1 else []
+    elif row.keyword == "SCBD" and part(lens, path[:-1]) is None:
+        side = _numbered(block, "SCBD", {"before": "1", "after": "2"}[path[2]])
+        pose = Pose(tilts_first=bool(side and side.number(1, "order", 0.0)))
+        like = with_part(lens, path[:-1], dataclasses.replace(pose, **{path[-1]: double(0.0)}))
+    elif row.keyword == "DIAM":  # followed by a floating aperture, irregular terms and the size of the stop
+        apertures = block.all(*aperture_keywords())
+        floats = bool(apertures) and apertures[-1].keyword == "FLAP"
+        paths += [ScaledPath((*path[:2], "apertures", 0, "extent", 1))] if floats else []
+        irregular = isinstance(surface.sag_terms, IrregularSag)
+        paths += [ScaledPath((*path[:2], "sag_terms", "radius"))] if irregular else []
+        sized = lens.stop == k and lens.aperture.kind == "float_by_stop"
+        paths += [ScaledPath(("aperture", "value"))] if sized else []
+    elif row.keyword in _PICKUPS:
+        paths += _picked_up(cell, row, file, {})
+    return tuple(paths), like
+
+
+def _paths_of_parameter(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
+    """The paths of PARM or XDAT by the row of the surface's type, with its pickups; and a lens that models them."""
+    k, j, likes = cell.number, cell.parameter, {}
+    kind, numbers = file.typed(k)
+    if row.keyword == "XDAT" and kind.terms is not None and (j == 1 or (j == 2 and kind.terms_are_coefficients)):
+        quantity = "number of terms" if j == 1 else "radius of normalisation"
+        message = f"the {quantity} of a surface that is {kind.name} is the same in all configurations here"
+        raise LensFileError(message, cell.record.place)
+    factors, likes[k] = kind.places(file.lens.surfaces[k], numbers, row.keyword, j)
+    paths = [ScaledPath(("surfaces", k, *place.steps), factor) for place, factor in factors.items()]
+    paths += _picked_up(cell, row, file, likes) if row.keyword == "PARM" and paths else []
+    surfaces = tuple(likes.get(number, surface) for number, surface in enumerate(file.lens.surfaces))
+    return tuple(paths), dataclasses.replace(file.lens, surfaces=surfaces)
+
+
+def _environment_paths(cell: Cell, path: Path, lens: Lens) -> list[Path]:
+    """A temperature or pressure of the surfaces that it covers, or of the lens and of surfaces that share it."""
+    if lens.environment is None:
+        return []
+    if cell.covered is not None:
+        return [("surfaces", k, *path) for k in sorted(cell.covered)]
+    sharing = [
+        ("surfaces", k, *path)
+        for k, surface in enumerate(lens.surfaces)
+        if surface.environment is not None and part(surface, path) is part(lens, path)
+    ]
+    return [path, *sharing]
+
+
+#: Pickups of numbers: by the keyword of the number, that of the rule, and the first word of the rule.
+#: PPAR j surface factor offset: parameter j; PZUP surface factor offset: thickness; CURV c 4 surface factor.
+_PICKUPS = {"PARM": ("PPAR", 1), "DISZ": ("PZUP", 0), "CURV": ("CURV", 2)}
+
+
+def _picked_up(cell: Cell, row: ValueRow, file: LensFile, likes: dict[int, Surface]) -> list[ScaledPath]:
+    """The paths of pickups of a number, from the object on, as a pickup looks back; likes: surfaces that model them.
+
+    A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
+    """
+    if row.keyword not in _PICKUPS:
+        return []
+    keyword, first = _PICKUPS[row.keyword]
+    blocks, j, paths = file.sections.surfaces, str(cell.parameter), []
+    followed = {cell.number: (1.0, 0.0)}  # factor and offset, in the unit of the file
+
+    def stored(block: Block) -> float | None:
+        record = _numbered(block, "PARM", j) if row.keyword == "PARM" else block.last(row.keyword)
+        text = record.words[row.word - 1] if record and row.word <= len(record.words) else ""
+        return plain(text) if is_number(text) else None
+
+    for k, block in enumerate(blocks):
+        rule = _numbered(block, "PPAR", j) if keyword == "PPAR" else block.last(keyword)
+        numbers = [plain(word) for word in rule.words[first : first + 3] if is_number(word)] if rule else []
+        if len(numbers) < 2 or (keyword == "CURV" and (rule.words[1] != "4" or any(numbers[2:]))):
+            continue
+        source, factor, offset = numbers[0], numbers[1], sum(numbers[2:])
+        if source not in followed or not source < k:
+            continue
+        held, wanted = stored(block), stored(blocks[int(source)])
+        if held is None or wanted is None or abs(held - (factor * wanted + offset)) > 1e-9 * abs(held) + 1e-300:
+            continue
+        scale, shift = followed[source]
+        factor, offset = followed[k] = factor * scale, factor * shift + offset
+        kind, values = file.typed(k)
+        places, power = {ParameterPath((row.path,)): 1.0}, row.power
+        if row.keyword == "PARM":
+            power = kind.power("PARM", cell.parameter)
+            places, likes[k] = kind.places(file.lens.surfaces[k], values, "PARM", cell.parameter)
+        elif row.keyword == "CURV" and "curvature" not in kind.holds:
+            places = {}
+        if places and (power is INVERSE and offset):
+            message = f"picked up by surface {k} with an offset, as a length of which the lens holds the reciprocal"
+            raise LensFileError(message, cell.record.place)
+        if places and row.keyword == "PARM" and power != file.typed(cell.number)[0].power("PARM", cell.parameter):
+            raise LensFileError(f"picked up by surface {k}, whose parameter has another unit", cell.record.place)
+        scale = 1 / factor if power is INVERSE else factor
+        offset = in_millimetres(offset, power or 0, file.millimetres)
+        paths += [ScaledPath(("surfaces", k, *place.steps), f * scale, f * offset) for place, f in places.items()]
+    return paths
+
+
+def _picked_glasses(number: int, file: LensFile) -> list[ScaledPath]:
+    """The media of the surfaces that pick up the glass of a surface."""
+    blocks, followed = file.sections.surfaces, [number]
+    for k, block in enumerate(blocks):
+        record, source = block.last("GLAS"), glass_source(block)
+        held = blocks[source].last("GLAS") if source in followed else None
+        if source in followed and (is_blank(record) or (held and held.words[:1] == record.words[:1])):
+            followed.append(k)
+    return [ScaledPath(("surfaces", k, "glass")) for k in followed[1:]]
+
+
+def _numbered(block: Block, keyword: str, number: str) -> Record | None:
+    records = reversed(block.all(keyword))
+    return next((record for record in records if record.words and record.words[0] == number), None)
+
+
+# -- values -----------------------------------------------------------------------------------------------------------
+
+
+def power_of(row: ValueRow, lens: Lens) -> int:
+    """The power of length in the value of a row, which of fields and of the aperture depends on their kind."""
+    is_length = lens.aperture.kind in ("entrance_pupil_diameter", "float_by_stop")
+    has_none = (row.of == "field" and lens.fields.kind == "angle") or (row.path == "aperture.value" and not is_length)
+    return 0 if has_none else row.power
+
+
+def _number(cell: Cell, row: ValueRow, file: LensFile) -> float:
+    """The number of a cell, in powers of mm. Raises LensFileError for a value out of range."""
+    text, place, label = cell.value, cell.record.place, f"{cell.name}: {row.quantity}"
+    if row.keyword == "DISZ" and cell.number == 0:
+        text = "INFINITY" if is_number(text) and plain(text) >= FAR else text
+        if is_infinite(text) and text[0] != "-":
+            return math.inf
+    if is_infinite(text):
+        raise LensFileError(f"{cell.name} is {shown(text)}; only the object may be at infinity", place)
+    value, power = number(text, label, place), power_of(row, file.lens)
+    if not row.path:
+        kind, numbers = file.typed(cell.number)
+        power = kind.power(row.keyword, cell.parameter)
+    try:
+        value = inverse(text, file.millimetres) if power is INVERSE else in_millimetres(value, power, file.millimetres)
+    except OverflowError as error:
+        raise LensFileError(f"{label} is {shown(text)}, too small a length", place) from error
+    if not math.isfinite(value):
+        raise LensFileError(f"{label} is {shown(text)}, too large once converted to mm", place)
+    if row.keyword == "PARM":
+        changed = numbers._replace(parameters={**numbers.parameters, cell.parameter: value})
+        if objection := kind.objection(changed):
+            raise LensFileError(objection, place)
+    if row.path.startswith("environment") and file.lens.environment is not None:
+        air = dataclasses.replace(file.lens.environment, **{row.path_in_lens(0)[-1]: double(value)})
+        environment_at((float(air.temperature), float(air.pressure)), place)
+    if row.path in ("wavelengths", "aperture.value") and value <= 0:
+        raise LensFileError(f"{label} is {shown(text)}, expected a positive number", place)
+    if row.path == "wavelength_weights" and value < 0:
+        raise LensFileError(f"{label} is {shown(text)}, expected 0 or more", place)
+    return value
+
+
+def _medium(cell: Cell, row: ValueRow, file: LensFile) -> Glass:
+    """The medium of a name, or of the stored model glass with another index, Abbe number or partial dispersion."""
+    record = file.sections.surfaces[cell.number].last("GLAS")
+    place = cell.record.place._replace(surface=cell.number)
+    if row.word > 1:
+        words = [*record.words, *["0"] * (row.word - len(record.words))]
+        words[row.word - 1] = cell.value
+        return file.medium(Record("GLAS", tuple(words), "", place))
+    if record and record.words and record.words[0].upper() == cell.value.upper():
+        return file.lens.surfaces[cell.number].glass  # of the same name, with the indices that the file has for it
+    return file.medium(Record("GLAS", (cell.value, "0", "0", "1.5", "40"), "", place)) if cell.value else AIR
+
+
+def _words(cell: Cell, row: ValueRow, file: LensFile, paths: Sequence[ScaledPath]) -> tuple:
+    """The contents of the paths of a value that is no tensor. Raises LensFileError for a value out of range."""
+    lens, place, last = file.lens, cell.record.place, len(file.lens.surfaces) - 1
+    if row.kind == TEXT:
+        return (cell.value.strip(),)
+    if row.kind != SIZE:
+        whole = integer(cell.value, f"{cell.name}: {row.quantity}", place)
+        if row.kind == SWITCH:
+            return (bool(whole),)
+        if row.kind == AIMING and 0 <= whole < len(AIMINGS):
+            return (AIMINGS[whole],)
+        if row.path == "primary_wavelength" and 1 <= whole <= len(lens.wavelengths):
+            return (whole,)
+        if row.path == "stop" and 0 < whole < last:
+            size = lens.surfaces[whole].semi_diameter
+            if len(paths) > 1 and not size:
+                raise LensFileError("FLOA (float by stop size), but the stop surface has no DIAM", place)
+            return (whole, *([double(size)] if len(paths) > 1 else []))
+        most = {"stop": f"a surface from 1 to {last - 1}", "ray_aiming": "0 (off), 1 (paraxial) or 2 (real)"}
+        expected = most.get(row.path, f"1 to {len(lens.wavelengths)}, the number of wavelengths")
+        raise LensFileError(f"{cell.name} is {shown(cell.value)}; expected {expected}", place)
+    size = _number(cell, row, file)
+    if row.keyword != "DIAM":
+        *owner, _, _ = paths[0].path
+        clear = with_part(part(lens, tuple(owner)), paths[0].path[len(owner) :], size)
+        clear_aperture(clear.shape, clear.extent, clear.obscures, clear.centre, cell.name, place)
+        return (size,)
+    if size < 0 or (not size and any(isinstance(part(lens, path), Tensor) for path, *_ in paths[1:])):
+        raise LensFileError(f"{cell.name} is {shown(cell.value)}, expected a semi-diameter above 0", place)
+    sizes = [size or None]
+    for path, *_ in paths[1:]:  # a floating aperture of an automatic semi-diameter keeps its own size
+        sizes.append(double(size) if isinstance(part(lens, path), Tensor) else size or part(lens, path))
+    return tuple(sizes)
 
 
 # -- reporting --------------------------------------------------------------------------------------------------------
@@ -587,7 +669,7 @@ def _report_solved(sections: Sections, operands: Sequence[PlacedOperand], active
 
     def refracts(operand: Operand) -> bool:
         row = ROWS.get(operand.name)
-        if row is None or not row.keyword.startswith("PARM"):
+        if row is None or row.keyword != "PARM":
             return row is not None and row.refracts
         kind = sections.surfaces[operand.number].last("TYPE") if operand.number < len(sections.surfaces) else None
         return bool(operand.paths) and not (kind and kind.words[:1] == ("COORDBRK",))
@@ -616,23 +698,7 @@ def environment(system: Block) -> Environment | None:
     record = system.last("ENVD")
     if record is None or not record.integer(2, "whether indices follow the environment", 0):
         return None
-    return environment_at((record.number(0, "temperature"), record.number(1, "pressure")), record.place)
-
-
-def in_environments(
-    surfaces: Sequence[Surface], blocks: Sequence[Block], around: Environment | None
-) -> tuple[Surface, ...]:
-    """The surfaces with their own environments, which `applied` writes as ENVD into their blocks."""
-    changed = list(surfaces)
-    for k, block in enumerate(blocks if around is not None else ()):
-        if record := block.last("ENVD"):
-            of_lens = float(around.temperature), float(around.pressure)
-            values = [
-                of_lens[position] if record.words[position] == OF_LENS else record.number(position, name)
-                for position, name in enumerate(ENVIRONMENT_OPERANDS.values())
-            ]
-            changed[k] = dataclasses.replace(changed[k], environment=environment_at(values, record.place))
-    return tuple(changed)
+    return environment_at([ROWS[name].read(record) for name in ENVIRONMENT_OPERANDS], record.place)
 
 
 def report_environment(sections: Sections, lens: Lens, report: Draft) -> None:
@@ -659,8 +725,7 @@ def environment_line(lens: Lens, place: Place) -> str:
     """The line of ENVD."""
     if lens.environment is None:
         return "ENVD 20 1 0"
-    values = (exact(getattr(lens.environment, name), name, place) for name in ENVIRONMENT_OPERANDS.values())
-    return " ".join(["ENVD", *values, "1"])
+    return " ".join(["ENVD", *(ROWS[name].write(lens, place) for name in ENVIRONMENT_OPERANDS), "1"])
 
 
 def is_of_surfaces(operand: Operand) -> bool:

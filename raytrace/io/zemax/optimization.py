@@ -43,10 +43,9 @@ from raytrace.io.source import (
     plain,
     read_text,
 )
-from raytrace.io.zemax.configurations import cell_of
+from raytrace.io.zemax.configurations import STATUSES, VARIABLE
 from raytrace.io.zemax.surfaces import (
     BLANK,
-    FIRST_TERM,
     INVERSE,
     SYSTEM_IGNORED,
     TAIL_REASON,
@@ -105,10 +104,9 @@ THICKNESS_SOLVES = {
 }
 _FOLLOWED = ("pickup", *(r.kind for r in (*CURVATURE_SOLVES.values(), *THICKNESS_SOLVES.values()) if r.followed))
 
-#: Rules by the code of DIAM, by the code of GLAS, and by the status of a number of a configuration.
+#: Rules by the code of DIAM, and by the code of GLAS.
 _FIXED, _SEMI_DIAMETER_RULES = 1, {2: "pickup", 3: "maximum"}
 _MODEL, _GLASS_RULES = 1, {2: "pickup", 3: "substitute"}
-_VARIABLE, _CONFIGURATION_RULES = 1, {2: "pickup", 4: "thermal"}
 
 #: Quantities of a model glass, by the position of the word of GLAS that makes them variable.
 _GLASS_NUMBERS = {6: "index", 7: "abbe_number", 8: "partial_dispersion"}
@@ -137,8 +135,7 @@ class TypedSurface(NamedTuple):
         return self.row.names(self.surface, self.numbers, keyword, j)
 
     def code(self, keyword: str) -> int:
-        record = self.block.last(keyword)
-        return record.integer(1, "code", 0) if record else 0
+        return self.block.integer(keyword, "code", 0, 1)
 
     def numbered(self, keyword: str) -> list[tuple[int, Record]]:
         """The records of a keyword in the order of their numbers."""
@@ -151,7 +148,7 @@ class TypedSurface(NamedTuple):
         """The rule of a code, and the surface that it refers to."""
         code = self.code(keyword)
         refers = code in kinds and kinds[code] != "substitute"
-        source = self.block.last(keyword).integer(2, "surface", 0) if refers else 0
+        source = self.block.integer(keyword, "surface", 0, 2) if refers else 0
         return self.solve(quantity, kinds.get(code, f"code {code}"), source=source)
 
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
@@ -179,13 +176,13 @@ def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft)
     for j, _ in typed.numbered("VPAR"):
         yield from _parameter_variable(typed, "PARM", j)
     for j, record in typed.numbered("XDAT"):
-        if (code := record.integer(2, "code", 0)) == _VARIABLE:
+        if (code := record.integer(2, "code", 0)) == VARIABLE:
             yield from _parameter_variable(typed, "XDAT", j)
         elif code:
             yield typed.solve(f"XDAT {j}", f"code {code}", _solve_numbers(record, 3))
     if (code := typed.code("GLAS")) == _MODEL:
         for k, name in _GLASS_NUMBERS.items():
-            if block.last("GLAS").number(k, "status", 0.0) == _VARIABLE:
+            if block.last("GLAS").number(k, "status", 0.0) == VARIABLE:
                 yield Vary(typed.number, name)
     elif code:
         yield typed.coded("glass", "GLAS", _GLASS_RULES)
@@ -220,7 +217,7 @@ def _source(numbers: list[float], before: int) -> int | None:
 
 
 def _curvature_rule(typed: TypedSurface, code: int) -> Vary | Solve:
-    if code == _VARIABLE:
+    if code == VARIABLE:
         return Vary(typed.number, "curvature")
     numbers = _solve_numbers(typed.block.last("CURV"), 2)
     source = _source(numbers, typed.number)
@@ -286,8 +283,11 @@ def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> list[Solve]:
 # -- the optimisation data of a file, read ----------------------------------------------------------------------------
 
 
-def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens:
-    """The lens with its optimisation data, None where the file has none; every variable is modelled."""
+def read(sections: Sections, lens: Lens, millimetres: float, configured: Sequence[Vary | Solve], report: Draft) -> Lens:
+    """The lens with its optimisation data, None where the file has none; every variable is modelled.
+
+    configured: the variables and pickups of the numbers that operands set.
+    """
     surfaces = []
     for block, surface in zip(sections.surfaces, lens.surfaces, strict=True):
         row = types()[type_name(block)]
@@ -303,7 +303,6 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
         return path is not None and ("surfaces", rule.surface, *path) in set_by_operands
 
     rules = [rule for typed in surfaces for rule in _rules(typed, surfaces, report) if not is_overridden(rule)]
-    configured = list(_configuration_rules(sections, lens))
     variables = tuple(rule for rule in (*rules, *configured) if isinstance(rule, Vary))
     solves = [rule for rule in (*rules, *configured) if isinstance(rule, Solve)]
     for solve in solves:
@@ -352,20 +351,16 @@ def _path_of(surface: Surface, quantity: str) -> LensPath | None:
     if quantity == "thickness":
         return ("thickness",)
     place = parameter_paths(surface).get(quantity)
-    return place and (*place.path, *(() if place.entry is None else ((place.entry,),)))
+    return place and place.steps
 
 
 def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and solves and pickups of them."""
 
     def modelled(typed: TypedSurface, name: str) -> Surface:
-        if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
-            data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
-            for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
-                named, like = typed.names(keyword, j)
-                if name in [number.name for number in named]:
-                    return like
-        return typed.surface
+        if name in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
+            return typed.surface
+        return typed.row.named(typed.surface, typed.numbers).get(name, ("", 0, typed.surface))[2]
 
     moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
     for solve in data.solves:
@@ -379,48 +374,6 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
         if path is not None and part(changed[number], path) is None:
             changed[number] = with_part(changed[number], path, double(0.0), like=like)
     return dataclasses.replace(lens, surfaces=tuple(changed))
-
-
-def _configuration_rules(sections: Sections, lens: Lens) -> Iterator[Vary | Solve]:
-    """The variables and pickups in the table of configurations, by the operands of the lens."""
-    head = sections.system.last("MNUM")
-    if head is None or not lens.operands:
-        return
-    after = (record for record in sections.tail if record.place.line > head.place.line)
-    cells = [cell for record in after if (cell := cell_of(record))]
-    # the operand of the lens, if any, of every cell and of every row of the table
-    keys = [(operand.name, operand.number, operand.parameter) for operand in lens.operands]
-    of_cells: list[int | None] = []
-    of_rows: list[int | None] = []
-    before, behind = None, 0
-    for cell in cells:
-        if before is None or before.key != cell.key or before.configuration >= cell.configuration:
-            index = next((k for k in range(behind, len(keys)) if keys[k] == cell.key), None)
-            behind = behind if index is None else index + 1
-            of_rows.append(index)
-        of_cells.append(of_rows[-1])
-        before = cell
-    for cell, operand in zip(cells, of_cells, strict=True):
-        status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
-        if operand is None or not status or not 1 <= cell.configuration <= len(lens.operands[operand]):
-            continue
-        number, name = cell.number, ""
-        for path, *_ in lens.operands[operand].paths[:1]:
-            if len(path) > 2 and path[0] == "surfaces":  # the quantity of that surface
-                surface = lens.surfaces[path[1]]
-                names = (n for n in ("thickness", *parameter_paths(surface)) if _path_of(surface, n) == path[2:])
-                number, name = path[1], next(names, "")
-        where = {"configuration": cell.configuration, "operand": operand}
-        if status == _VARIABLE:
-            yield Vary(number, name, **where) if name else Solve(cell.number, cell.name, "variable", **where)
-            continue
-        numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
-        source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
-        is_row = row == int(row) and 0 < row <= len(of_rows) and of_rows[int(row) - 1] is not None
-        kind = _CONFIGURATION_RULES.get(status, f"status {status}")
-        followed = (float(of_rows[int(row) - 1]),) if is_row else ()
-        pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
-        yield Solve(cell.number, name or cell.name, kind, **pickup, **where)
 
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------
@@ -527,17 +480,25 @@ def margin_line(data: OptimizationData | None) -> str:
 
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     """The lines of a surface with its variables, solves and pickups. Raises LensFileError for a rule without a line."""
-    data = lens.optimization_data
-    if data is None:
-        return lines
+    data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
     rules = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
-    sizes = [rule for rule in rules if rule.quantity == "semi_diameter"]
-    code, source = (_FIXED if number in data.semi_diameters else 0), 0
-    if not code and sizes:
-        code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
-    lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
+    pickups = _operand_pickups(lens, number, place)
+    solved = {rule.quantity for rule in rules if isinstance(rule, Solve) and rule.operand is None}
+    picked = {rule.quantity for rule in pickups}
+    rules = [
+        rule for rule in rules if rule.operand is not None or isinstance(rule, Solve) or rule.quantity not in picked
+    ]
+    rules += [rule for rule in pickups if rule.quantity not in solved]
+    if lens.optimization_data is not None:
+        sizes = [rule for rule in rules if rule.quantity == "semi_diameter"]
+        code, source = (_FIXED if number in data.semi_diameters else 0), 0
+        if not code and sizes:
+            code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
+        lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
     rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
-    parameters = _parameters(lens.surfaces[number]) if rules else {}
+    row, surface = types().get(type_of(lens.surfaces[number]) or ""), lens.surfaces[number]
+    has_numbers = bool(rules) and row is not None
+    parameters = row.named(surface, row.numbers(surface)._replace(size=surface.semi_diameter)) if has_numbers else {}
     for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
@@ -559,6 +520,26 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
         else:
             lines = _with_parameter(lines, rule, parameters, place)
     return lines
+
+
+def _operand_pickups(lens: Lens, number: int, place: Place) -> list[Solve]:
+    """The pickups by which a surface follows operands of other surfaces.
+
+    Raises LensFileError for a pickup that a .zmx file is not known to have.
+    """
+    pickups, quantities = [], {"THIC": "thickness", "CRVT": "curvature", "GLSS": "glass"}
+    for operand in lens.operands:
+        followed = [scaled for scaled in operand.paths[1:] if scaled.path[:2] == ("surfaces", number)]
+        if number == operand.number or not followed or followed[0].path[2] == "environment":
+            continue
+        path, scale, offset = followed[0]
+        names = {found.steps: name for name, found in parameter_paths(lens.surfaces[number]).items()}
+        is_parameter = operand.name in ("PRAM", *(f"PAR{j}" for j in range(1, 9)))
+        quantity = names.get(path[2:]) if is_parameter else quantities.get(operand.name)
+        if not quantity or path[2:] != operand.paths[0].path[2:] or path[2] == "phase":
+            raise LensFileError(f"follows {operand} by a rule that is not written", place)
+        pickups.append(Solve(number, quantity, "pickup", source=operand.number, scale=scale, offset=offset))
+    return pickups
 
 
 def _code_of(kind: str, codes: dict[int, str]) -> int:
@@ -604,7 +585,7 @@ def _thickness_line(rule: Vary | Solve, place: Place) -> str:
 
 def _with_curvature(lines: Lines, rule: Vary | Solve, place: Place) -> Lines:
     if isinstance(rule, Vary):
-        words = [str(_VARIABLE), "0", "0"]
+        words = [str(VARIABLE), "0", "0"]
     elif rule.kind == "pickup":
         words = [str(_CURVATURE_PICKUP), str(rule.source), repr(rule.scale)]
         if rule.offset:
@@ -625,13 +606,13 @@ def with_glass_line(lines: Lines) -> Lines:
 
 def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: Place) -> Lines:
     keyword, _, j = rule.quantity.partition(" ")
-    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))
+    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))[:2]
     if not keyword:
         raise _unheld(rule, place)
     is_variable = isinstance(rule, Vary) or rule.kind == "variable"
     if keyword == "XDAT":
         further = [] if isinstance(rule, Vary) else [*map(_spelled, rule.numbers)]
-        words = {3: str(_VARIABLE if is_variable else _code_of(rule.kind, {}))} | dict(enumerate(further, 4))
+        words = {3: str(VARIABLE if is_variable else _code_of(rule.kind, {}))} | dict(enumerate(further, 4))
         start = f"  XDAT {j} "
         return [changed([line], "XDAT", words)[0] if line.startswith(start) else line for line in lines]
     if is_variable:
@@ -641,19 +622,6 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
     else:
         line = " ".join([f"PPAR {j}", *map(_spelled, rule.numbers)])
     return _behind(lines, f"PARM {j}", line)
-
-
-def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
-    """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
-    row, by_name = types().get(type_of(surface) or ""), {}
-    if row is None:
-        return by_name
-    numbers = row.numbers(surface)._replace(size=surface.semi_diameter)
-    data = 0 if numbers.terms is None else len(numbers.terms)
-    for keyword, j in (*(("PARM", j) for j in row.parameters), *(("XDAT", FIRST_TERM + k) for k in range(data))):
-        for named in row.names(surface, numbers, keyword, j)[0]:
-            by_name.setdefault(named.name, (keyword, j))
-    return by_name
 
 
 def _unheld(rule: Vary | Solve, place: Place) -> LensFileError:
@@ -680,10 +648,10 @@ def statuses(lens: Lens, written: Sequence[Operand]) -> dict[tuple[int, int], tu
         if rule.operand is None or rule.operand >= len(at) or at[rule.operand] is None:
             continue
         if isinstance(rule, Vary) or rule.kind == "variable":
-            status = str(_VARIABLE), "0 1 1 1.0 0.0 0"
+            status = str(VARIABLE), "0 1 1 1.0 0.0 0"
         else:
             row = at[int(rule.numbers[0])] if rule.numbers else None
             pickup = f"0 {rule.source} {0 if row is None else row + 1} {rule.scale!r} {rule.offset!r} 0"
-            status = str(_code_of(rule.kind, _CONFIGURATION_RULES)), pickup
+            status = str(_code_of(rule.kind, STATUSES)), pickup
         words[at[rule.operand], rule.configuration] = status
     return words

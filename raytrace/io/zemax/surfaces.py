@@ -33,6 +33,7 @@ from raytrace.io.source import (
     UnsupportedSurface,
     by_word,
     double,
+    exact,
     is_infinite,
     nonzero,
     refuse_surplus,
@@ -42,7 +43,9 @@ from raytrace.io.source import (
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
-from raytrace.system.configurations import same
+from raytrace.system.configurations import Path as LensPath
+from raytrace.system.configurations import part, same
+from raytrace.system.lens import Lens
 from raytrace.system.parameter_paths import ParameterPath, parameter_paths
 from raytrace.system.phases import Facets, FringePhase, Grating, Hologram, IdealLens, PolynomialPhase, RadialPhase
 from raytrace.system.poses import Pose, undone
@@ -293,19 +296,105 @@ def in_millimetres(number: float, power: int, millimetres: float) -> float:
     return number * millimetres**power if power >= 0 else number / millimetres**-power
 
 
-#: Powers of length of the words of a line, from 1, by its keyword; others have none. Apertures have their sizes first.
-POWERS = {
-    "ENPD": {1: 1},
-    "SDMA": {3: 1},
-    "CURV": {1: -1},
-    "DISZ": {1: 1},
-    "DIAM": {1: 1},
-    "VDSZ": {1: 1, 2: 1},
-    "PZUP": {3: 1},
-    "OBDC": {1: 1, 2: 1},
-    "UDAD": {2: 1, 3: 1},
-    "SCBD": {4: 1, 5: 1},
+# -- values of records: path, unit and operand ------------------------------------------------------------------------
+
+#: Kinds of value: a number that rays depend on, a size, a number of a surface or wavelength, a yes or no, …
+NUMBER, SIZE, WHOLE, SWITCH, AIMING, TEXT, GLASS = "number", "size", "whole", "switch", "aiming", "text", "glass"
+
+
+class ValueRow(NamedTuple):
+    """A value of a record: reader, writer, unit conversion and the multi-configuration operand follow from its row.
+
+    of: the argument of the operand: "surface", "field", "wavelength", or "" of the system.
+    keyword, word: the record, and the position of the value in it, from 1; 0: that of the field.
+    path: of the value in its surface, or in the lens; "" where the type of the surface decides (PARM, XDAT).
+    power: of length in the value; of fields, of those that are lengths. quantity: as an error calls it.
+    refracts: whether the paraxial rays at other surfaces depend on it, and with them the solves there.
+    """
+
+    of: str
+    keyword: str
+    word: int
+    path: str
+    power: int = 0
+    quantity: str = "value"
+    kind: str = NUMBER
+    refracts: bool = False
+
+    def path_in_lens(self, number: int) -> LensPath:
+        """The path of the value of a surface, field or wavelength of this number, in a lens."""
+        *steps, last = (int(step) if step.isdigit() else step for step in self.path.split("."))
+        if self.of in ("field", "wavelength"):
+            return (*steps, (last, number - 1)) if isinstance(last, int) else (*steps, last, (number - 1,))
+        return (*(("surfaces", number) if self.of == "surface" else ()), *steps, last)
+
+    def read(self, record: Record, millimetres: float = 1.0, default: float | None = None) -> float:
+        """The number of a record, in powers of mm."""
+        return in_millimetres(record.number(self.word - 1, self.quantity, default), self.power, millimetres)
+
+    def write(self, holder: Surface | Lens, place: Place) -> str:
+        """The number that a surface, or a lens, holds, in powers of mm; 0 where it is not modelled."""
+        steps = tuple(int(step) if step.isdigit() else step for step in self.path.split("."))
+        return exact(part(holder, steps), self.quantity, place)
+
+
+def _field(name: str, path: str, power: int = 0) -> ValueRow:
+    return ValueRow("field", FIELD_LISTS[name].keywords[0], 0, path, power, FIELD_LISTS[name].quantity)
+
+
+def _poses(side: str, path: str) -> dict[str, ValueRow]:
+    """Decentres and tilts of an SCBD record, CBDX … before and CADX … after the surface."""
+    axes = {"DX": ("x", 1), "DY": ("y", 1), "TX": ("tilt_x", 0), "TY": ("tilt_y", 0), "TZ": ("tilt_z", 0)}
+    return {
+        f"C{side}{axis}": ValueRow("surface", "SCBD", word, f"{path}.{name}", power, "tilt or decentre")
+        for word, (axis, (name, power)) in enumerate(axes.items(), 4)
+    }
+
+
+#: The values that configurations may give, by their operands.
+ROWS = {
+    "THIC": ValueRow("surface", "DISZ", 1, "thickness", 1, "thickness", refracts=True),
+    "CRVT": ValueRow("surface", "CURV", 1, "curvature", -1, "curvature", refracts=True),
+    "CONN": ValueRow("surface", "CONI", 1, "conic", 0, "conic constant"),
+    "GLSS": ValueRow("surface", "GLAS", 1, "glass", kind=GLASS, refracts=True),
+    "MIND": ValueRow("surface", "GLAS", 4, "glass", 0, "index nd", GLASS, refracts=True),
+    "MABB": ValueRow("surface", "GLAS", 5, "glass", 0, "Abbe number Vd", GLASS),
+    "MDPG": ValueRow("surface", "GLAS", 6, "glass", 0, "ΔPgF", GLASS),
+    "PRAM": ValueRow("surface", "PARM", 2, ""),
+    **{f"PAR{j}": ValueRow("surface", "PARM", 2, "") for j in range(1, 9)},
+    "EDVA": ValueRow("surface", "XDAT", 2, ""),
+    "SDIA": ValueRow("surface", "DIAM", 1, "semi_diameter", 1, "semi-diameter", SIZE),
+    "APMN": ValueRow("surface", "CLAP", 1, "apertures.0.extent.0", 1, "size of the aperture", SIZE),
+    "APMX": ValueRow("surface", "CLAP", 2, "apertures.0.extent.1", 1, "size of the aperture", SIZE),
+    "APDX": ValueRow("surface", "OBDC", 1, "apertures.0.centre.0", 1, "decentre", SIZE),
+    "APDY": ValueRow("surface", "OBDC", 2, "apertures.0.centre.1", 1, "decentre", SIZE),
+    **_poses("B", "before"),
+    **_poses("A", "after"),
+    "MCOM": ValueRow("surface", "COMM", 1, "comment", kind=TEXT),
+    "XFIE": _field("x", "fields.x", 1),
+    "YFIE": _field("y", "fields.y", 1),
+    "FLWT": _field("weight", "fields.weight"),
+    **{
+        f"F{name}": _field(name, f"fields.vignetting.{k}") for k, name in enumerate(("VDX", "VDY", "VCX", "VCY", "VAN"))
+    },
+    "WAVE": ValueRow("wavelength", "WAVM", 2, "wavelengths", 0, "wavelength", refracts=True),
+    "WLWT": ValueRow("wavelength", "WAVM", 3, "wavelength_weights", 0, "weight of a wavelength"),
+    "PRWV": ValueRow("", "PWAV", 1, "primary_wavelength", 0, "primary wavelength", WHOLE, refracts=True),
+    "APER": ValueRow("", "ENPD", 1, "aperture.value", 1, "system aperture", refracts=True),
+    "STPS": ValueRow("", "STOP", 1, "stop", 0, "stop", WHOLE, refracts=True),
+    "TELE": ValueRow("", "FTYP", 2, "fields.telecentric", 0, "telecentric", SWITCH),
+    "RAAM": ValueRow("", "RAIM", 2, "ray_aiming", 0, "ray aiming", AIMING),
+    "TEMP": ValueRow("", "ENVD", 1, "environment.temperature", 0, "temperature", refracts=True),
+    "PRES": ValueRow("", "ENVD", 2, "environment.pressure", 0, "pressure", refracts=True),
+    "LTTL": ValueRow("", "NAME", 1, "name", kind=TEXT),
 }
+
+#: Powers of length of the words of a line, from 1, by its keyword: those of the rows, and those without an operand.
+#: Apertures have their sizes first.
+POWERS: dict[str, dict[int, int]] = {"SDMA": {3: 1}, "VDSZ": {1: 1, 2: 1}, "PZUP": {3: 1}, "UDAD": {2: 1, 3: 1}}
+for _row in ROWS.values():
+    if _row.power and _row.of != "field":
+        POWERS.setdefault(_row.keyword, {})[_row.word] = _row.power
 
 
 def measured(record: Record, position: int, quantity: str, millimetres: float, default: float | None = None) -> float:
@@ -354,7 +443,7 @@ class Parameter(NamedTuple):
 
 
 class Named(NamedTuple):
-    """A number of the lens by its name in `parameter_paths`; it is factor times the number of the file in mm."""
+    """A number of the lens by its name in `parameter_paths`: factor times the number of the file in mm."""
 
     name: str
     factor: float
@@ -467,10 +556,13 @@ class SurfaceType:
         held = surface if self.part is None else surface.phase or sag
         return Numbers(parameters, held.coefficients, 1.0 if self.part is None else held.radius)
 
-    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
-        """The numbers of the lens that PARM j, or XDAT j, gives, and a surface in which all of them are modelled.
+    def places(
+        self, surface: Surface, numbers: Numbers, keyword: str, j: int
+    ) -> tuple[dict[ParameterPath, float], Surface]:
+        """The paths in a surface that PARM j, or XDAT j, gives, each with its factor; and a surface that models them.
 
-        Empty for a switch, and for numbers that the surface does not model.
+        The lens holds factor times the number of the file in mm. Empty for a switch, and for numbers that the surface
+        does not model.
         """
         modelled = 0.34375  # any number other than 0
         if keyword == "PARM" and j in self.parameters:
@@ -484,14 +576,39 @@ class SurfaceType:
             factors = {ParameterPath((owner, "coefficients"), entry): 1.0} if self.part else {}
             if self.terms_are_coefficients:
                 factors = {ParameterPath(("coefficients",), entry): float(numbers.radius) ** (-2 * (entry + 1))}
+        elif keyword == "XDAT" and j == 2 and self.part is not None and numbers.terms is not None:
+            factors = {ParameterPath(("phase" if "phase" in self.holds else "sag_terms", "radius")): 1.0}
         else:
-            return (), surface
+            return {}, surface
         try:
             like = dataclasses.replace(surface, **self.fields(numbers))
         except ValueError:
-            return (), surface
+            return {}, surface
+        held = parameter_paths(like).values()
+        return {place: factor for place, factor in factors.items() if place in held}, like
+
+    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
+        """`places` by the names of the numbers; without the radius that normalises terms, which is no variable."""
+        factors, like = self.places(surface, numbers, keyword, j)
         names = {place: name for name, place in parameter_paths(like).items()}
-        return tuple(Named(names[place], factor) for place, factor in factors.items() if place in names), like
+        is_number = keyword == "PARM" or j >= FIRST_TERM
+        return tuple(Named(names[place], factor) for place, factor in factors.items() if is_number), like
+
+    def named(self, surface: Surface, numbers: Numbers) -> dict[str, tuple[str, int, Surface]]:
+        """PARM or XDAT of every number of the lens that the type gives, by its name, and a surface that models it."""
+        terms = 0 if numbers.terms is None else len(numbers.terms)
+        found: dict[str, tuple[str, int, Surface]] = {}
+        for keyword, j in (*(("PARM", j) for j in self.parameters), *(("XDAT", FIRST_TERM + k) for k in range(terms))):
+            names, like = self.names(surface, numbers, keyword, j)
+            for number in names:
+                found.setdefault(number.name, (keyword, j, like))
+        return found
+
+    def power(self, keyword: str, j: int) -> int | None:
+        """The power of length in PARM j, or in XDAT j."""
+        if keyword == "XDAT":
+            return {1: 0, 2: 1}.get(j, self.terms or 0)
+        return self.parameters[j].power if j in self.parameters else 0
 
 
 def _parameters(first: int, *rows: tuple) -> dict[int, Parameter]:
@@ -694,6 +811,9 @@ def poses_are_parameters(surface: Surface) -> bool:
     return not before.tilts_first and before.z is None and before.tilt_z is None and same(undone(before), after)
 
 
+_POSE = tuple(_poses("B", "before").values())
+
+
 def poses(block: Block, millimetres: float) -> dict[str, Pose]:
     """The fields "before" and "after" of SCBD records, where they are not 0.
 
@@ -703,15 +823,14 @@ def poses(block: Block, millimetres: float) -> dict[str, Pose]:
     fields = {}
     for record in block.all("SCBD"):
         where = record.integer(0, "side of the tilt", 0)
-        numbers = [measured(record, k, "tilt or decentre", millimetres, 0.0) for k in range(3, 8)]
-        if where == 3 or not any(numbers):
+        numbers = {row.path.rpartition(".")[2]: row.read(record, millimetres, 0.0) for row in _POSE}
+        if where == 3 or not any(numbers.values()):
             continue
         order = record.number(1, "order")
         if where not in (1, 2) or order not in (0, 1):
             message = f"tilt or decentre of the surface (SCBD {where:g} of order {order:g}) is not modelled"
             raise UnsupportedSurface(f"{message}; known are SCBD 1 and 2 of order 0 and 1", record.place)
-        named = dict(zip(("x", "y", "tilt_x", "tilt_y", "tilt_z"), numbers, strict=True))
-        fields["before" if where == 1 else "after"] = pose_of(named, tilts_first=order == 1)
+        fields["before" if where == 1 else "after"] = pose_of(numbers, tilts_first=order == 1)
     return fields
 
 
@@ -827,7 +946,7 @@ def _unsupported(block: Block, at_end: bool) -> str:
         return f"type {kind} of the object with a tilt or decentre of the surface (SCBD)"
     if row.is_break and posed:
         return f"type {kind} ({row.name}) with a tilt or decentre of the surface (SCBD)"
-    if row.flat and any(_nonzero(block, keyword, keyword, 1.0) is not None for keyword in ("CURV", "CONI")):
+    if row.flat and any(_nonzero(block, held, 1.0) is not None for held in _SHAPES.values()):
         return f"type {kind} ({row.name}) on a curved surface (CURV)"
     numbers = numbers_of(block, row, 1.0)
     if kind == "IRREGULA" and any(map(numbers.at, (1, 2, 3, 4))) and posed:
@@ -877,12 +996,11 @@ def build(
             raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", thickness.place)
         distance = float("inf")
     else:
-        distance = measured(thickness, 0, "thickness", millimetres)
+        distance = ROWS["THIC"].read(thickness, millimetres)
     kind, fields = type_name(block), {}
     row = types()[kind]
     if "curvature" in row.holds:
-        fields["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)
-        fields["conic"] = _nonzero(block, "CONI", "conic constant", millimetres)
+        fields |= {field: _nonzero(block, held, millimetres) for field, held in _SHAPES.items()}
     if row.is_break:
         for keyword in ("GLAS", *aperture_keywords()):
             record = block.last(keyword)
@@ -909,15 +1027,19 @@ def build(
     )
 
 
-def _nonzero(block: Block, keyword: str, quantity: str, millimetres: float) -> Tensor | None:
-    record = block.last(keyword)
-    return nonzero(measured(record, 0, quantity, millimetres)) if record else None
+#: Curvature and conic constant, by the field of a surface.
+_SHAPES = {row.path: row for row in (ROWS["CRVT"], ROWS["CONN"])}
+
+
+def _nonzero(block: Block, row: ValueRow, millimetres: float) -> Tensor | None:
+    record = block.last(row.keyword)
+    return nonzero(row.read(record, millimetres)) if record else None
 
 
 def semi_diameter(block: Block, millimetres: float) -> float | None:
     """DIAM, which is a semi-diameter, in mm; None if absent or 0 (left to be computed)."""
     record = block.last("DIAM")
-    size = measured(record, 0, "semi-diameter", millimetres) if record and record.words else 0.0
+    size = ROWS["SDIA"].read(record, millimetres) if record and record.words else 0.0
     if size < 0:
         raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
     return size or None
@@ -948,13 +1070,15 @@ def _picked_up(block: Block, blocks: Sequence[Block], report: Draft) -> Record |
 def _medium(
     block: Block, blocks: Sequence[Block], catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft
 ) -> Glass:
+    record = _picked_up(block, blocks, report)
+    return AIR if record is None else medium(record, catalogs, user, report)
+
+
+def medium(record: Record, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
     """The medium of a GLAS record: name, flag (0 catalog, 1 model, 2 pickup, 3 substitute), -, nd, Vd, ΔPgF.
 
     The columns after the name are placeholders unless the flag says model glass or the name is ___BLANK.
     """
-    record = _picked_up(block, blocks, report)
-    if record is None:
-        return AIR
     if not record.words:
         raise LensFileError("GLAS without a name; delete the line for air", record.place)
     name, surface = record.words[0], record.place.surface
@@ -1001,7 +1125,7 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
     if record.keyword == "FLAP":
         sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
     at = block.last("OBDC")
-    centre = tuple(measured(at, axis, "decentre", millimetres) for axis in (0, 1)) if at else (0.0, 0.0)
+    centre = tuple(ROWS[name].read(at, millimetres) for name in ("APDX", "APDY")) if at else (0.0, 0.0)
     return (clear_aperture(shape, sizes, obscures, centre, record.keyword, record.place),)
 
 

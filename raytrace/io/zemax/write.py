@@ -18,10 +18,8 @@ from torch import Tensor
 from raytrace.io.assembly import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.io.source import (
     MILLIMETRES,
-    Draft,
     LensFileError,
     Place,
-    Record,
     exact,
     exact_list,
     is_infinite,
@@ -30,39 +28,38 @@ from raytrace.io.source import (
 )
 from raytrace.io.zemax.configurations import (
     FAR,
-    ROWS,
-    Cell,
     environment_line,
-    is_of_surfaces,
+    power_of,
     with_environments,
-    word_of,
 )
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
-    changed,
     margin_line,
     statuses,
     tail_lines,
-    with_glass_line,
     with_rules,
 )
 from raytrace.io.zemax.surfaces import (
+    AIMING,
     AIMINGS,
     BLANK,
     FIELD_KINDS,
     FIELD_LISTS,
     FIELDS_IN_LISTS,
+    GLASS,
     INVERSE,
     NOTE_PIECE,
     POWERS,
+    ROWS,
+    SIZE,
     SYSTEM_APERTURES,
-    Sections,
+    TEXT,
     SurfaceType,
+    ValueRow,
     aperture_keywords,
     in_millimetres,
     poses_are_parameters,
-    sections,
     spelled_inverse,
     type_of,
     types,
@@ -71,7 +68,6 @@ from raytrace.materials.glass import Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Operand, count, same, with_operands
 from raytrace.system.lens import Lens
-from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed
 
@@ -97,8 +93,7 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        ruled = with_rules(_surface(lens, number, surface, place), lens, number, place)
-        lines += _with_pickups(ruled, lens, number, place)
+        lines += with_rules(_surface(lens, number, surface, place), lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -168,25 +163,24 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
     kind = _type(surface, place)
-    curvature = exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":
         semi_diameter = float(lens.aperture.value)
-    size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, 'semi-diameter', place)} 1"
+    size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, ROWS['SDIA'].quantity, place)} 1"
     # an aperture that follows the semi-diameter from one configuration to the next
     followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
-    posed = () if kind == "COORDBRK" or poses_are_parameters(surface) else ((1, surface.before), (2, surface.after))
+    posed = () if kind == "COORDBRK" or poses_are_parameters(surface) else ((1, "before"), (2, "after"))
     comment = one_line(surface.comment, "the comment", place)
     return [
         f"SURF {number}",
         *(["  STOP"] if number == lens.stop else []),
         f"  TYPE {kind}",
-        *(f"  SCBD {side} {_pose(pose, place)}" for side, pose in posed if pose is not None),
-        f'  CURV {curvature} 0 0 0 0 ""',
+        *(f"  SCBD {side} {_pose(surface, name, place)}" for side, name in posed if getattr(surface, name) is not None),
+        f'  CURV {ROWS["CRVT"].write(surface, place)} 0 0 0 0 ""',
         *_numbers(surface, types()[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
-        *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
+        *([] if surface.conic is None else [f"  CONI {ROWS['CONN'].write(surface, place)}"]),
         f'  DIAM {size} 0 0 1 ""',
         *_apertures(surface.apertures, place, ("surfaces", number, "apertures") in followed),
         *([f"  COMM {comment}"] if comment else []),
@@ -246,13 +240,13 @@ def _numbers(surface: Surface, row: SurfaceType, place: Place) -> list[str]:
     return lines + [f'  XDAT {i} {text} 0 0 1.0 0.0 0 ""' for i, text in enumerate(data, 1)]
 
 
-def _pose(pose: Pose, place: Place) -> str:
-    """Order, decentres and tilts of an SCBD line."""
+def _pose(surface: Surface, name: str, place: Place) -> str:
+    """Order, decentres and tilts of an SCBD line, of the pose `before` or `after` a surface."""
+    pose = getattr(surface, name)
     if pose.z is not None:
         message = "a decentre along z; add it to the thickness before; a .zmx file cannot hold it"
         raise LensFileError(message, place)
-    values = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
-    numbers = (exact(value, "tilt or decentre", place) for value in values)
+    numbers = (row.write(surface, place) for row in ROWS.values() if row.path.startswith(f"{name}."))
     return " ".join([str(int(pose.tilts_first)), "0", *numbers])
 
 
@@ -286,7 +280,7 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place, floats: bool) -> l
     keyword = "FLAP" if floats else shape.zemax[aperture.obscures]
     lines = [f"  {keyword} {' '.join(sizes)} 0"] if shape.sizes else [f"  {keyword} 0 0 0", *_corners(sizes, place)]
     if any(aperture.centre):
-        x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)
+        x, y = (exact(number, ROWS["APDX"].quantity, place) for number in aperture.centre)
         lines.append(f"  OBDC {x} {y}")
     return lines
 
@@ -383,20 +377,21 @@ def in_file(word: str, power: int | None, millimetres: float) -> str:
 
 
 def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> list[str]:
-    """MNUM and a line for every operand in every configuration.
+    """MNUM and a line for every operand in every configuration, by the row of its value.
 
-    The value of an operand is its word in the file of the lens in that configuration.
-    body: the lines of system and surfaces of a lens. Raises LensFileError for operands that the lines cannot give.
+    body: the lines of system and surfaces of a lens. Raises LensFileError for operands that the lines cannot give, and
+    for a configuration that a file cannot hold.
     """
     original, lens, place = lens, with_environments(lens, Place(file)), Place(file)
     if not lens.operands:
         return ["MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
     numbers = range(1, count(lens.operands) + 1)
-    texts = [sections("\n".join(body(with_operands(lens, k))) + "\n", file, Draft(file, "zmx")) for k in numbers]
+    for k in numbers:
+        body(with_operands(lens, k))  # refuses what no file holds
     lines = [f"MNUM {len(numbers)} {lens.current_configuration}"]
     rules = statuses(original, lens.operands)
     for position, operand in enumerate(lens.operands):
-        values = [_value(operand, k, texts[k - 1], place) for k in numbers]
+        values = [_value(operand, k, lens, place) for k in range(len(numbers))]
         names = [value.upper() for value in values] if operand.media else []
         for k, name in enumerate(names):  # a file identifies glasses by their names, model glasses too
             if not same(operand.media[k], operand.media[names.index(name)]):
@@ -412,43 +407,33 @@ def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> 
     return lines
 
 
-def _value(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
-    """The value of an operand: the word in the file of its configuration, or its own where it has none there."""
-    if operand.paths and operand.name in ROWS and not is_of_surfaces(operand):
-        record = Record(operand.name, (), "", place)
-        cell = Cell(operand.name, operand.number, operand.parameter, configuration, "", record)
-        word = word_of(text, cell)
-        if word is not None:
-            return repr(FAR) if is_infinite(word) else word.replace('"', "'")
+def _value(operand: Operand, k: int, lens: Lens, place: Place) -> str:
+    """The value of an operand in configuration k, from 0, in the unit of the file."""
+    row = ROWS.get(operand.name) if operand.paths else None
     if operand.numbers is not None:
-        return exact(operand.numbers[configuration - 1], str(operand), place)
-    return one_line(str(operand.values()[configuration - 1]), str(operand), place).replace('"', "'")
+        number = operand.numbers[k]
+        if operand.name == "THIC" and operand.number == 0 and number.ndim == 0 and float(number) == math.inf:
+            return repr(FAR)
+        text = exact(number, str(operand), place)
+        return text if row is None else _in_file_unit(text, operand, row, lens)
+    content = operand.values()[k]
+    if row is None:
+        return one_line(str(content), str(operand), place).replace('"', "'")
+    if row.kind == GLASS:
+        line = _glass(operand.media[k], place)
+        return line[0].split()[row.word] if line else ""
+    if row.kind == SIZE:
+        return "0" if content is None else _in_file_unit(exact(content, str(operand), place), operand, row, lens)
+    if row.kind == AIMING and content in AIMINGS:
+        content = AIMINGS.index(content)
+    return one_line(str(content if row.kind in (AIMING, TEXT) else int(content)), str(operand), place).replace('"', "'")
 
 
-def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> list[str]:
-    """The lines of a surface with the pickups by which it follows operands of other surfaces.
-
-    Raises LensFileError for a pickup that a .zmx file is not known to have.
-    """
-    for operand in lens.operands:
-        first = operand.paths[0].path if operand.paths else ()
-        for path, factor, offset in operand.paths[1:]:
-            if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
-                continue
-            name = "PRAM" if operand.name.startswith("PAR") else operand.name
-            if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
-                raise LensFileError(f"follows {operand} by a rule that is not written", place)
-            start = {"PRAM": f"PPAR {operand.parameter}", "THIC": "PZUP", "CRVT": "CURV", "GLSS": "GLAS"}[name]
-            line = next((line.split() for line in lines if f"{line} ".startswith(f"  {start} ")), [])
-            if name in ("PRAM", "THIC"):
-                if not line:  # else a solve of the surface itself is written already
-                    lines = [*lines, f"  {start} {operand.number} {factor!r} {offset!r} 0"]
-            elif line[2:3] not in (["0"], ["1"], []):
-                continue
-            elif name == "GLSS":
-                lines = changed(with_glass_line(lines), "GLAS", {2: "2", 3: str(operand.number)})
-            elif offset:
-                raise LensFileError(f"follows {operand} with an offset, which is not written", place)
-            else:
-                lines = changed(lines, "CURV", {2: "4", 3: str(operand.number), 4: repr(factor), 5: "0"})
-    return lines
+def _in_file_unit(text: str, operand: Operand, row: ValueRow, lens: Lens) -> str:
+    """A number of an operand in powers of mm as the file has it."""
+    unit, power = 1.0 if lens.optimization_data is None else lens.optimization_data.unit, power_of(row, lens)
+    if not row.path:
+        parameter = int(operand.name[3]) if operand.name[:3] == "PAR" else operand.parameter
+        power = types()[type_of(lens.surfaces[operand.number])].power(row.keyword, parameter)
+        text = spelled_inverse(float(text)) if power is INVERSE else text
+    return text if unit == 1 or power == 0 else in_file(text, power, unit)

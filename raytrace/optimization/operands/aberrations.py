@@ -11,10 +11,17 @@ import torch
 
 from raytrace.analysis.chief import NEAR_AXIS, NEAR_CHIEF, focus_of_close_rays, relative_error
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
-from raytrace.maths.dual import value_of
-from raytrace.maths.numerics import dot_2
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
-from raytrace.optimization.lens_state import LensState, listed
+from raytrace.maths.numerics import dot_2, value_of
+from raytrace.optimization.lens_state import LensState, largest_field, listed
+from raytrace.optimization.operands.operand import (
+    BadRow,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Planner,
+    RowValues,
+)
 from raytrace.optimization.operands.paraxial import (
     along,
     chief_ray_of,
@@ -23,10 +30,9 @@ from raytrace.optimization.operands.paraxial import (
     per_row,
 )
 from raytrace.optimization.operands.rays import known
-from raytrace.optimization.ray_bundle import largest_field
 from raytrace.system.surface import is_even, ynu
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import vignette
+from raytrace.tracing.trace import is_bent
 
 _FIELDS = 30  # of the fit of f θ
 

@@ -6,12 +6,12 @@ weights. A row without a number, as the root of a negative one, is nan and count
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, value_of
-from raytrace.optimization.context import (
+from raytrace.maths.numerics import Dual, value_of
+from raytrace.optimization.lens_state import listed
+from raytrace.optimization.operands.operand import (
     SETTINGS,
     BadRow,
     Evaluate,
@@ -21,12 +21,7 @@ from raytrace.optimization.context import (
     Planner,
     RowValues,
 )
-from raytrace.optimization.lens_state import listed
 from raytrace.system.optimization_data import Row
-
-
-class Circle(ValueError):
-    """Rows that take values of one another in a circle."""
 
 
 def _row(line: Line, number: int, rows: Sequence[Row]) -> int:
@@ -56,20 +51,6 @@ def _range(line: Line, rows: Sequence[Row]) -> list[int]:
     if not numbers:
         raise BadRow(line, f"takes the values of rows {first} to {last}: none of them has one")
     return numbers
-
-
-def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
-    """Rows of arithmetic, each after those that it takes values of. Raises Circle.
-
-    referred: the rows whose values each takes, by its own number.
-    """
-    try:
-        return [row for row in TopologicalSorter(referred).static_order() if row in referred]
-    except CycleError as error:
-        circle = " → ".join(map(str, reversed(error.args[1])))
-        raise Circle(
-            f"rows {circle} of the merit function take values of one another in a circle: no row may wait for itself"
-        ) from None
 
 
 def _operand(function: Callable, refers: Callable, text: str, convention: str = "", bounds: str = "") -> Operand:

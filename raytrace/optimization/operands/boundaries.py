@@ -12,10 +12,9 @@ import numpy as np
 import torch
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
-from raytrace.optimization.lens_state import ENDS, LensState, listed
-from raytrace.optimization.ray_bundle import Bundle, largest_field
+from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.optimization.lens_state import ENDS, Bundle, LensState, largest_field, listed
+from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.system.lens import media
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, medium_surfaces, sag_at

@@ -16,16 +16,15 @@ from torch import Tensor
 from raytrace.analysis.mtf import clear_circle, cutoff, mtf_on_grid
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.analysis.setting import scene_of
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner
-from raytrace.optimization.operands.custom import OrLost
+from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.optimization.lens_state import largest_field
+from raytrace.optimization.operands.operand import BadRow, Evaluate, EvaluationContext, Line, Operand, OrLost, Planner
 from raytrace.optimization.operands.paraxial import image_index, per_row
 from raytrace.optimization.operands.wavefront import beam_of, colours_of, rings, sphere_of
-from raytrace.optimization.ray_bundle import largest_field
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene
+from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere, towards_centre
 
 _MISSED = 0.02  # waves of RMS that the polynomials of a wave may leave

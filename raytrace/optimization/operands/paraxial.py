@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, quotient, value_of
-from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
-from raytrace.optimization.lens_state import LensState, listed
-from raytrace.optimization.operands.arguments import need
+from raytrace.maths.numerics import Dual, quotient, value_of
+from raytrace.optimization.lens_state import LensState, largest_field, listed
+from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues, need
 from raytrace.optimization.operands.rays import known
-from raytrace.optimization.ray_bundle import largest_field
 from raytrace.tracing.paraxial import chief_ray, petzval_sum
 
 _RIM = 32  # rays of the outline of a cone

@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.maths.numerics import dot, safe_sqrt
-from raytrace.optimization.context import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
-from raytrace.optimization.ray_bundle import Hits
+from raytrace.maths.numerics import Dual, dot, safe_sqrt, slope_of, value_of
+from raytrace.optimization.lens_state import Hits
+from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in

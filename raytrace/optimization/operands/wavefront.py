@@ -12,15 +12,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, Vector, slope_of, value_of
-from raytrace.maths.numerics import dot
-from raytrace.maths.pupil import gauss_rings, square
-from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Line, Operand, Planner, RowValues
+from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.sampling import gauss_rings, square
+from raytrace.optimization.lens_state import Hits
+from raytrace.optimization.operands.operand import (
+    BadRow,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Planner,
+    RowValues,
+)
 from raytrace.optimization.operands.paraxial import image_index, per_row
 from raytrace.optimization.operands.rays import known
-from raytrace.optimization.ray_bundle import Hits
-from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere
 
 

@@ -144,7 +144,7 @@ function drawSpots(target, now, stored) {
   const spots = now.spots;
   if (!spots) return empty(target, "spots", "no spots");
   const count = now.fields.length, width = target.clientWidth || 170;
-  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 40));
+  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 26));
   const half = 1.12 * Math.max(spots.half, Math.min(spots.airy ?? 0, 4 * spots.half), 1e-6);
   target.replaceChildren();
   now.fields.forEach((field, f) => {
@@ -163,10 +163,11 @@ function drawSpots(target, now, stored) {
       data.append(line(path, now.wavelength_colours[w], { "stroke-linecap": "round", "stroke-width": 1.5 }));
     });
     picture.append(data);
-    const name = make("div", { className: "caption", style: `color:${now.field_colours[f]}` }, make("b", { textContent: field }));
-    const caption = make("div", { className: "caption", "data-number": `rms-${f}`, "data-value": rms ?? "" , textContent: text });
-    if (before !== undefined) caption.append(make("span", { className: "was", textContent: ` (stored ${words(before, 3)})` }));
-    target.append(make("div", { className: "spot" }, name, picture, caption));
+    const name = make("b", { style: `color:${now.field_colours[f]}`, textContent: field });
+    const value = make("span", { "data-number": `rms-${f}`, "data-value": rms ?? "", textContent: ` ${text}` });
+    const caption = make("div", { className: "caption" }, name, value);
+    if (before !== undefined) caption.append(make("span", { className: "was", textContent: ` (${words(before, 3)})` }));
+    target.append(make("div", { className: "spot" }, caption, picture));
   });
   const bar = make("div", { className: "caption grey", textContent: `box ${words(2 * half, 3)} µm · Airy radius ${words(spots.airy, 3)} µm` });
   target.append(bar);
@@ -187,7 +188,7 @@ function drawFans(target, now, stored) {
       const last = f === rows - 1;
       const { at, up, curves } = axes(part, s ? (width - 34) / 2 : 34 + (width - 34) / 2, height, {
         x: [-1, 1], y: [-top, top], left: s ? 6 : 34, right: 3, top: 14, bottom: last ? 24 : 6,
-        ticksX: 0, ticksY: s ? 0 : 3, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
+        ticksX: 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
       });
       part.append(svg("line", { x1: at(0), x2: at(0), y1: 14, y2: height - (last ? 24 : 6), class: "zero" }), svg("line", { x1: at(-1), x2: at(1), y1: up(0), y2: up(0), class: "zero" }));
       if (stored && stored.fans && stored.fans[section][f]) stored.fans[section][f].forEach((values) => curves.append(line(curve(stored.fans.pupil, values, at, up), "var(--grey)", { "stroke-dasharray": "2 2" })));
@@ -298,7 +299,7 @@ class Viewer {
         make("span", { className: "group save" }, this.path, button("Save", "Write the lens; the suffix selects the format: .zmx .seq .len .csv …", () => this.save()), make("label", { title: "write over a file that exists" }, this.replace, " replace"))),
       this.message,
       make("div", { className: "columns" },
-        make("div", { className: "left" }, this.conditions, make("label", { className: "more" }, this.more, " all numbers (conic, asphere, tilt, semi-diameter)"), this.table, this.problems),
+        make("div", { className: "left" }, this.conditions, this.table, this.problems),
         make("div", { className: "right" },
           panel("layout", "Layout", this.fieldKey),
           this.paraxial,
@@ -508,6 +509,7 @@ class Viewer {
       this.show(input, shownAs(value), refused);
       vary.checked = lens.rows[surface].vary.includes(name);
       slider.hidden = value === null;
+      vary.hidden = value === null || surface === lens.rows.length - 1;
       if (value === null || slider.dataset.held) return;
       let known = range();
       const margin = known ? 0.02 * (known.high - known.low) : 0;
@@ -568,9 +570,9 @@ class Viewer {
     const parts = [
       field(`fields, ${lens.fields.unit}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
       field("wavelengths, µm", "wavelengths", { type: "wavelengths" }, (now) => now.wavelengths.map(typed).join(", ")),
-      make("label", {}, make("span", { textContent: "primary" }), primary),
       make("div", { className: "pair" }, kind, field("aperture", "aperture", { type: "aperture" }, (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)),
     ];
+    parts.push(make("label", {}, make("span", { textContent: "primary, µm" }), primary), make("label", { className: "more" }, this.more, " all numbers (conic, asphere, tilt, …)"));
     if (lens.configurations > 1) {
       const chosen = make("select", { "aria-label": "configuration", onchange: () => this.event({ type: "configuration", number: Number(chosen.value) }) }, ...Array.from({ length: lens.configurations }, (_, k) => make("option", { value: k + 1, textContent: k + 1 })));
       this.controls.push((now) => (chosen.value = now.configuration));

@@ -1,0 +1,36 @@
+"""Settings of the book: `python -m sphinx docs docs/_build/html` builds it; `-b linkcheck` checks external links."""
+
+import tomllib
+from pathlib import Path
+
+root = Path(__file__).parent
+
+project = "raytrace"
+release = tomllib.loads((root.parent / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "experiments"]
+nitpicky = False
+
+html_theme = "furo"
+html_title = "raytrace"
+html_show_copyright = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+
+myst_enable_extensions = ["deflist", "dollarmath", "attrs_block"]
+myst_heading_anchors = 4
+
+# Tutorials are executed by the build. Outputs are kept inside _build until the text of the tutorial changes.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(root / "_build" / ".notebooks")
+nb_execution_raise_on_error = True
+nb_execution_timeout = 60  # s per cell; tests/test_book.py limits the tutorial
+nb_execution_in_temp = True  # files that a tutorial writes stay out of docs/
+nb_merge_streams = True
+
+# Links between pages are checked by every build, external links by linkcheck.
+linkcheck_anchors = True
+linkcheck_timeout = 10
+linkcheck_retries = 1
+linkcheck_report_timeouts_as_broken = False

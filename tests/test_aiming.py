@@ -1,0 +1,167 @@
+"""Filling: rays are aimed where the axis bends in front of the stop, and a beam that misses the stop is reported."""
+
+import math
+import warnings
+
+import pytest
+import torch
+from problems import vector
+from test_launch import fisheye
+
+import raytrace as rt
+from raytrace.cli import build_parser
+from raytrace.cli.commands import COMMANDS
+from raytrace.io import FORMATS
+from raytrace.io.source import Place, decode
+from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
+from raytrace.tracing.trace import aiming_of, at_stop
+
+RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+
+
+def pose(**numbers):
+    return rt.Pose(**numbers)
+
+
+def off_axis_parabola(**how):
+    """The stop 50 mm off the axis of the mirror, in the plane of its focus."""
+    return rt.lens(
+        [
+            dict(radius=math.inf, thickness=100, before=pose(y=50.0), after=pose(y=-50.0)),
+            dict(radius=-200, conic=-1, thickness=-100, glass="MIRROR"),
+        ],
+        stop=1, entrance_pupil_diameter=20, fields=[0.3], **how,
+    )  # fmt: skip
+
+
+def test_every_verb_traces_the_beam_that_fills_a_decentred_stop():
+    lens, real = off_axis_parabola(), off_axis_parabola(ray_aiming="real")
+    assert lens.ray_aiming == "auto"
+    assert torch.equal(launch(lens, RIM).position, launch(real, RIM).position)
+    # 24.6 µm of coma and astigmatism; the beam about the axis of the mirror has 1.08 µm.
+    assert float(rt.spot(lens).rms_radius) == pytest.approx(0.0245941, abs=1e-6)
+    assert float(rt.spot(lens.at(ray_aiming="off")).rms_radius) == pytest.approx(0.0010765, abs=1e-6)
+    for verb in (rt.wavefront, rt.ray_fan):
+        assert str(verb(lens)) == str(verb(real)), verb
+    assert "auto: real" in str(rt.info(lens))
+
+
+@pytest.mark.parametrize(
+    ("rows", "stop", "aiming"),
+    [
+        ([dict(thickness=5.0), dict(radius=50, thickness=50)], 1, "off"),
+        ([dict(thickness=5.0, before=pose(tilt_x=3.0)), dict(radius=50, thickness=50)], 1, "real"),
+        ([dict(radius=50, thickness=5, before=pose(y=1.0)), dict(thickness=50)], 2, "real"),
+        ([dict(thickness=5.0, phase=rt.Grating(0.1, 1.0)), dict(thickness=50)], 2, "real"),
+        ([dict(thickness=5.0), dict(thickness=50, before=pose(tilt_x=3.0))], 1, "off"),
+    ],
+    ids=["straight", "tilted stop", "decentred lens", "grating", "bent behind the stop"],
+)
+def test_rays_are_aimed_where_the_axis_bends_in_front_of_the_stop(rows, stop, aiming):
+    lens = rt.lens(rows, stop=stop, entrance_pupil_diameter=2)
+    assert aiming_of(lens) == aiming
+    for mode in ("off", "paraxial", "real"):
+        assert aiming_of(lens.at(ray_aiming=mode)) == mode
+
+
+def test_the_miss_of_the_stop_is_that_of_traced_rays():
+    lens, fields = fisheye(), vector(0.0, 20.0, 40.0)
+    fields = torch.stack([0 * fields, fields])
+    found = filling(lens, fields)
+    aimed, plain = (launch(lens, RIM, fields=fields, ray_aiming=mode) for mode in ("real", "off"))
+    (ought, _), (at, _) = (at_stop(lens, rays, lens.primary) for rays in (aimed, plain))
+    missed = (at - ought).norm(dim=0)[:, 0] / found.radius
+    assert found.radius == pytest.approx(float(ought[1, 0, 0, 1].abs()), rel=1e-9)
+    assert torch.allclose(found.chief, missed[:, 0], atol=1e-9)
+    assert (found.marginal >= missed[:, 1:].amax(1) - 1e-9).all()
+    assert found.chief[0] < 1e-12 < TOLERANCE < found.chief[2]
+
+
+def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(capsys):
+    lens = fisheye()
+    with pytest.warns(UnfilledStop, match=r"field 40 degrees: rays miss the stop, .* chief ray by .* % of it from the "
+                      r"centre, marginal rays by .* \(1 of 2 fields .*`ray_aiming=real`") as warned:  # fmt: skip
+        rt.spot(lens, fields=[0, 40])
+    assert len(warned) == 1
+    for verb in (rt.layout, rt.ray_fan, rt.wavefront, rt.mtf, rt.psf, rt.trace, rt.focus, rt.relative_illumination):
+        with pytest.warns(UnfilledStop, match="field 40 degrees"):
+            verb(lens, fields=[40])
+    curvature = lens.surfaces[1].curvature.clone().requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UnfilledStop)
+        rt.spot(lens.at(ray_aiming="real"), fields=[0, 40])
+        rt.spot(lens, fields=[0, 40], ray_aiming="paraxial")
+        rt.spot(lens, fields=[0, 1])
+        rt.spot(lens.replace(1, curvature=curvature), fields=[0, 40])  # as in a loop of optimisation
+        rt.psf(lens, rt.Gaussian(order=3), fields=[40])
+        torch.func.vmap(lambda y: (warn_of_filling(lens, torch.stack([0 * y, y])[:, None]), y)[1])(vector(30.0, 40.0))
+    from raytrace.cli import main
+
+    assert main(["spot", "retrofocus", "--ray-aiming", "off"]) == 0
+    messages = [line for line in capsys.readouterr().err.splitlines() if "miss the stop" in line]
+    assert len(messages) == 1
+    assert "--ray-aiming real aims them" in messages[0]
+
+
+#: Commands that trace no rays of a lens whose aiming may be chosen.
+WITHOUT = {"check", "convert", "glass", "bench", "wave"}
+
+
+@pytest.mark.parametrize("command", [command.name for command in COMMANDS])
+def test_every_command_that_traces_takes_ray_aiming(command):
+    parser = next(a for a in build_parser()._actions if a.dest == "command").choices[command]
+    names = {option for action in parser._actions for option in action.option_strings}
+    assert ("--ray-aiming" in names) == (command not in WITHOUT), command
+
+
+def test_the_option_sets_the_lens(capsys):
+    from raytrace.cli import main
+
+    texts = []
+    for words in ([], ["--ray-aiming", "real"]):
+        assert main(["spot", "double_gauss", *words]) == 0
+        texts.append(capsys.readouterr().out.rstrip("\n"))
+    lens = rt.read_lens("double_gauss")
+    assert texts == [str(rt.spot(lens)), str(rt.spot(lens.at(ray_aiming="real")))]
+
+
+SEQUENCE = "RDM;LEN\nDIM M\nEPD 50\nWL 587.6;YAN 0\nSO 0 1e14\nS 60 20 700.500\nS -200 20\nS 0 60\nSTO\nSI 0 0\nGO\n"
+
+
+def test_the_entrance_pupil_of_a_sequence_is_that_of_the_real_beam_on_the_axis():
+    def read(text):
+        return FORMATS[".seq"].read(decode(text.encode(), Place("a.seq")), "a.seq")
+
+    lens, report = read(SEQUENCE)
+    assert lens.ray_aiming == "real"
+    rim = launch(lens, RIM).position[:2, 0, 0]
+    assert rim[1, 1].item() == pytest.approx(25.0, abs=1e-6)
+    assert launch(lens, RIM, ray_aiming="paraxial").position[1, 0, 0, 1].item() > 25.1  # of the paraxial stop
+    assert any("EPD holds on the axis" in note for note in report.notes)
+    lens, report = read(SEQUENCE.replace("GO\n", "!raytrace aiming paraxial\nGO\n"))
+    assert lens.ray_aiming == "paraxial"
+    assert not any("aiming" in note for note in report.notes)
+
+
+def test_check_says_which_aiming_and_which_primary_wavelength_are_taken(tmp_path):
+    straight = rt.lens(
+        [dict(radius=50, thickness=50)], stop=1, f_number=9, wavelengths=[0.5, 0.6], primary_wavelength=2
+    )
+    for name in ("a.csv", "a.zmx"):
+        rt.write_lens(straight, tmp_path / name)
+        said = str(rt.check(tmp_path / name))
+        assert "primary wavelength: number 2 of 2, 0.6 µm" in said
+        assert "ray aiming: auto (real where the axis bends in front of the stop" in said
+    rt.write_lens(off_axis_parabola(), tmp_path / "b.zmx")  # so that OpticStudio traces the same beam
+    assert rt.read_lens(tmp_path / "b.zmx").ray_aiming == "real"
+
+
+def test_derivatives_of_an_aimed_beam_are_finite_for_an_object_at_infinity():
+    """A stop that is tilted: the vergence of the object was 1/(inf · length), whose derivative was nan."""
+    tilt = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
+    lens = rt.lens(
+        [dict(thickness=5.0, before=pose(tilt_x=tilt)), dict(radius=50, thickness=100, glass="MIRROR")],
+        stop=1, entrance_pupil_diameter=2, fields=[1.0],
+    )  # fmt: skip
+    (slope,) = torch.autograd.grad(launch(lens, RIM).position.sum(), tilt)
+    assert slope.isfinite()

@@ -1,0 +1,110 @@
+"""The book: its notebooks run, are short, assert their figures, and mention only names and commands that exist."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import raytrace as rt
+from raytrace.cli import build_parser
+from raytrace.cli.commands import COMMANDS
+
+DOCS = Path(__file__).parents[1] / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
+PAGES = [
+    DOCS / "index.md",
+    *(page for name in ("start", "tutorials", "reference") for page in (DOCS / name).glob("*.md")),
+]
+CELL = re.compile(r"^```\{code-cell\} *\w*\n((?::.*\n)*)(.*?)^```$", re.M | re.S)
+NOTEBOOKS = [page for page in PAGES if CELL.search(page.read_text("utf-8"))]
+#: Seconds of a tutorial on two cores.
+BUDGET = 60
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(DOCS))
+
+
+def code(page: Path) -> str:
+    """The cells of a notebook, one program."""
+    return "\n".join(match[2] for match in CELL.finditer(page.read_text("utf-8")))
+
+
+def commands(page: Path) -> list[str]:
+    """The lines of the shell blocks of a page that call raytrace."""
+    blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [line.removeprefix("$ ") for line in lines if line.removeprefix("$ ").startswith("raytrace ")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", NOTEBOOKS, ids=name_of)
+def test_notebook_runs_within_its_time(page, tmp_path):
+    """A process of its own, in an empty folder, with two threads."""
+    path = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "2", "PYTHONPATH": path}
+    (tmp_path / "notebook.py").write_text(code(page), "utf-8")
+    began = time.perf_counter()
+    process = subprocess.run(
+        [sys.executable, "notebook.py"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=4 * BUDGET,
+    )
+    assert process.returncode == 0, process.stderr[-4000:]
+    assert time.perf_counter() - began < BUDGET
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=name_of)
+def test_tutorial_is_short_and_asserts_its_figures(page):
+    text = page.read_text("utf-8")
+    assert re.match(r"---\nfile_format: mystnb\nkernelspec:\n  name: python3\n---\n\n# \w", text)
+    assert len(text.splitlines()) <= 150
+    assert len(re.findall(r"^\s*assert ", code(page), re.M)) >= 3
+    compile(code(page), name_of(page), "exec")
+
+
+def test_tutorials_are_numbered_and_in_the_table_of_contents():
+    assert "\ntutorials/*\n" in (DOCS / "index.md").read_text("utf-8")
+    numbers = [page.name[:2] for page in TUTORIALS]
+    assert len(numbers) == len({*numbers})
+    assert all(re.match(r"\d\d_[a-z_]+\.md$", page.name) for page in TUTORIALS)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_names_and_commands_of_a_page_exist(page):
+    text = page.read_text("utf-8")
+    for name in re.findall(r"\brt\.([A-Za-z_]\w*)", text):
+        assert hasattr(rt, name), f"rt.{name}"
+    known = {command.name for command in COMMANDS}
+    for name in re.findall(r"`raytrace ([a-z][\w-]*)", text):
+        assert name in known, f"raytrace {name}"
+    for line in commands(page):
+        words = shlex.split(line, comments=True)
+        assert build_parser().parse_args(words[1:]).command == words[1], line
+
+
+@pytest.mark.slow
+def test_book_builds_without_warnings(tmp_path):
+    pytest.importorskip("myst_nb", reason="needs the extra [docs]")
+    pytest.importorskip("furo", reason="needs the extra [docs]")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "-q",
+        "-d",
+        str(tmp_path / "doctrees"),
+        str(DOCS),
+        str(tmp_path / "html"),
+    ]
+    process = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True, timeout=1800)
+    assert process.returncode == 0, process.stderr[-4000:]
