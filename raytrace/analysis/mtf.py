@@ -37,6 +37,7 @@ from raytrace.tracing.spot import image_rays, spot_of
 
 _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
+_LEAST_PHASE = 70.0  # radians along a pupil radius that the former integrate, see `rings_and_arms`
 _FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
 _NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
@@ -395,6 +396,11 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
     ]
     tangential, sagittal = (torch.cat(part) for part in zip(*parts, strict=True))
     return tangential, sagittal
+
+
+def least_reach(blur: float) -> float:
+    """The frequency in cycles/mm up to which the fewest rays give the MTF of spots of a radius `blur` mm."""
+    return _LEAST_PHASE / (2 * math.pi * blur) if blur > 0 else math.inf
 
 
 def _together(lens: Lens, pupil: tuple[Tensor, Tensor]) -> int:

@@ -604,7 +604,7 @@ COMMANDS = (
     _command(
         "view",
         "turn the numbers of a lens in a browser",
-        "Serve the viewer of a lens on 127.0.0.1: its prescription as a table with a slider on every number, and layout, "
+        "Serve the viewer of a lens on 127.0.0.1: its prescription as a table with a slider on every number, layout, "
         "spots, ray fans, MTF and field curves, redrawn while a slider is dragged; undo, optimise, compare, save. The "
         "address has a random token; nothing is written except by save. Ctrl-C ends it. Needs the extra: pip install "
         "'raytrace[view]'.",

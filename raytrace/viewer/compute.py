@@ -16,12 +16,12 @@ from torch import Tensor
 from raytrace.analysis.chief import field_curvature_of
 from raytrace.analysis.fans import ray_fan_of
 from raytrace.analysis.layout import draw_layout
-from raytrace.analysis.mtf import geometric_mtf, mtf, transfer
+from raytrace.analysis.mtf import geometric_mtf, least_reach, mtf, transfer
 from raytrace.analysis.setting import field_range
 from raytrace.analysis.spot_diagram import airy_radius, field_spots
 from raytrace.materials.glass import label
-from raytrace.maths.sampling import hexapolar
 from raytrace.maths.numerics import detached
+from raytrace.maths.sampling import hexapolar
 from raytrace.plotting import style
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Lens, field_label, field_points
 from raytrace.system.parameter_paths import number_at, parameter_paths
@@ -228,7 +228,7 @@ def _analyses(lens: Lens, fields: Tensor, highest: float, problems: list[str]) -
         "layout": lambda: layout_of(lens, fields),
         "spots": lambda: spots_of(lens, fields),
         "fans": lambda: fans_of(lens, fields),
-        "mtf": lambda: mtf_of(lens, fields, highest),
+        "mtf": lambda: mtf_of(lens, fields, min(highest, least_reach(1e-3 * found["spots"]["half"]))),
         "curvature": lambda: curvature_of(lens),
         "first_order": lambda: first_order_of(lens),
     }.items():
@@ -248,17 +248,21 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 
 
 def mtf_of_field(state: State, field: int) -> dict:
-    """The MTF of one of the shown fields, of diffraction where the library computes that."""
+    """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lens = _simple(state.lens)
         fields = shown_fields(lens)[:, field : field + 1]
         if not fields.shape[1]:
             return {"message": f"field {field}: this lens has fewer fields"}
+        found = {"field": field, "mtf": None}
+        whole = field_spots(lens, fields=shown_fields(lens), rings=1)[0]
+        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency:
+            return found  # of so large a blur diffraction shows nothing
         try:
-            return {"field": field, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
+            return {**found, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
         except (ValueError, RuntimeError):  # as `refresh` reports
-            return {"field": field, "mtf": None}
+            return found
 
 
 def remarks(state: State) -> list[str]:

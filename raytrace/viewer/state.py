@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.mtf import frequency_range
-from raytrace.optimization.default_merit import KINDS
-from raytrace.optimization.lens_model import Model
-from raytrace.optimization.variables import freedom, path_of
+from raytrace.optimization.merit import KINDS
+from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import APERTURE_KINDS, Lens, SystemAperture, check, field_points
@@ -34,9 +33,9 @@ class State:
     """What the viewer shows.
 
     lens, vary: the lens and its variables, words of the variable syntax; stored: the lens of the file, for comparison.
-    past, future: pairs (lens, vary), the latest last. merit: what is optimised, a key of `default_merit.KINDS` or ""
-    for the merit function of the file; frequency: the highest of the MTF, cycles/mm. compare: whether the stored lens
-    is drawn too; dragged: the number that a slider moves; message: why the last event changed nothing.
+    past, future: pairs (lens, vary), the latest last. merit: what is optimised, a key of `merit.KINDS` or "" for the
+    merit function of the file; frequency: the highest of the MTF, cycles/mm. compare: whether the stored lens is drawn
+    too; dragged: the number that a slider moves; message: why the last event changed nothing.
     """
 
     lens: Lens

@@ -202,12 +202,12 @@ function drawFans(target, now, stored) {
   });
 }
 
-function drawMtf(target, now, stored) {
+function drawMtf(target, now, stored, highest) {
   const found = now.mtf;
   if (!found) return empty(target, "mtf", "no MTF");
   const width = target.clientWidth || 300, height = target.clientHeight || 200;
   const picture = figure("mtf", "", width, height, `MTF (${found.transfer}) to ${words(found.frequency.at(-1))} cycles per mm`);
-  const { at, up, curves } = axes(picture, width, height, { x: [0, found.frequency.at(-1)], y: [0, 1], left: 30, xlabel: "cycles/mm", ticksY: 5 });
+  const { at, up, curves } = axes(picture, width, height, { x: [0, highest], y: [0, 1], left: 30, xlabel: "cycles/mm", ticksY: 5 });
   if (found.limit) curves.append(line(curve(found.frequency, found.limit, at, up), "var(--grey)", { "stroke-dasharray": "1 3" }));
   for (const [source, was] of [[stored && stored.mtf, true], [found, false]]) if (source) {
     ["tangential", "sagittal"].forEach((section, s) => source[section].forEach((values, f) => {
@@ -401,7 +401,7 @@ class Viewer {
     drawLayout(this.figures.layout, now, stored);
     drawSpots(this.figures.spots, now, stored);
     drawFans(this.figures.fans, now, stored);
-    drawMtf(this.figures.mtf, now, stored);
+    drawMtf(this.figures.mtf, now, stored, this.last.prescription.frequency);
     drawCurvature(this.figures.curvature, now, stored);
     this.transfer.textContent = now.mtf ? now.mtf.transfer : "";
     const key = (names, colours) => names.map((name, k) => make("span", { style: `--colour:${colours[k]}`, textContent: name }));
