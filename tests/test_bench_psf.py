@@ -14,16 +14,14 @@ from problems import plano_hyperbolic, scene_of, vector
 from scripts import script
 
 from raytrace.bench import psf as bench
-from raytrace.bench import psf_cases
 from raytrace.bench.figures import psf_figure
-from raytrace.bench.huygens import Sampling, clear_rings, direct_sum, moments, solid_angle
-from raytrace.bench.psf import PsfRow, gradient, measure, report, steps, truth_of, with_all_leaves
-from raytrace.bench.psf_cases import Case, Method, cases
+from raytrace.bench.psf import Case, Method, PsfRow, cases, gradient, measure, report, steps, truth_of, with_all_leaves
 from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.sampling import grid
 from raytrace.psf_models import MODELS, drt, wave
+from raytrace.psf_models.direct_sum import Sampling, clear_rings, direct_sum, moments, sampling_of, solid_angle
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture
 
@@ -65,8 +63,7 @@ def test_direct_sum_is_the_wave_models_limit():
     s = scene_of(lens, 7.0, 25e3)
     window = grid(0.01, 3, moments(s, 16, 64)[0])
     found = wave.kernels(s, window, order=1)
-    rings, arms, nodes = bench.wave_sampling(s, window)
-    kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
+    kernel, _ = direct_sum(s, window, sampling_of(s, window).scaled(1.0, 1))
     assert kernel.sum() > 0.3
     assert bench.relative_l1(found.kernel[0, 0, 0], kernel) < min(1e-3, float(found.residual) + 1e-5)
 
@@ -116,7 +113,7 @@ def test_usual_cases_and_others():
     assert math.isinf(found[2].distance)
     for case in found[2:]:
         sigma = float(moments(case.scene, 8, 32)[1].sqrt().max())
-        assert 7 * sigma <= psf_cases.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
+        assert 7 * sigma <= bench.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
 
 
 def test_gradients_are_by_all_that_is_modelled():
@@ -216,7 +213,7 @@ def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monke
     monkeypatch.setattr(extended, "direct_sum", direct_sum)
     monkeypatch.setattr(extended, "clock", lambda threads: lambda: now[0])
     kernels, windows = {"wave": ones}, {"wave": case.window(vector(0.0, 0.0))}
-    truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), rings=40, arms=160, nodes=4)
+    truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), Sampling(40, 160, 4))
     *rings, coarse, fine, far = extended.direct_rows(truth, 1)
     assert [line.model for line in rings] == ["direct sum, rings"] * 3
     assert (coarse.rays, fine.rays, far.extrapolated) == (64**2, 96**2, True)
@@ -227,13 +224,13 @@ def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monke
 @pytest.fixture
 def few(monkeypatch):
     """One coarse order of each model and small direct sums."""
-    monkeypatch.setattr(psf_cases, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
-    monkeypatch.setattr(psf_cases, "_TOLERANCES", {"fourier": (0.01,)})
+    monkeypatch.setattr(bench, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
+    monkeypatch.setattr(bench, "_TOLERANCES", {"fourier": (0.01,)})
     monkeypatch.setattr(bench, "_FINEST_WAVE", 1)
     monkeypatch.setattr(extended, "PILOT", 20_000)
     monkeypatch.setattr(extended, "PATIENCE", 0.05)
     monkeypatch.setattr(extended, "SQUARE", (16, 24))
-    monkeypatch.setattr(psf_cases, "PIXELS", 7)
+    monkeypatch.setattr(bench, "PIXELS", 7)
 
 
 def test_command_writes_everything(few, tmp_path, capsys):
@@ -263,7 +260,7 @@ def test_progress_adds_up_and_refusals_are_reported(few, monkeypatch):
     def refuse(*arguments):
         raise ValueError("too steep")
 
-    monkeypatch.setattr(bench, "direct_sum", refuse)
+    monkeypatch.setattr(bench.direct_sum, "reference", refuse)
     case = Case(plano_hyperbolic(diameter=1.0), "stigmatic", 0.0, math.inf, 0.005)
     done, said = [], []
     rows = measure([case], repeats=1, threads=1, progress=done.append, say=said.append)

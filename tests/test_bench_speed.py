@@ -14,17 +14,9 @@ from scripts import script
 from raytrace.bench import measure as timing
 from raytrace.bench import speed
 from raytrace.bench.figures import speed_figure
-from raytrace.bench.measure import (
-    Own,
-    errors_of,
-    field_rays,
-    in_turns,
-    leaves_of,
-    slope,
-    squared_radius,
-)
+from raytrace.bench.measure import Own, Row, errors_of, field_rays, in_turns, leaves_of, squared_radius
 from raytrace.bench.report import Measured
-from raytrace.bench.speed import STAGES, Bench, Row, Sizes, document, measure, three_aspheres, with_sensor_leaf
+from raytrace.bench.speed import STAGES, Bench, Sizes, document, measure, slope, three_aspheres, with_sensor_leaf
 from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
@@ -338,7 +330,7 @@ def test_targets_are_judged_on_the_right_side():
 
 
 def test_document_has_speeds_by_entrant_in_millions():
-    row = Row("raytrace", "float32", "forward", 64, 1e-3, 5e6, 1.0, None)
+    row = Row("raytrace", "float32", "forward", False, 64, 64, 1e-3, 1e-3, 5e6, 1.0, None, None)
     found = document([row], {"float32": {"two_process_gain": math.inf, "bytes_per_ray": 64.0}})
     assert found["float32"]["millions_per_second"] == {"forward": {"raytrace": {"64": 5.0}}}
     assert found["float32"]["two_process_gain"] is None

@@ -1,6 +1,7 @@
 """The forms of the command line: one name, one meaning over all commands; several values; what was meant."""
 
 import argparse
+import inspect
 import io
 import json
 import math
@@ -13,10 +14,13 @@ import pandas
 import pytest
 import torch
 
+import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
-from raytrace.cli.options import PICTURES, picture_file
+from raytrace.cli.commands import COMMANDS
+from raytrace.cli.parameters import entries, parameters_of
 from raytrace.cli.run import find_lens
+from raytrace.cli.types import PICTURES, picture_file
 from raytrace.io import read_lens
 from raytrace.maths.sampling import hexapolar
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
@@ -310,3 +314,46 @@ def test_axes_do_not_magnify_rounding(tmp_path):
     assert not off_axis.plot().axes[0].texts
     off_line = distortion(lens, fields=[(0, 1), (1, 0)])
     assert off_line.plot().axes[0].lines[0].get_marker() == "o"  # few fields: points are seen
+
+
+# -- options from signatures ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", [command.name for command in COMMANDS if command.verb in rt.PUBLIC])
+def test_parameters_read_from_the_source_are_those_of_the_function(command):
+    verb = command.replace("-", "_")
+    expected, read = inspect.signature(getattr(rt, verb)).parameters, parameters_of(verb)
+    assert [*read] == [*expected]
+    for name, parameter in read.items():
+        if parameter.default is not None:  # one that is no constant in the source is not read
+            assert parameter.default == expected[name].default
+
+
+def test_entries_of_a_docstring_are_help_texts():
+    text = """A sum.
+
+    first, second: numbers, of `first` more
+    often. The rest is no help. third: "a" or "b";
+    fourth: mm."""
+    assert entries(inspect.cleandoc(text), ["first", "second", "third", "fourth"]) == {
+        **dict.fromkeys(("first", "second"), "numbers, of --first more often"),
+        "third": "a or b",
+        "fourth": "mm",
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_option_has_a_help_text(command):
+    parser = argparse.ArgumentParser(add_help=False)
+    command.add_arguments(parser)
+    assert all(action.help for action in parser._actions if not isinstance(action, argparse._SubParsersAction))
+
+
+def test_options_of_other_commands_are_not_built():
+    def count(parser):
+        (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+        return {name: len(child._actions) for name, child in commands.choices.items()}
+
+    every, one = count(build_parser()), count(build_parser("mtf"))
+    assert one["mtf"] == every["mtf"] > 10
+    assert {name for name, number in one.items() if number > 1} == {"mtf"}

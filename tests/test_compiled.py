@@ -323,9 +323,7 @@ def test_rays_that_change_before_the_first_surface_are_pushed_on(with_path):
     for one, other in zip(found, by_torch, strict=True):
         assert one is other or torch.allclose(one.double(), other.double(), rtol=1e-10, atol=1e-10)
     step = 1e-6
-    own, between, gap = with_numbers(
-        task.structure, surfaces, (table + step * changes[1]).reshape(3, 2, 1, -1).unbind(-1)
-    )
+    own, between, gap = with_numbers(task.structure, surfaces, table + step * changes[1], (3, 2))
     moved = Rays(position + step * start[0][:, 1], direction + step * start[1][:, 1], task.valid, rays.opl)
     end = trace_surfaces(own, moved, indices=between, gap=gap)
     assert_close((end.position - found.position)[:2] / step, found.by_position[:2, 1], rtol=1e-4, atol=1e-3)

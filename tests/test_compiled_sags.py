@@ -12,8 +12,16 @@ from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.numerics import to
 from raytrace.system.rays import Rays
-from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
-from raytrace.system.shapes import SAG_TERMS
+from raytrace.system.sag_terms import (
+    SAG_TERMS,
+    FringeSag,
+    GridSag,
+    IrregularSag,
+    PolynomialSag,
+    PowerSag,
+    TiltSag,
+    ZernikeSag,
+)
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.trace import hit_jacobian, trace_surfaces

@@ -311,6 +311,22 @@ def test_pickups_are_followed_and_written_and_other_rules_left(name, tmp_path):
     assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
 
 
+def test_a_focal_length_that_is_picked_up_is_followed_by_its_reciprocal(tmp_path):
+    ideal = "TYPE PARAXIAL\nPARM 1 50\nPARM 2 1"
+    stop = "TYPE PARAXIAL\nPARM 1 150\nPARM 2 1\nPPAR 1 1 3 0 0"
+    text = file(tail=two("PRAM", 1, "50", "80", 1), surface=ideal, stop=stop)
+    text = text.replace("CURV 0.02", "CURV 0").replace("CURV -0.02", "CURV 0")
+    lens, report = read(text)
+    assert not any("not followed" in line for line in (*report.warnings, *report.notes))
+    powers = [float(one.surfaces[2].phase.power_y) for one in lens.configurations]
+    assert powers == pytest.approx([1 / 150, 1 / 240], rel=1e-15)
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
+    broken = text.replace("PPAR 1 1 3 0 0", "PPAR 1 1 2 50 0")  # with an offset the reciprocal is not proportional
+    with pytest.raises(ValueError, match="picked up by a rule that is not followed"):
+        read(broken)[0].configuration(2)
+
+
 def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
     tail = operands('MOFF 0 1 "far" 0 0', 'MOFF 0 2 "near" 0 0', "CWGT 0 1 1 0 0", "CWGT 0 2 2.5 0 0")
     lens = read(file(tail=tail))[0]

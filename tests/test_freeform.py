@@ -14,8 +14,8 @@ from raytrace.maths.bivariate import powers
 from raytrace.maths.numerics import to
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
-from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial
-from raytrace.system.shapes import KINDS, relief
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial, relief
+from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, sag_at, vertex_curvature, vertex_curvatures
 from raytrace.tracing.trace import trace_surfaces
 

@@ -21,14 +21,14 @@ from raytrace.io.source import LensFileError
 from raytrace.maths.numerics import value
 from raytrace.maths.sampling import gauss_rings, grid, sobol
 from raytrace.psf_models import psf
-from raytrace.system import shapes
+from raytrace.system import sag_terms, shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.parameter_paths import number_at, parameter_paths, with_number
 from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
-from raytrace.system.surface import sag, sag_at
+from raytrace.system.surface import sag, sag_and_derivatives, sag_at
 from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -107,7 +107,7 @@ def test_odd_asphere_is_its_formula_in_fifty_digits(engine):
 
 def test_slopes_are_the_derivatives_of_the_sag():
     u = vector(0.01, 0.5, 20.0).requires_grad_()
-    S, dS, d2S = shapes.sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
+    S, dS, d2S = sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
     (slope,) = torch.autograd.grad(S.sum(), u, create_graph=True)
     (bend,) = torch.autograd.grad(slope.sum(), u)
     assert_close(slope, dS, rtol=1e-13, atol=0)
@@ -241,8 +241,8 @@ def dome(u, coefficients, highest, along):
 def made_up(monkeypatch):
     kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
     monkeypatch.setitem(shapes.KINDS, "dome", kind)
-    ripple = shapes.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
-    monkeypatch.setitem(shapes.SAG_TERMS, "Ripple", ripple)
+    ripple = sag_terms.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
+    monkeypatch.setitem(sag_terms.SAG_TERMS, "Ripple", ripple)
 
 
 FACES = {

@@ -1,5 +1,7 @@
 """Fans: transverse ray aberration and OPD along the two principal sections of the pupil."""
 
+from typing import Literal
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -104,12 +106,13 @@ def opd_fan(
     fields: Points = None,
     wavelengths: Numbers = None,
     points: int = 41,
-    reference: str = "primary",
+    reference: Literal["primary", "own"] = "primary",
 ) -> Fan:
     """OPD in waves against the chief ray of each wavelength; arguments as for `ray_fan`.
 
-    reference: the sphere, "primary": about the point of the primary wavelength for all, so that lateral colour shows as
-    tilt and axial colour as defocus; "own": about each wavelength's own point, which takes lateral colour out.
+    points: rays across the pupil; reference: the sphere, "primary": about the point of the primary wavelength for all,
+    so that lateral colour shows as tilt and axial colour as defocus; "own": about each wavelength's own point, which
+    takes lateral colour out.
     """
     lens, fields = setting(lens, fields, wavelengths)
     front = _front(lens, fields, points, reference)

@@ -162,12 +162,13 @@ def mtf(
         OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              diffraction
         OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      geometric
 
-    geometric: True or False; by default diffraction, except for a field that would need more than 1280 points across
-    the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted to change by at most 1e-3
-    at every frequency: that field is geometric, as `by_rays` reports.
-    The wavelengths' OTFs add by weight and transmitted light, each at its own place on the sensor: lateral colour
-    counts. through_focus: mm by which the sensor moves to either side, of one frequency. fields: y or (x, y);
-    wavelengths: µm. Raises ValueError where too few rays arrive or the blur is too large.
+    geometric: of rays alone, or always of diffraction; by default of diffraction, except for a field that would need
+    more than 1280 points across the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted
+    to change by at most 1e-3 at every frequency: that field is geometric, as `by_rays` reports. The wavelengths' OTFs
+    add by weight and transmitted light, each at its own place on the sensor: lateral colour counts. frequencies:
+    cycles/mm, by default 41 from 0 to the resolution of the sharpest field, at most half of the diffraction cutoff;
+    through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
+    ValueError where too few rays arrive or the blur is too large.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)

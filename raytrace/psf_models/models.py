@@ -12,6 +12,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -210,10 +211,10 @@ def psf(
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
     grid: Grid | None = None,
-    center: str | None = None,
+    center: Literal["axis", "chief", "centroid"] | None = None,
     window: str = "follows",
     tol: float | None = None,
-    normalise: str = "energy",
+    normalise: Literal["energy", "window"] = "energy",
     per_wavelength: bool = False,
     execution: Execution | None = None,
 ) -> Psf:
