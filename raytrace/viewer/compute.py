@@ -257,7 +257,7 @@ def mtf_of_field(state: State, field: int) -> dict:
             return {"message": f"field {field}: this lens has fewer fields"}
         found = {"field": field, "mtf": None}
         whole = field_spots(lens, fields=shown_fields(lens), rings=1)[0]
-        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency:
+        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency / 3:
             return found  # of so large a blur diffraction shows nothing
         try:
             return {**found, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
