@@ -15,6 +15,6 @@ file_check        `check`: what was read of a lens file, and which operands are 
 
 A new operand is a function of an `EvaluationContext` and a row of the table at the end of its family's file; its test
 compares it with the analysis of the same quantity (`tests/test_operands_FAMILY.py`). Every number of a surface that
-`system.parameter_paths` lists can vary. Tests of the syntax of variables and constraints:
-`tests/test_variable_syntax.py`, `test_constraints.py`; of the descent: `test_optimize.py`, `test_attained.py`, `test_checkpoint.py`; `test_search.py`.
+`system.parameter_paths` lists can vary. Tests of variables and constraints: `tests/test_variable_syntax.py`,
+`test_constraints.py`; of the descent: `test_optimize.py`, `test_attained.py`, `test_checkpoint.py`; `test_search.py`.
 """
