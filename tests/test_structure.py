@@ -32,7 +32,7 @@ def helpers() -> dict[str, list[str]]:
 
 
 def test_no_two_test_files_define_the_same_helper():
-    """What two need stands in problems.py, or is a fixture of conftest.py."""
+    """A helper of two files is in problems.py, or a fixture in shared_fixtures.py."""
     for places in helpers().values():
         files = {place.partition(":")[0] for place in places}
         assert len(files) == 1, f"the same function in {places}"

@@ -13,6 +13,7 @@
 | wave            | the traced wavefront: diffraction with the true aberrations                                  |
 | radial          | rotationally symmetric light along one radius                                                |
 | dft             | sums of waves: matrix DFT, Bessel functions, Huygens                                         |
+| direct_sum      | the direct Huygens sum: converged kernels of waves, reference of the wave model              |
 | pupil_clearance | clear parts of a vignetted pupil                                                             |
 | figures         | figures of PSFs, the finely sampled light in them                                            |
 
@@ -20,7 +21,7 @@ To add a model: a module with `kernels(scene, grid, *, order) -> Kernels`, a cla
 in `models`; `psf`, the command and `rt.compare` read the row.
 
 Tests: tests/test_psf_MODULE.py; test_psf (the call), test_psf_laws (all models), test_psf_estimates (tolerances),
-test_psf_derivatives, test_psf_rays (independent rays), test_shards (processes), test_plot_psf (figures).
+test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_shards (processes), test_plot_psf.
 """
 
 from raytrace.psf_models.figures import CloseUp as CloseUp
