@@ -117,6 +117,8 @@ def walks() -> dict[str, Callable[[], object]]:
     camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet(), model="gaussian")
     pictures, distances = torch.rand(2, 84, 84), torch.tensor([2e4, 3e4], dtype=torch.float64)
     rays = rt.Rays(start, along, torch.ones(1, dtype=torch.bool))
+    rt.prepare()  # the compiled trace, whatever this machine has compiled before
+    camera(pictures, distances)  # the sampling is chosen at the first call
     psf, read_lens = rt.psf, rt.read_lens
     optimize, triplet = rt.optimize, rt.read_lens("cooke_triplet")
     return {

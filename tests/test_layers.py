@@ -86,9 +86,9 @@ def room(name: str) -> str:
 
 
 def floor(name: str) -> int:
-    """The floor of the room that a module stands in."""
+    """The layer of the package of a module."""
     if room(name) not in FLOORS:
-        pytest.fail(f"raytrace/{room(name)} stands on no floor: add it to FLOORS in {__file__}")
+        pytest.fail(f"raytrace/{room(name)} has no layer: add it to FLOORS in {__file__}")
     return FLOORS[room(name)]
 
 
@@ -153,13 +153,13 @@ def test_imports_inside_a_room_run_one_way(folder):
 
 
 def _folders(name: str, others: list[str]) -> list[str]:
-    """Folders whose __init__ an import runs on its way, but for those that the module stands in itself."""
+    """Folders whose __init__ an import runs, except the folders of the module itself."""
     found = [folder_of(other) for other in others if other in MODULES]
     return [folder for folder in found if folder and not name.startswith(f"{folder}.")]
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not COMMANDS.match(name)])
-def test_imports_stand_at_the_top_of_the_file(name):
+def test_imports_are_at_the_top_of_the_file(name):
     """An import inside a function, a condition or a class hides a dependency; commands alone defer them, for speed."""
     tree = parsed(MODULES[name])
     at_top = {id(node) for node in tree.body}

@@ -25,8 +25,8 @@ from raytrace.maths.sampling import Grid, grid
 from raytrace.pages import listing, milliseconds, yes
 from raytrace.psf_models import MODELS, NotConverged, Psf, direct_sum, drt, paraxial, psf
 from raytrace.psf_models.direct_sum import Sampling, moments, sampling_of
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
-from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.paraxial import first_order, largest_field

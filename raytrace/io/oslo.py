@@ -31,7 +31,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.io.assembly import LensDraft, assemble, listed_glass, pose_of
+from raytrace.io.assembly import BENT, ONWARD, RETURNED, LensDraft, assemble, listed_glass, poses_of
 from raytrace.io.source import (
     IGNORED,
     READ,
@@ -56,7 +56,7 @@ from raytrace.io.source import (
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
-from raytrace.system.poses import Pose, undone
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface, is_posed, medium_surfaces, power, signed, ynu
 
 # -- the commands -----------------------------------------------------------------------------------------------------
@@ -586,14 +586,13 @@ def _poses(commands: _Commands, unit: float) -> dict[str, Pose]:
         raise LensFileError(message, commands.last("DT").place)
     signs = {word: sign * (unit if word[0] == "D" else 1.0) for word, (_, sign) in _POSES.items()}
     numbers = {_POSES[word][0]: signs[word] * value for word, value in moved.items()}
-    before = pose_of(numbers, tilts_first=order == -1)
     if bend:
         mirror = commands.last("RFL", "RFH")
         if back or mirror is None or len(moved) != 1 or next(iter(moved)) not in ("TLA", "TLB"):
             message = "BEN is modelled on a mirror that is tilted by TLA or by TLB alone, and without RCO"
             raise UnsupportedSurface(message, bend.place)
-        return {"before": before, "after": Pose(tilt_x=before.tilt_x, tilt_y=before.tilt_y)}
-    return {"before": before, "after": undone(before)} if back else {"before": before}
+    axes = BENT if bend else RETURNED if back else ONWARD
+    return dict(zip(("before", "after"), poses_of(numbers, axes, tilts_first=order == -1), strict=True))
 
 
 #: Pickups: the sign of the number, and the commands of the same quantity.

@@ -28,7 +28,7 @@ _NAMES = re.compile(r"^[ \t]*NM[ \t]+(\S+)", re.MULTILINE)
 
 
 class CatalogError(ValueError):
-    """A glass catalog cannot be read: says file and line, what was found, what was expected and the likely fix."""
+    """A malformed glass catalog; the message has file and line, the text found, the text expected and a likely fix."""
 
 
 class CatalogWarning(UserWarning):
@@ -73,11 +73,11 @@ def read_text(path: str | Path) -> str:
 
 def decode(content: bytes, path: str | Path) -> str:
     """The text of a catalog's bytes; `path` is its place in messages. Raises CatalogError."""
-    path, found = Path(path), encoding(content)
+    path, codec = Path(path), encoding(content)
     try:
-        text = content.decode(found).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
+        text = content.decode(codec).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
     except UnicodeDecodeError as error:
-        raise CatalogError(f"{path}: damaged {found.upper()} text at byte {error.start}; cut off?") from error
+        raise CatalogError(f"{path}: damaged {codec.upper()} text at byte {error.start}; cut off?") from error
     binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
     if binary:
         line = text.count("\n", 0, binary.start()) + 1
@@ -90,7 +90,7 @@ class _Listing(Mapping):
 
     def __init__(self, text: str, catalog: str, path: Path):
         self._text, self._catalog, self._path = text, catalog, path
-        starts = [(found[1], found.start()) for found in _NAMES.finditer(text)]
+        starts = [(match[1], match.start()) for match in _NAMES.finditer(text)]
         ends = [start for _, start in starts[1:]] + [len(text)]
         self._places: dict[str, tuple[int, int]] = {}
         for (name, start), end in zip(starts, ends, strict=True):
@@ -168,7 +168,7 @@ def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tup
     """(line, keyword, rest) of every record, its lines counted from `first`.
 
     A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
-    status; what is neither is noted in `unknown` as word -> line.
+    status; the first words of other lines are noted in `unknown`, with their lines.
     """
     line_of_record, keyword, parts = 0, "", []
     for line, content in enumerate(re.split(r"\r\n|\r|\n", text), first):
@@ -214,15 +214,20 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     if len(coefficients) < count:
         found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
         raise _fault(path, line, found, expected, "is the line cut off?")
+    line_of_range, text = _only(block, "LD", name, path)
+    span = _numbers(text.split(), path, line_of_range)[:2]
+    if span != (0.0, 0.0) and (len(span) < 2 or not 0 < span[0] < span[1]):
+        expected = "the shortest and the longest wavelength in µm"
+        raise _fault(path, line_of_range, f"LD {text[:40]} for {name}", expected)
     comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
     listing = re.search(r"\balternatives: *([^;\n]+)", comment)
-    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
+    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # in catalogs, an unknown nd
     return Glass(
         name=name,
         formula=formula,
         coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
-        wavelength_range=_wavelength_range(block, name, path),
+        wavelength_range=None if span == (0.0, 0.0) else span,
         status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
@@ -230,21 +235,11 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         listed_name=name,
         comment=comment,
         records=tuple(
-            (keyword, _numbers(_told(keyword, text.split()), path, line, blanks=True))
+            (keyword, _numbers(_with_known(keyword, text.split()), path, line, blanks=True))
             for line, keyword, text in block
             if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
     )
-
-
-def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
-    line, text = _only(block, "LD", name, path)
-    numbers = _numbers(text.split(), path, line)[:2]
-    if numbers == (0.0, 0.0):
-        return None
-    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
-        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
-    return numbers
 
 
 def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
@@ -252,16 +247,16 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
 
     A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
     """
-    found = [(line, text) for line, key, text in block if key == keyword]
-    if not found:
+    records = [(line, text) for line, key, text in block if key == keyword]
+    if not records:
         raise _fault(path, block[-1][0], f"{name} without a {keyword} record", "one", "is the file cut off?")
-    if len(found) > 1:
+    if len(records) > 1:
         fix = "is the NM line of the next glass missing or misspelt?"
-        raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
-    return found[0]
+        raise _fault(path, records[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
+    return records[0]
 
 
-def _told(keyword: str, words: list[str]) -> list[str]:
+def _with_known(keyword: str, words: list[str]) -> list[str]:
     """The words of a record; a thermal coefficient that is not known is 0, as AGF has it, and its temperature 20 °C."""
     if keyword != "TD":
         return words

@@ -95,8 +95,8 @@ def find_glass(
     surface 2". Raises UnknownGlass, and CatalogError for a bad user catalog; warns AmbiguousGlass.
     """
     wanted = name.strip()
-    own = [load(path) for path in user_catalogs(user)]
-    for catalog in own:
+    of_user = [load(path) for path in user_catalogs(user)]
+    for catalog in of_user:
         glass = catalog.find(wanted)
         if glass:
             return replace(glass, name=name)
@@ -111,8 +111,8 @@ def find_glass(
     alias = aliases().get(wanted.upper())
     if alias:
         return replace(_shipped_glass(alias.glass, alias.catalog), name=name)
-    own += [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
-    raise UnknownGlass(name, where, _nearest(wanted, own), [*(catalog.name for catalog in own), *SHIPPED])
+    supplied = of_user + [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
+    raise UnknownGlass(name, where, _nearest(wanted, supplied), [*(catalog.name for catalog in supplied), *SHIPPED])
 
 
 def edition(glass: Glass) -> tuple[str, ...]:
@@ -125,8 +125,8 @@ def edition(glass: Glass) -> tuple[str, ...]:
     parts = [part.strip() for part in glass.comment.split(";")]
     sources = [part for part in parts if "sources agree" in part or "deviate by" in part]
     if not sources:
-        own = f": {glass.comment}" if glass.comment else " does not state its edition"
-        return (glass.catalog + own,)
+        edition = f": {glass.comment}" if glass.comment else " does not state its edition"
+        return (glass.catalog + edition,)
     newer = OLDER_EDITIONS.get((glass.catalog, glass.listed_name or glass.name))
     older = [f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}"] if newer else []
     return ("date not stated; " + "; ".join(sources), *older)
@@ -134,8 +134,8 @@ def edition(glass: Glass) -> tuple[str, ...]:
 
 def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()) -> tuple[str, ...]:
     """The catalog names of a lens file that are neither shipped nor the file name of a user catalog."""
-    own = {path.stem.upper() for path in user_catalogs(user)}
-    return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in own)
+    of_user = {path.stem.upper() for path in user_catalogs(user)}
+    return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in of_user)
 
 
 def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:

@@ -140,7 +140,7 @@ def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
 
 
 def charge(glass: Glass) -> float:
-    """By how much a merit counts more with a glass that its maker does not prefer, or that is dear."""
+    """Factor on the merit of a glass that its maker does not prefer, or that is expensive."""
     price = next((numbers[0] for keyword, numbers in glass.records if keyword == "OD" and numbers), 0.0)
     return STATUSES.get(glass.status, max(STATUSES.values())) * max(price, 1.0) ** _PRICE
 

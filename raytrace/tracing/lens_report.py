@@ -12,11 +12,11 @@ from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, media
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, is_round_about_axis, media
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
+from raytrace.system.surface import Surface, vertex_curvature
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
@@ -279,14 +279,9 @@ def _figures(lens: Lens) -> list[float]:
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 
-def _has_sections(lens: Lens) -> bool:
-    """Whether first-order data about the base ray differ from the straightened ones."""
-    return not all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
-
-
 def _base_ray_document(lens: Lens) -> dict:
     """(tangential, sagittal) of every figure, null for those that do not exist."""
-    if not _has_sections(lens):
+    if is_round_about_axis(lens):  # the sections agree with the straightened lens
         return {}
     base = base_ray(lens)
     figures = {name: numbers(getattr(base, name)) for _, name, _ in BASE_RAY_LINES}
@@ -295,7 +290,7 @@ def _base_ray_document(lens: Lens) -> dict:
 
 
 def _base_ray_lines(lens: Lens) -> list[str]:
-    if not _has_sections(lens):
+    if is_round_about_axis(lens):  # the sections agree with the straightened lens
         return []
     base = base_ray(lens)
     if not bool(base.valid):

@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_aperture, pose_of
+from raytrace.io.assembly import BENT, MOST_POINTS, ONWARD, LensDraft, assemble, clear_aperture, poses_of
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -38,6 +38,7 @@ from raytrace.io.codev.keywords import (
     LETTERS,
     MOST_TERMS,
     NANOMETRE,
+    POSE_TYPES,
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
@@ -67,7 +68,7 @@ from raytrace.materials.glass import AIR, MIRROR, Glass, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
 from raytrace.system.phases import RadialPhase
-from raytrace.system.poses import Pose, undone
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface, medium_surfaces, power, signed, ynu
 
 #: Millimetres in a unit of DIM.
@@ -445,19 +446,12 @@ def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
     for name, word in POSE_WORDS.items():
         factor = -1.0 if word in LEFT_HANDED else 1.0 if name.startswith("tilt") else unit
         numbers[name] = factor * block.number(word, "decentre or tilt")
-    pose, type_ = pose_of(numbers), block.last("POSE")
-    word = type_.keyword if type_ else ""
-    if pose is None or not word:
-        return pose, None
-    if word == "DAR":
-        return pose, undone(pose)
-    if word == "REV":
-        return None, undone(pose)
-    tilts = {name: value for name, value in numbers.items() if name.startswith("tilt") and value}
-    if len(tilts) > 1:
+    type_ = block.last("POSE")
+    axes = POSE_TYPES[type_.keyword] if type_ else ONWARD
+    if axes == BENT and sum(bool(value) for name, value in numbers.items() if name.startswith("tilt")) > 1:
         message = "BEN with tilts about several axes, to which CODE V adds one of its own, is not modelled"
         raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", type_.place)
-    return pose, pose_of(tilts)
+    return poses_of(numbers, axes)
 
 
 # -- apertures --------------------------------------------------------------------------------------------------------

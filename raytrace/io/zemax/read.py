@@ -81,9 +81,11 @@ def read(
         if parts.system.integer(keyword, quantity, 0, position):
             report.warn(message, parts.system.last(keyword).place)
     of_name = partial(medium, catalogs=came, user=catalogs, report=report.again())
-    file_as_stored = configurations.LensFile(parts, lens, unit, of_name)
-    lens, configured = configurations.read(file_as_stored, report, configuration)
-    lens = optimization.read(parts, lens, unit, configured, report)
+    typed = optimization.typed_surfaces(parts, lens, unit)
+    rules = optimization.rules_of(typed, report)
+    as_stored = configurations.LensFile(parts, lens, unit, typed, rules, of_name)
+    lens, configured = configurations.read(as_stored, report, configuration)
+    lens = optimization.read(parts, lens, typed, rules, configured, report)
     configurations.report_environment(parts, lens, report)
     return lens
 

@@ -597,12 +597,12 @@ class SurfaceType:
     def named(self, surface: Surface, numbers: Numbers) -> dict[str, tuple[str, int, Surface]]:
         """PARM or XDAT of every number of the lens that the type gives, by its name, and a surface that models it."""
         terms = 0 if numbers.terms is None else len(numbers.terms)
-        found: dict[str, tuple[str, int, Surface]] = {}
+        by_name: dict[str, tuple[str, int, Surface]] = {}
         for keyword, j in (*(("PARM", j) for j in self.parameters), *(("XDAT", FIRST_TERM + k) for k in range(terms))):
             names, like = self.names(surface, numbers, keyword, j)
             for number in names:
-                found.setdefault(number.name, (keyword, j, like))
-        return found
+                by_name.setdefault(number.name, (keyword, j, like))
+        return by_name
 
     def power(self, keyword: str, j: int) -> int | None:
         """The power of length in PARM j, or in XDAT j."""
