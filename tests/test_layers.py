@@ -37,6 +37,7 @@ FLOORS = {
     "wave_optics": 7,
     "optimization": 8,
     "imaging": 9,
+    "viewer": 10,
     # pages of experiments
     "experiments": 11,
     "cli": 12,
@@ -58,7 +59,7 @@ SHOWN_BY = {
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas")
+DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn")
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -228,9 +229,10 @@ DISTRIBUTIONS = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed."""
+    """But for those of `bench`, which measures what is installed; those of the viewer are its extra."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {re.match(r"[\w-]+", name)[0] for name in project["dependencies"]}
+    extra = project["optional-dependencies"]["view"]
+    declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extra)}
     library = (path for name, path in MODULES.items() if room(name) != "bench")
     roots = {name.split(".")[0] for path in library for name in imports(path)}
     others = roots - set(sys.stdlib_module_names) - {room(name) for name in MODULES} - {"raytrace"}
