@@ -1,4 +1,4 @@
-"""Filling: rays are aimed where the axis bends in front of the stop, and a beam that misses the stop is reported."""
+"""Ray aiming: rays fill the stop behind a folded axis, and a beam that misses the stop is reported."""
 
 import math
 import warnings
@@ -143,7 +143,7 @@ def test_the_entrance_pupil_of_a_sequence_is_that_of_the_real_beam_on_the_axis()
     assert not any("aiming" in note for note in report.notes)
 
 
-def test_check_says_which_aiming_and_which_primary_wavelength_are_taken(tmp_path):
+def test_check_reports_ray_aiming_and_primary_wavelength(tmp_path):
     straight = rt.lens(
         [dict(radius=50, thickness=50)], stop=1, f_number=9, wavelengths=[0.5, 0.6], primary_wavelength=2
     )

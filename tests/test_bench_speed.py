@@ -142,7 +142,7 @@ def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
     assert not bool(Limit(built, lens, dtype, safe=True, steps=0).trace(to(rays, dtype=dtype)).valid.all())
 
 
-def test_limits_refuse_what_they_do_not_know(built):
+def test_limits_refuse_unsupported_surfaces(built):
     for lens, safe in ((read_lens("hubble"), True), (three_aspheres(), False)):
         with pytest.raises(ValueError, match="know"):
             Limit(built, lens, torch.float64, safe=safe)
@@ -279,7 +279,7 @@ def test_ratios_are_those_of_the_speeds(measured):
         assert numbers["small_batch_ms"] == pytest.approx(1e3 * small_s)
 
 
-def test_accuracy_stands_beside_every_speed_of_the_tables(measured):
+def test_tables_have_the_accuracy_of_every_speed(measured):
     """nm on the image: rounding of float32 at 20 mm, and of float64."""
     rows, _ = measured
     bound = {"float32": 1e3, "float64": 1e-4}

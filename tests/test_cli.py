@@ -336,7 +336,7 @@ def test_bad_lens_files_are_refused_by_name(run, name):
 
 
 @pytest.mark.parametrize("name", ["missing.zmx", "folder.zmx", ".", "", "ü ñ/日.zmx"])
-def test_what_is_no_file_is_refused(run, name):
+def test_missing_files_are_refused(run, name):
     Path("folder.zmx").mkdir()
     for command in ("info", "check", "focus"):
         assert name in run(command, name).error
@@ -831,7 +831,7 @@ def test_a_spot_without_rays_is_a_dash_and_a_warning_says_where_they_end(run, ra
     assert [lost["rays"], lost["rms_radius_um"], lost["geometric_radius_um"]] == [0, None, None]
 
 
-def test_focus_tells_of_a_field_that_is_lost(run):
+def test_focus_reports_a_vignetted_field(run):
     both = run("focus", "cooke_triplet", "--field", 0, 80, "--json")
     assert "field 80 degrees, 0.587562 µm: all 576 rays lost: missed surface 2" in both.err
     assert both.document["sensor_after"] == run("focus", "cooke_triplet", "--json").document["sensor_after"]
@@ -996,7 +996,7 @@ def test_focus_without_a_focus_is_refused(run):
     assert "rays fail or are vignetted" in partly.err
 
 
-def test_a_virtual_image_is_said(run):
+def test_a_virtual_image_is_reported(run):
     """An object within the focal length of 100 mm: its image lies before the lens."""
     code, out, err = run("focus", "singlet", "--object-distance", "50", "--json")
     found = json.loads(out)
@@ -1080,7 +1080,7 @@ def test_a_write_that_fails_leaves_the_old_file(run, monkeypatch, arguments):
 @pytest.mark.parametrize(
     "arguments", [("trace", "double_gauss"), ("convert", "double_gauss"), ("focus", "double_gauss")]
 )
-def test_what_is_no_regular_file_is_never_replaced(run, arguments):
+def test_only_regular_files_are_replaced(run, arguments):
     """-o onto a device or a pipe must not turn it into a file."""
     pipe = Path("pipe.zmx")
     os.mkfifo(pipe)

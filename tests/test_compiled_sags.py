@@ -41,7 +41,7 @@ def drawn(count: int, size: float, seed: int = 3) -> torch.Tensor:
     return size * torch.randn(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-#: Each with what it stands in: indices before and behind. Steep enough for rays of `some_rays` to miss some of them.
+#: Surfaces between two media. Steep enough for rays of `some_rays` to miss some of them.
 FACES = {
     "toroid": freeform("toroidal", 1 / 14, -0.7, -1 / 11, 1e-3, -2e-5, 1e-7),
     "toroid of one curve": freeform("toroidal", 1 / 12, None, 1 / 9),
@@ -97,7 +97,7 @@ def test_rays_of_all_fates_are_traced_as_by_torch(name, dtype):
 @each
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
 @pytest.mark.parametrize("with_path", [True, False])
-def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
+def test_the_adjoint_equals_autograd(name, dtype, close, with_path):
     rays, given_surfaces = some_rays(dtype=dtype), to(systems(name), dtype=dtype)
     weights = torch.randn(7, 700, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
 
@@ -122,7 +122,7 @@ def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
 @pytest.mark.parametrize(
     ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
 )
-def test_the_tangents_are_those_of_torch(name, dtype, close):
+def test_the_tangents_equal_those_of_torch(name, dtype, close):
     rays = some_rays(200, dtype=dtype)
     surfaces, media, leaves = with_leaves(to(systems(name), dtype=dtype), indices(dtype))
     compiled, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=media))
@@ -196,7 +196,7 @@ def test_powers_are_the_sag_terms(name):
     assert bool((expected.z.abs() <= bound * (1 + 1e-12)).all())
 
 
-def test_what_stays_with_torch():
+def test_unsupported_surfaces_are_traced_by_torch():
     """Heights on a grid, terms of a degree whose powers would lose digits, odd bases, and powers that differ by ray."""
     faces = [
         departed(GridSag(torch.zeros(4, 4, dtype=torch.float64), scalar(5.0))),

@@ -85,7 +85,7 @@ def saved_alike(one, other) -> bool:
     return True
 
 
-#: An operand, its values, and the file saved in each of the configurations: (what stands there, what it becomes).
+#: An operand, its values, and the file saved in each of the configurations: (text of the file, its replacement).
 ASPHERE = "TYPE EVENASPH\nPARM 1 0\nPARM 2 1e-5"
 RAIM = "PWAV 2\nRAIM 0 0"
 CASES = {
@@ -176,7 +176,7 @@ def test_a_scanning_mirror_turns_the_light_by_twice_its_angle_and_its_pickup_tur
             assert saved_alike(one, other)
 
 
-def test_what_no_operand_names_is_shared_and_derivatives_reach_both():
+def test_numbers_without_an_operand_are_shared_by_configurations_with_derivatives():
     lens = read(file(tail=two("THIC", 1, "4", "5.5")))[0]
     values = lens.operands[0].numbers.clone().requires_grad_()
     curvature = lens.surfaces[2].curvature.clone().requires_grad_()
@@ -237,7 +237,7 @@ def test_a_configuration_that_is_not_there_is_refused():
         ("THIC 1 {} 1e{}99", "too large"),
     ],
 )
-def test_what_is_not_followed_is_reported_and_the_configuration_refused(line, said):
+def test_unsupported_operands_are_reported_and_the_configuration_refused(line, said):
     text = file(tail=operands(line.format(1, 0), line.format(2, 7)))
     lens, report = read(text)
     number = text.splitlines().index(line.format(1, 0)) + 1
@@ -276,7 +276,7 @@ def test_unknown_known_and_missing_operands_are_reported():
         assert piece in said
 
 
-def test_what_rays_are_solved_for_is_reported_where_operands_bend_them():
+def test_ray_solves_that_operands_change_are_reported():
     solved = {"stop": "MAZH 0 0"}
     text = file(tail=two("THIC", 1, "4", "5"), **solved)
     assert any(
@@ -335,7 +335,7 @@ def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
     assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
 
 
-def test_a_table_says_that_it_holds_one_configuration(tmp_path):
+def test_a_table_reports_that_it_holds_one_configuration(tmp_path):
     lens = read(file(tail=two("THIC", 1, "4", "5")))[0].configuration(2)
     with pytest.warns(LensFileWarning, match="other configurations, 2 in all"):
         write_lens(lens, tmp_path / "lens.csv")
@@ -380,7 +380,7 @@ def test_the_command_opens_any_configuration(zoom, capsys):
     assert "configuration 2" in capsys.readouterr().err
 
 
-def test_info_says_which_configuration_it_is(zoom, capsys):
+def test_info_prints_the_configuration(zoom, capsys):
     assert main(["info", "zoom.zmx", "--configuration", "2"]) == 0
     assert re.search(r"configuration +2 of 2\n", capsys.readouterr().out)
     assert main(["info", "zoom.zmx", "--json"]) == 0
@@ -390,7 +390,7 @@ def test_info_says_which_configuration_it_is(zoom, capsys):
     assert "configuration" not in capsys.readouterr().out
 
 
-def test_check_shows_what_differs(zoom, capsys):
+def test_check_lists_differences_between_configurations(zoom, capsys):
     assert main(["check", "zoom.zmx"]) == 0
     out = capsys.readouterr().out
     assert re.search(r"THIC 1 +4 +5\n", out)

@@ -1,4 +1,4 @@
-"""Words for readers: commands that the documentation quotes, columns and labels in the field's terms."""
+"""Documentation: quoted commands parse, and columns and labels use the terms of the field."""
 
 import argparse
 import contextlib

@@ -192,7 +192,7 @@ def test_index_warns_outside_the_range_and_names_glass_wavelength_and_range():
     assert n[1].item() == pytest.approx(3.895422492943524, rel=4 * ULP)  # mpmath
 
 
-def test_index_refuses_what_has_none_and_names_place_glass_wavelength_formula_and_range():
+def test_a_missing_index_is_refused_with_place_glass_wavelength_formula_and_range():
     with pytest.raises(InvalidIndex) as caught:
         check_wavelengths(BK7, [0.55, 10.0], where="a.zmx:31, surface 2")
     for part in ("a.zmx:31, surface 2", "N-BK7 (SCHOTT)", "at 10 µm", "sellmeier_1", "0.3 to 2.5 µm"):
@@ -202,7 +202,7 @@ def test_index_refuses_what_has_none_and_names_place_glass_wavelength_formula_an
             index(BK7, wrong)
 
 
-def test_inside_the_range_and_at_its_ends_nothing_is_said():
+def test_no_warning_inside_the_range_and_at_its_ends():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         index(BK7, float64([0.3, 0.55, 2.5]))
@@ -334,7 +334,7 @@ def test_model_glass_refuses_numbers_that_are_no_glass(numbers):
         model_glass(*numbers)
 
 
-def test_sellmeier_refuses_what_does_not_pair():
+def test_sellmeier_refuses_unpaired_coefficients():
     with pytest.raises(ValueError, match="as many strengths as poles"):
         sellmeier([1.0, 2.0], [0.01])
     assert sellmeier([1.0] * 4, [0.01] * 4).formula == "sellmeier_3"

@@ -37,6 +37,7 @@ FLOORS = {
     "wave_optics": 7,
     "optimization": 8,
     "imaging": 9,
+    "viewer": 10,
     # pages of experiments
     "experiments": 11,
     "cli": 12,
@@ -58,7 +59,7 @@ SHOWN_BY = {
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas")
+DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn")
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -86,9 +87,9 @@ def room(name: str) -> str:
 
 
 def floor(name: str) -> int:
-    """The floor of the room that a module stands in."""
+    """The layer of the package of a module."""
     if room(name) not in FLOORS:
-        pytest.fail(f"raytrace/{room(name)} stands on no floor: add it to FLOORS in {__file__}")
+        pytest.fail(f"raytrace/{room(name)} has no layer: add it to FLOORS in {__file__}")
     return FLOORS[room(name)]
 
 
@@ -153,13 +154,13 @@ def test_imports_inside_a_room_run_one_way(folder):
 
 
 def _folders(name: str, others: list[str]) -> list[str]:
-    """Folders whose __init__ an import runs on its way, but for those that the module stands in itself."""
+    """Folders whose __init__ an import runs, except the folders of the module itself."""
     found = [folder_of(other) for other in others if other in MODULES]
     return [folder for folder in found if folder and not name.startswith(f"{folder}.")]
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not COMMANDS.match(name)])
-def test_imports_stand_at_the_top_of_the_file(name):
+def test_imports_are_at_the_top_of_the_file(name):
     """An import inside a function, a condition or a class hides a dependency; commands alone defer them, for speed."""
     tree = parsed(MODULES[name])
     at_top = {id(node) for node in tree.body}
@@ -228,9 +229,10 @@ DISTRIBUTIONS = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed."""
+    """But for those of `bench`, which measures what is installed; those of the viewer are its extra."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {re.match(r"[\w-]+", name)[0] for name in project["dependencies"]}
+    extra = project["optional-dependencies"]["view"]
+    declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extra)}
     library = (path for name, path in MODULES.items() if room(name) != "bench")
     roots = {name.split(".")[0] for path in library for name in imports(path)}
     others = roots - set(sys.stdlib_module_names) - {room(name) for name in MODULES} - {"raytrace"}

@@ -274,7 +274,7 @@ def test_an_archive_is_no_npy_and_a_bomb_no_npz(tmp_path):
         read_npz(bytes(content))
 
 
-def test_arrays_come_back(tmp_path):
+def test_arrays_round_trip(tmp_path):
     given = {"heights": np.arange(6.0).reshape(2, 3), "by_columns": np.asfortranarray(np.eye(3, 2)), "glass": "PMMA"}
     np.savez_compressed(tmp_path / "a.npz", empty=np.zeros((0, 3)), **given)
     found = read_npz((tmp_path / "a.npz").read_bytes())

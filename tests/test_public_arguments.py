@@ -81,7 +81,7 @@ def test_a_path_and_a_lens_and_one_number_and_several_are_alike(verb, short, ful
 
 
 @pytest.mark.parametrize("verb", OF_A_LENS)
-def test_what_is_no_lens_is_refused(verb, singlet):
+def test_arguments_that_are_not_lenses_are_refused(verb, singlet):
     for wrong, said in ((None, "None"), (5, "5"), ([singlet], "a list"), (rt.info(singlet), "as its `lens`")):
         refused(TypeError, verb, said, lens=wrong)
     with pytest.raises((OSError, ValueError), match="no_such_lens"):
@@ -89,7 +89,7 @@ def test_what_is_no_lens_is_refused(verb, singlet):
 
 
 @pytest.mark.parametrize(("verb", "name"), OF_SEVERAL, ids=lambda value: str(value))
-def test_what_are_no_numbers_is_refused(verb, name, singlet):
+def test_arguments_that_are_not_numbers_are_refused(verb, name, singlet):
     lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
     refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: NAN})
     refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: [1, NAN]})

@@ -1,4 +1,4 @@
-"""README.md keeps its word: its commands are the ones that run, its examples work, its links and pictures exist."""
+"""README.md: its commands and examples run, its links and pictures exist."""
 
 import re
 import shlex

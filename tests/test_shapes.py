@@ -348,7 +348,7 @@ class TestWhatHasToKnow:
         ):
             plain.replace(1, kind="cone")
 
-    def test_files_hold_it_or_say_that_they_do_not(self, name, tmp_path):
+    def test_files_store_it_or_report_that_they_do_not(self, name, tmp_path):
         system = system_of(name)
         for suffix in (".zmx", ".csv"):
             path = tmp_path / f"{name}{suffix}"
@@ -378,7 +378,7 @@ class TestWhatHasToKnow:
 # ---------------------------------------------------------------- polygons
 
 SLIT = CORPUS / "zmx" / "Project_X__sc_slit.ZMX"
-#: A square ring of ±4 mm with a hole of ±2 mm and a triangle beside it, each closed.
+#: A square ring of ±4 mm with a hole of ±2 mm and a triangle outside it, each closed.
 CORNERS = (-4, -4, 4, -4, 4, 4, -4, 4, -4, -4, -2, -2, -2, 2, 2, 2, 2, -2, -2, -2, 6, 1, 8, 1, 7, 3, 6, 1)
 
 
@@ -397,7 +397,7 @@ def through(x, y):
 
 @both_engines
 @pytest.mark.parametrize("obscures", [False, True])
-def test_polygons_pass_what_lies_within_an_odd_number_of_them(engine, obscures):
+def test_polygons_pass_points_within_an_odd_number_of_them(engine, obscures):
     grid_of = torch.linspace(-9, 9, 73, dtype=torch.float64)  # corners and sides among them
     x, y = (part.reshape(-1) for part in torch.meshgrid(grid_of, grid_of, indexing="xy"))
     position = torch.stack([x, y, torch.zeros_like(x)])

@@ -20,7 +20,7 @@ FILES = sorted((DOCS / "elements").glob("*.npy"))
 SMOOTH = sorted(file for file in (DOCS / "elements").glob("*.json") if not file.stem.endswith(".npy"))
 
 
-def test_they_are_two_hundred_kilobytes_at_most_and_say_what_they_are():
+def test_elements_are_two_hundred_kilobytes_at_most_and_labelled():
     assert FILES
     assert SMOOTH
     assert sum(file.stat().st_size for file in (DOCS / "elements").iterdir()) <= 200_000

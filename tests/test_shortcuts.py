@@ -1,4 +1,4 @@
-"""Less work: reuse, planes, symmetry and shared parts give the same numbers as all of the work."""
+"""Shortcuts (reuse of rays, planes, symmetry, shared parts) give the same numbers as the full computation."""
 
 import dataclasses
 import functools
@@ -171,7 +171,7 @@ CASES = cases(64, 2)
 
 
 @pytest.mark.parametrize(("engine", "what", "less", "full"), CASES, ids=[f"{case[0]} {case[1]}" for case in CASES])
-def test_less_work_gives_the_same_result(engine, what, less, full):
+def test_a_shortcut_gives_the_same_result(engine, what, less, full):
     with trace_engine(engine):
         for _ in range(2):  # a Memo is filled by the first call
             a, b = less(), full()
@@ -181,7 +181,7 @@ def test_less_work_gives_the_same_result(engine, what, less, full):
 
 
 @pytest.mark.parametrize(("number", "again"), [(None, 1), (11, 2)])
-def test_memo_of_the_cases_traces_only_what_moves(number, again):
+def test_memo_of_the_cases_traces_only_changed_surfaces(number, again):
     """Surfaces crossed by a second call: the image alone, or also the last one before it."""
     lens, _ = with_sensor_leaf(double_gauss()) if number is None else of_last_radius(double_gauss())
     bundle = (

@@ -1,4 +1,4 @@
-"""Stores: records line by line, schemas, and damaged journals, outcomes and labels, each with one clear error."""
+"""Stores: records line by line, schemas, and clear errors for damaged journals, outcomes and labels."""
 
 import json
 import math
@@ -94,7 +94,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_a_schema_says_what_was_found_and_expected(words):
+def test_a_schema_reports_found_and_expected_values(words):
     check, value = REFUSED[words]
     with pytest.raises(Unfit) as error:
         check(value)
@@ -144,7 +144,7 @@ def test_many_damaged_lines_are_counted(tmp_path):
     assert "lines: 50 damaged lines in all" in str(said[-1].message)
 
 
-def test_what_cannot_be_appended_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+def test_a_failed_append_leaves_the_file_unchanged(tmp_path, monkeypatch):
     """A disk that is full in the middle of a record."""
     path = tmp_path / "lines"
     append_text(path, "1\n")
@@ -347,7 +347,7 @@ def test_files_of_a_run_are_no_pipes(tmp_path):
             read()
 
 
-def test_arrays_of_a_store_come_back_and_damaged_ones_are_refused(tmp_path):
+def test_arrays_of_a_store_round_trip_and_damaged_ones_are_refused(tmp_path):
     given = {"heights": np.arange(6.0).reshape(2, 3)}
     for compute in (lambda: given, None):
         found = Store(tmp_path, IDENTITY).arrays("a", compute)

@@ -41,7 +41,7 @@ def fit(folder, steps, *, every=5, seconds=60.0, stop_at=None, poison=None):
     return [p.detach().clone() for p in module.parameters()]
 
 
-def test_a_run_that_was_stopped_goes_on_bit_by_bit(tmp_path):
+def test_a_stopped_run_resumes_bit_identically(tmp_path):
     whole = fit(tmp_path / "whole", 23)
     for stop_at in (13, 4, 17):
         fit(tmp_path / "parts", 23, stop_at=stop_at)
@@ -65,7 +65,7 @@ def test_checkpoints_by_time_change_no_number(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):
+def test_a_killed_process_leaves_a_run_that_resumes(tmp_path):
     """kill -9 in the middle, twice; the end is that of a run that was never killed."""
     script = textwrap.dedent(f"""
         import sys, time

@@ -30,7 +30,7 @@ def test_comparing_values_is_identity_and_never_raises():
     assert len({one, other}) == 2
 
 
-def test_tree_holds_numbers_only_and_comes_back_whole():
+def test_tree_holds_numbers_only_and_is_rebuilt():
     lens = aspheric_singlet(name="asphere", notes=("a", "b"))
     leaves, structure = pytree.tree_flatten(lens)
     assert all(isinstance(leaf, torch.Tensor) for leaf in leaves)

@@ -192,7 +192,7 @@ def test_a_smooth_element_is_a_file_of_its_coefficients(run, tmp_path):
         assert words in err
 
 
-def test_what_is_dear_is_said_or_refused(run):
+def test_expensive_computations_are_reported_or_refused(run):
     """The cubic element at its full size: seconds where it was minutes; what no memory is left for is refused."""
     words = ("psf", "--element", "cubic", "--depth", "1000", "--wavelength", "0.55")
     code, out, err = run(*words, "--max-bytes", "10MB")

@@ -264,18 +264,19 @@ def field_spots(
     wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
     about: Tensor | None = None,
+    rings: int = _DOT_RINGS,
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
     The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
     weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
     `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
-    from where radii count, the centroid by default.
+    from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
     points, weights = with_rim(points, weights)
-    dots = even_hexapolar(_DOT_RINGS, dtype=dtype, device=device)
+    dots = even_hexapolar(rings, dtype=dtype, device=device)
     shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)

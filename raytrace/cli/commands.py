@@ -221,6 +221,21 @@ _WAVE_FIGURES = {
 }
 
 
+def _view(arguments: argparse.Namespace) -> None:
+    """The viewer until Ctrl-C."""
+    from raytrace.cli.progress import silence
+    from raytrace.cli.run import CommandError, find_lens, open_lens
+    from raytrace.viewer.server import MissingExtra, serve
+
+    path = find_lens(arguments.lens)
+    silence()
+    file = path if Path(arguments.lens).exists() else Path(path.name)
+    try:
+        serve(open_lens(arguments), file=file, port=arguments.port, browser=arguments.browser, as_json=arguments.json)
+    except MissingExtra as error:
+        raise CommandError(str(error)) from error
+
+
 def _wave_psf(arguments: argparse.Namespace):
     import raytrace
     from raytrace.cli.run import catalogs, options_of, printed_on_failure, say
@@ -456,6 +471,22 @@ COMMANDS = (
         zoom.zmx --configuration 2 --skip-unknown""",
         lens, conditions, *MERIT, plot("the contributions to the merit, by operand and field"),
         each="list every row, also the rays of one field",
+    ),
+    _command(
+        "view",
+        "turn the numbers of a lens in a browser",
+        "Serve the viewer of a lens on 127.0.0.1: its prescription as a table with a slider on every number, layout, "
+        "spots, ray fans, MTF and field curves, redrawn while a slider is dragged; undo, optimise, compare, save. The "
+        "address has a random token; nothing is written except by save. Ctrl-C ends it. Needs the extra: pip install "
+        "'raytrace[view]'.",
+        """
+        cooke_triplet
+        lens.zmx --port 8765 --no-browser""",
+        lens,
+        conditions,
+        option("--port", metavar="N", type=count, default=0, help="port of the server (default: a free one)"),
+        option("--no-browser", dest="browser", action="store_false", help="print the address, open no browser"),
+        run=_view,
     ),
     _command(
         "trace",

@@ -202,10 +202,15 @@ def arrivals(
 def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
     """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
     rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    return rays.position[:2, ..., 0], chief_arrives(lens, rays, fields, wavelengths)
+
+
+def chief_arrives(lens: Lens, rays: Rays, fields: Tensor, wavelengths: Tensor) -> Tensor:
+    """Whether the first of the rays (3, F, W, P), chief rays, arrive or were only vignetted, (F, W)."""
     if is_bent(lens):
-        return rays.position[:2, ..., 0], unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
+        return unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
     on_axis = (fields == 0).all(0)[:, None]
-    return rays.position[:2, ..., 0], (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
+    return (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
 
 
 @torch.no_grad()
