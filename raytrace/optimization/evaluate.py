@@ -181,7 +181,6 @@ def evaluate(
         k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
     evaluated, like = evaluation(np.zeros(0)), torch.float64
-    squares = np.bincount(evaluated.of_row, evaluated.residuals**2, minlength=len(function))[shown]
     return MeritResult(
         lens=lens,
         merit=torch.tensor(evaluated.merit, dtype=like),
@@ -190,7 +189,7 @@ def evaluate(
         values=torch.as_tensor(evaluated.values[shown], dtype=like),
         targets=torch.as_tensor(evaluation.targets[shown], dtype=like),
         weights=torch.as_tensor(evaluation.weights[shown], dtype=like),
-        contributions=torch.as_tensor(squares / max(squares.sum(), 1e-300), dtype=like),
+        contributions=torch.as_tensor(evaluated.contributions(shown), dtype=like),
         lost=torch.as_tensor(evaluated.lost[shown]),
         configurations=torch.tensor([of_rows[k] for k in shown], dtype=torch.int64),
         unit=function.unit,

@@ -875,7 +875,7 @@ def optimize(
     result = _optimized(
         lens, problem.model, names, x, descent, started, rows=problem.rows, unit=problem.unit,
         merits=(problem.merit(before), problem.merit(after)), values=(before.values[:count], after.values[:count]),
-        contributions=(_contributions(before, count), _contributions(after, count)),
+        contributions=tuple(end.contributions(np.arange(count)) for end in (before, after)),
         glasses=tuple(choice.steps) if choice else (), conditions=reached(problem, x, lower=lower, upper=upper),
     )  # fmt: skip
     ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
@@ -987,9 +987,3 @@ def _warned(result: Optimized) -> Optimized:
     for lens in result.lens.configurations:
         warn_of_defects(lens)
     return result
-
-
-def _contributions(evaluated: Evaluated, rows: int) -> np.ndarray:
-    """The part (R,) of every row in the square of the merit."""
-    squares = np.bincount(evaluated.of_row, evaluated.residuals**2, minlength=rows)[:rows]
-    return squares / max(squares.sum(), 1e-300)
