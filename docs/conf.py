@@ -3,6 +3,8 @@
 import tomllib
 from pathlib import Path
 
+import raytrace
+
 root = Path(__file__).parent
 
 project = "raytrace"
@@ -34,3 +36,8 @@ linkcheck_anchors = True
 linkcheck_timeout = 10
 linkcheck_retries = 1
 linkcheck_report_timeouts_as_broken = False
+
+
+def setup(app):
+    """Compile the trace once for this machine, outside the time limits of the cells."""
+    raytrace.prepare()
