@@ -120,6 +120,7 @@ PUBLIC = {
     "wavefront": "analysis.wavefronts",
     "grid": "maths.sampling",
     "psf": "psf_models",
+    "view": "viewer.widget",
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",

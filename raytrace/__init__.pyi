@@ -120,6 +120,7 @@ from raytrace.tracing.scene import Memo as Memo
 from raytrace.tracing.spot import Spot as Spot
 from raytrace.tracing.streaming import mean_square_gradient as mean_square_gradient
 from raytrace.tracing.trace import hit_jacobian as hit_jacobian
+from raytrace.viewer.widget import view as view
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf
 from raytrace.wave_optics.element_files import read_element as read_element

@@ -60,6 +60,14 @@ def afford(needed: float, what: str, *, helps: str) -> None:
         )
 
 
+def afford_rays(pupil_points: int, **counts: int) -> None:
+    """Raise OverBudget for more rays than memory holds; counts: of fields, wavelengths, …, by name."""
+    rays = math.prod((pupil_points, *counts.values()))
+    factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
+    what = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
+    afford(RAY_BYTES * rays, what, helps="ask for fewer fields, wavelengths or pupil points")
+
+
 def forewarn(seconds: float, what: str, *, helps: str) -> None:
     """Warn TakesLong of a long predicted time, right to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:

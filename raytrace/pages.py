@@ -3,7 +3,7 @@
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -39,6 +39,32 @@ def grid(header: Sequence, rows: Iterable[Sequence]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
+def listing(columns: Mapping[str, Callable], rows: Iterable) -> list[str]:
+    """Lines of a table: a column for each heading (text behind a | only distinguishes columns), a line for each row."""
+    heading = [name.partition("|")[0] for name in columns]
+    return grid(heading, ([form(row) for form in columns.values()] for row in rows)).splitlines()
+
+
+def digits(number: float | None, form: str = ".1e", none: str = "") -> str:
+    """A number in a form; `none` if it is None or not finite."""
+    return none if number is None or not math.isfinite(number) else format(number, form)
+
+
+def significant(number: float | None, count: int = 3) -> str:
+    """A number to `count` digits, large ones without exponent; – if it is None or not finite."""
+    if number is None or not math.isfinite(number):
+        return "–"
+    return f"{number:,.0f}" if abs(number) >= 10 ** (count - 1) else f"{number:.{count}g}"
+
+
+def milliseconds(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1e3 * seconds:,.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.3g}"
+
+
+def yes(fact: bool | None, none: str = "–") -> str:
+    return none if fact is None else "yes" if fact else "no"
+
+
 def picture(place: str, caption: str) -> str:
     """A figure with its caption below it."""
     return f"![{caption}]({place})\n\n*{caption}*"
@@ -52,11 +78,6 @@ def shown(value: float, digits: int) -> str:
 def measured(what: str, about: Mapping[str, str | int]) -> str:
     """A caption: the quantity measured, in one thread, and the machine."""
     return f"Median processor time of {what}, one thread; " + ", ".join(f"{name} {one}" for name, one in about.items())
-
-
-def page(lines: Iterable[str], kept: str) -> str:
-    """Lines, the mark, and `kept` below it."""
-    return "\n".join([*lines, "", KEPT, kept]).rstrip() + "\n"
 
 
 def machine() -> dict[str, str | int]:

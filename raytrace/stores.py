@@ -11,6 +11,7 @@ found and expected. A file is replaced as a whole or not at all. Of lines, the i
 off, and damaged ones are reported by their number while the others hold.
 """
 
+import contextlib
 import csv
 import dataclasses
 import io
@@ -55,15 +56,13 @@ def number(least: float = -math.inf, most: float = math.inf, *, infinite: bool =
     span = f" from {least:g}" * (least > -math.inf) + f" to {most:g}" * (most < math.inf)
 
     def check(value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        result = math.nan
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            with contextlib.suppress(OverflowError):
+                result = float(value)
+        if not least <= result <= most or (math.isinf(result) and not infinite):  # NaN is in no range
             raise Unfit(f"found {shown(value)}, expected {words}{span}")
-        try:
-            found = float(value)
-        except OverflowError:
-            found = math.nan
-        if math.isnan(found) or (math.isinf(found) and not infinite) or not least <= found <= most:
-            raise Unfit(f"found {shown(value)}, expected {words}{span}")
-        return found
+        return result
 
     return check
 
@@ -92,14 +91,12 @@ def anything(value: object) -> object:
 
 
 def either(*checks: Check) -> Check:
-    """What one of the checks takes; the last says what was expected."""
+    """A value of the first check that accepts it; the error is that of the last."""
 
     def check(value: object) -> object:
-        for one in checks[:-1]:
-            try:
-                return one(value)
-            except Unfit:
-                continue
+        for accepts in checks[:-1]:
+            with contextlib.suppress(Unfit):
+                return accepts(value)
         return checks[-1](value)
 
     return check
@@ -109,10 +106,9 @@ def exactly(*values: object) -> Check:
     """One of these values."""
 
     def check(value: object) -> object:
-        for one in values:
-            if type(value) is type(one) and value == one:
-                return value
-        raise Unfit(f"found {shown(value)}, expected {' or '.join(map(shown, values))}")
+        if not any(type(value) is type(allowed) and value == allowed for allowed in values):
+            raise Unfit(f"found {shown(value)}, expected {' or '.join(map(shown, values))}")
+        return value
 
     return check
 
@@ -126,31 +122,25 @@ def listed(entry: Check, least: int = 0, most: int | None = None) -> Check:
             raise Unfit(f"found {shown(value)}, expected a list")
         if not least <= len(value) <= (len(value) if most is None else most):
             raise Unfit(f"found {shown(value)}, expected {words} of them")
-        return [_inside(f"entry {k}", entry, one) for k, one in enumerate(value, 1)]
+        return [_inside(f"entry {k}", entry, content) for k, content in enumerate(value, 1)]
 
     return check
 
 
 def mapped(entry: Check) -> Check:
     """Names with values of one kind."""
-
-    def check(value: object) -> dict:
-        return {name: _inside(name, entry, one) for name, one in _names(value).items()}
-
-    return check
+    return lambda value: {name: _inside(name, entry, content) for name, content in _names(value).items()}
 
 
 def record(needed: Mapping[str, Check], optional: Mapping[str, Check] = MappingProxyType({})) -> Check:
     """Names with values of their kinds; other names are left as they are."""
 
     def check(value: object) -> dict:
-        found = dict(_names(value))
-        if missing := [name for name in needed if name not in found]:
+        names = _names(value)
+        if missing := [name for name in needed if name not in names]:
             raise Unfit(f"{missing[0]!r} is missing")
-        for name, entry in (*needed.items(), *optional.items()):
-            if name in found:
-                found[name] = _inside(name, entry, found[name])
-        return found
+        checks = {name: entry for name, entry in {**needed, **optional}.items() if name in names}
+        return names | {name: _inside(name, entry, names[name]) for name, entry in checks.items()}
 
     return check
 
@@ -201,7 +191,7 @@ def shown(value: object) -> str:
 
 
 def parsed(content: bytes) -> object:
-    """What JSON in UTF-8 holds. Raises Unfit."""
+    """The value of JSON in UTF-8. Raises Unfit."""
     try:
         return json.loads(content.decode("utf-8"))
     except json.JSONDecodeError as error:
@@ -216,14 +206,18 @@ def parsed(content: bytes) -> object:
 
 
 def read_file(
-    path: str | os.PathLike, decode: Callable[[bytes], object], error: type[ValueError], advice: str, most: int = _MOST
+    path: str | os.PathLike,
+    decode: Callable[[bytes], object],
+    error: type[ValueError],
+    advice: str,
+    most: int | None = None,
 ) -> object:
-    """The decoded content of a regular file of at most `most` bytes; decode raises Unfit.
+    """The decoded content of a regular file of at most `most` bytes (default 1 GiB); decode raises Unfit.
 
     Raises OSError, and `error` with the file, its line, and the advice how to resume.
     """
     try:
-        return decode(read_bytes(path, most))
+        return decode(read_bytes(path, _MOST if most is None else most))
     except Unfit as reason:
         place = f"{path}, line {reason.line}" if reason.line else f"{path}"
         raise error(f"{place}: {reason}; {advice}") from reason
@@ -409,7 +403,7 @@ class Records(Store):
         self.lines = None if path is None else Lines(path, check, head=mapped(anything))
 
     def read(self) -> list[tuple[int, object]]:
-        """Every record with the number of its line; the file is begun where there is none.
+        """Every record with the number of its line; a missing file is started.
 
         Warns DamagedLine. Raises OSError and the errors of the kind.
         """

@@ -1,4 +1,4 @@
-"""Words: the nearest known to an unknown one, what the kind of a value is called, and the line that a warning names."""
+"""Texts of messages: the known name nearest to an unknown one, the kind of a value, the line that a warning names."""
 
 import difflib
 import functools

@@ -11,7 +11,7 @@ import torch
 from problems import floats
 
 from raytrace.maths.sampling import Grid
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.tracing.spot import spot_of_points
 
 getcontext().prec = 60

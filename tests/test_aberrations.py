@@ -37,7 +37,7 @@ def test_the_first_crossing_is_the_paraxial_focus_of_each_wavelength(distance):
     torch.testing.assert_close(found.crossing[:, 0], focus, rtol=0, atol=2 * NANOMETRE)
 
 
-def test_rays_that_do_not_cross_the_axis_are_said_to():
+def test_rays_that_do_not_cross_the_axis_are_reported():
     """Lost on the way, or parallel to the axis."""
     stopped = SPHERE.replace(2, apertures=(Aperture("circular", (0.0, 20.0)),))
     assert longitudinal_aberration(stopped, points=5).valid[0].tolist() == [True, True, True, False, False]
@@ -113,7 +113,7 @@ def test_a_micrometre_of_the_sensor_moves_every_crossing_by_one():
 
 
 def test_a_diffractive_lens_shifts_its_focus_against_the_wavelength():
-    """f = f0 λ0/λ of a flat diffractive lens, and the same lens beside air has no other colour."""
+    """f = f0 λ0/λ of a flat diffractive lens, and the same lens in air has no other colour."""
     plane = dict(thickness=100.0, phase=rt.RadialPhase([-math.pi * 25 / (0.55e-3 * 100)], 5.0, 1.0))
     system = rt.lens([plane], stop=1, entrance_pupil_diameter=10, wavelengths=[0.55, 0.5, 0.6])
     found = chromatic_focal_shift(system, samples=11)

@@ -194,7 +194,7 @@ def test_diffraction_meets_rays_where_the_blur_is_large():
 
 
 def test_through_focus_is_the_mtf_at_each_sensor():
-    """About the sensor as it stands, where this lens is in focus."""
+    """About the sensor of the file, where this lens is in focus."""
     lens = perfect()
     found = rt.mtf(lens, frequencies=[60.0], through_focus=0.5)
     assert found.sensor_distances[[0, 10, 20]].tolist() == pytest.approx([49.5, 50.0, 50.5])
@@ -420,7 +420,7 @@ def test_a_wavelength_without_light_is_named_too(analyse, geometric):
         analyse(lens, [1.0], geometric=geometric)
 
 
-def test_a_column_in_per_cent_is_named_so_and_is_what_the_text_prints():
+def test_a_column_in_per_cent_has_the_unit_and_values_of_the_text():
     """Text, frame and document have the same number; units of the columns come with the frame and the document."""
     lens = problems.double_gauss()
     found, grid = rt.distortion(lens, fields=[14.0]), rt.distortion_grid(lens, points=3)

@@ -9,8 +9,8 @@ from differences import gradcheck, gradgradcheck
 from problems import surface
 
 from raytrace.system.intersection import intersect
-from raytrace.system.shapes import EVEN, sag_and_derivatives
-from raytrace.system.surface import sag
+from raytrace.system.shapes import EVEN
+from raytrace.system.surface import sag, sag_and_derivatives
 
 ROUNDING = 2.0**-53
 

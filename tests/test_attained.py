@@ -1,7 +1,8 @@
-"""What an optimisation was asked for and what it reached: contradictions are refused, misses are warned of."""
+"""Attained values of constraints: contradictions are refused, violations are warned of."""
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def test_a_search_refuses_them_too(triplet):
         rt.search(triplet, merit="spot", vary="curvature", hold="efl=100 efl=50", starts=1)
 
 
-def test_what_is_missed_is_in_text_document_and_figure(triplet):
+def test_violations_are_in_text_document_and_figure(triplet):
     merit = rt.DefaultMerit("spot", air_thickness="0.1:90", glass_thickness="0.5:1")
     with pytest.warns(NotReached, match="MXCG 1 7 <= 1 .row 7. is not reached"):
         found = rt.optimize(triplet, merit=merit, vary="curvature", hold="efl=100", cycles=3)
@@ -124,7 +125,7 @@ def test_commands_whose_conditions_are_not_met_exit_with_1(line, said, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_a_lens_that_misses_what_was_asked_for_is_written_all_the_same(tmp_path, capsys):
+def test_a_lens_that_violates_a_constraint_is_still_written(tmp_path, capsys):
     path = tmp_path / "there.zmx"
     line = "optimize cooke_triplet --merit spot --vary sensor --glass-thickness 50 --cycles 1 -o"
     assert main([*line.split(), str(path)]) == 1
@@ -206,7 +207,7 @@ def test_a_zoom_is_printed_and_drawn_in_all_its_configurations(triplet):
     zoom = triplet.with_configurations(thickness={2: [6.0, 9.0], 7: [77.4, 70.0]})
     found = rt.optimize(zoom, merit="spot", vary="thickness:2@1 thickness:2@2", cycles=1)
     text = str(found)
-    assert "configuration        EFL before, mm" in text
+    assert re.search(r"^configuration +EFL before +EFL after +left\n +mm +mm +%$", text, re.M)
     lengths = [float(rt.first_order(one).effective_focal_length) for one in found.lens.configurations]
     assert all(f"{length:.8g}" in text for length in lengths)
     assert {one["configuration"] for one in found.document()["operands"]} == {1, 2}
@@ -219,7 +220,7 @@ def test_a_zoom_is_printed_and_drawn_in_all_its_configurations(triplet):
     ] == [1] * 4
 
 
-def test_a_search_says_by_how_many_of_its_descents_a_minimum_was_found(triplet):
+def test_a_search_reports_how_many_descents_reached_a_minimum(triplet):
     found = rt.search(triplet, merit="spot", vary="sensor", bounds="sensor:50,90", starts=6)
     assert found.descents == 4 + 4  # the best four of six starts, and four hops
     assert int(found.found.sum()) <= found.descents

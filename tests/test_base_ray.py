@@ -87,7 +87,7 @@ def test_a_tilted_plate_is_astigmatic_and_moves_the_ray():
     found = rt.base_ray(lens)
     way = t / math.cos(inside)
     foci = [f - 40 - way * math.cos(theta) ** 2 / (n * math.cos(inside) ** 2), f - 40 - way / n]
-    # They count from the plane of the rear vertex, which lies t cos θ behind the front one and t sin θ beside it.
+    # They count from the plane of the rear vertex, which lies t cos θ behind the front one and t sin θ off it.
     ahead = way * math.cos(theta - inside) - t * math.cos(theta)
     assert near(found.back_focal_distance, [focus + ahead for focus in foci], 1e-12)
     assert near(found.position[1], t * math.sin(theta) - way * math.sin(theta - inside), 1e-12)
@@ -138,7 +138,7 @@ def test_rays_are_aimed_where_the_straightened_pupil_is_at_infinity(ray_aiming):
         rt.spot(lens, ray_aiming="off")
 
 
-def test_the_stop_may_stand_behind_a_fold_and_aside():
+def test_the_stop_may_be_behind_a_fold_and_decentred():
     """Aimed rays fill a decentred, tilted stop about its own middle; those that are not go about the axis."""
     lens = bends.folded(rt.read_lens("double_gauss"), 4, tilt_x=2.0).at(ray_aiming="real")
     aside = lens.replace(lens.stop, before=pose(x=0.4, y=-0.7, tilt_y=5.0), after=pose(x=-0.4, y=0.7))
@@ -191,7 +191,7 @@ def test_info_shows_both_only_where_they_differ():
     assert found.document()["effective_focal_length"] == pytest.approx(100.0)
 
 
-def test_what_needs_an_axis_names_the_surface_that_bends_it():
+def test_analyses_about_an_axis_name_the_surface_that_folds_it():
     lens = bends.folded(rt.read_lens("double_gauss"), 10, tilt_x=45.0)
     for refused in (
         rt.seidel, rt.longitudinal_aberration, lambda one: rt.psf(one, "paraxial"), lambda one: rt.psf(one, "fourier"),

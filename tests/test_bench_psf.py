@@ -7,95 +7,23 @@ import io
 import json
 import math
 
-import problems
 import pytest
 import torch
-from problems import plano_hyperbolic, scene_of, vector
+from problems import plano_hyperbolic, vector
 from scripts import script
 
 from raytrace.bench import psf as bench
-from raytrace.bench import psf_cases
 from raytrace.bench.figures import psf_figure
-from raytrace.bench.huygens import Sampling, clear_rings, direct_sum, moments, solid_angle
-from raytrace.bench.psf import PsfRow, gradient, measure, report, steps, truth_of, with_all_leaves
-from raytrace.bench.psf_cases import Case, Method, cases
+from raytrace.bench.psf import Case, Method, PsfRow, cases, gradient, measure, report, steps, truth_of, with_all_leaves
 from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.io import read_lens
-from raytrace.maths.sampling import grid
 from raytrace.psf_models import MODELS, drt, wave
-from raytrace.psf_models.gaussian import kernels as gaussian_kernels
-from raytrace.system.surface import Aperture
+from raytrace.psf_models.direct_sum import Sampling, moments
 
 pytestmark = pytest.mark.usefixtures("threads")
 
 extended = script("bench_psf")
-
-
-@pytest.mark.parametrize("sampling", [Sampling(12, 32, 3), Sampling(80, 0, 3)])
-def test_direct_sum_of_a_perfect_lens_peaks_as_airy(sampling):
-    """I(0) = E A/(λf)² with E = 1, A = πR²: to 4 NA² = 1e-4, a square grid to the raggedness of its rim, 0.5 %."""
-    lens = plano_hyperbolic(diameter=0.5)
-    pitch = 1e-4  # 1/300 of the Airy radius: the pixel is flat
-    kernel, rays = direct_sum(scene_of(lens), grid(pitch, 1), sampling)
-    expected = math.pi * 0.25**2 / (0.55e-3 * 50.0) ** 2 * pitch**2
-    assert rays == (384 if sampling.arms else pytest.approx(5027, abs=40))
-    assert float(kernel) == pytest.approx(expected, rel=1e-4 if sampling.arms else 5e-3)
-
-
-def test_direct_sum_of_an_annulus():
-    """A central stop of radius ε leaves (1 - ε²) of the light and of the area: the peak falls by its square."""
-    stop = (Aperture("circular", (0.2, math.inf)),)
-    window = grid(1e-4, 1)
-    ratio = direct_sum(scene_of(plano_hyperbolic(diameter=1.0, apertures=stop)), window, Sampling(12, 32, 3))[0]
-    ratio = ratio / direct_sum(scene_of(plano_hyperbolic(diameter=1.0)), window, Sampling(12, 32, 3))[0]
-    assert float(ratio) == pytest.approx((1 - 0.4**2) ** 2, rel=1e-4)
-
-
-def test_direct_sum_keeps_the_light():
-    """All light of the perfect lens within 6 Airy radii but the rings' tail, 2/(π v), v = π D r/(λ f)."""
-    kernel, _ = direct_sum(scene_of(plano_hyperbolic(diameter=1.0)), grid(0.08, 5), Sampling(16, 48, 7))
-    tail = 2 / (math.pi * math.pi * 0.2 / (0.55e-3 * 50.0))
-    assert 0.5 * tail < 1 - float(kernel.sum()) < 1.5 * tail
-
-
-def test_direct_sum_is_the_wave_models_limit():
-    """Off the axis, in coma: two quadratures, two Jacobians, exact and plane wavelets."""
-    lens = problems.double_gauss(aperture=("entrance_pupil_diameter", 8.0))
-    s = scene_of(lens, 7.0, 25e3)
-    window = grid(0.01, 3, moments(s, 16, 64)[0])
-    found = wave.kernels(s, window, order=1)
-    rings, arms, nodes = bench.wave_sampling(s, window)
-    kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
-    assert kernel.sum() > 0.3
-    assert bench.relative_l1(found.kernel[0, 0, 0], kernel) < min(1e-3, float(found.residual) + 1e-5)
-
-
-def test_rim_is_found():
-    """Rings between the edges of an annulus carry its area and none is lost."""
-    stop = (Aperture("circular", (0.2, 0.45)),)
-    s = scene_of(plano_hyperbolic(diameter=1.0, apertures=stop))
-    points, weights = clear_rings(s, 6, 16)
-    radius = 0.5 * torch.linalg.vector_norm(points, dim=0)
-    assert weights.sum() == pytest.approx((0.45**2 - 0.2**2) / 0.25, rel=1e-9)
-    assert radius.min() > 0.2
-    assert radius.max() < 0.45
-
-
-def test_solid_angle_of_a_perfect_lens():
-    """Parallel light into a perfect cone: (L, M) = -R p/f to NA², so that Ω = (R/f)²."""
-    points = vector(0.0, 0.3, -0.2, 0.5).reshape(2, 2)
-    assert torch.allclose(solid_angle(scene_of(plano_hyperbolic(diameter=1.0)), points), vector(1e-4, 1e-4), rtol=3e-4)
-
-
-def test_moments_are_those_of_many_rings():
-    lens = read_lens("double_gauss")
-    s = scene_of(lens, 14.0, 1e4)
-    s = dataclasses.replace(s, wavelengths=lens.primary[None])
-    (centroid, variance, energy), fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
-    assert torch.allclose(variance, fine.covariance[::2, 0, 0, 0], rtol=1e-10)
-    assert torch.allclose(centroid, fine.centroid[:, 0, 0, 0], atol=1e-12)
-    assert energy == pytest.approx(1.0, abs=1e-14)
 
 
 def test_random_histogram_is_one_histogram_however_it_is_cut():
@@ -116,7 +44,7 @@ def test_usual_cases_and_others():
     assert math.isinf(found[2].distance)
     for case in found[2:]:
         sigma = float(moments(case.scene, 8, 32)[1].sqrt().max())
-        assert 7 * sigma <= psf_cases.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
+        assert 7 * sigma <= bench.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
 
 
 def test_gradients_are_by_all_that_is_modelled():
@@ -216,7 +144,7 @@ def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monke
     monkeypatch.setattr(extended, "direct_sum", direct_sum)
     monkeypatch.setattr(extended, "clock", lambda threads: lambda: now[0])
     kernels, windows = {"wave": ones}, {"wave": case.window(vector(0.0, 0.0))}
-    truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), rings=40, arms=160, nodes=4)
+    truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), Sampling(40, 160, 4))
     *rings, coarse, fine, far = extended.direct_rows(truth, 1)
     assert [line.model for line in rings] == ["direct sum, rings"] * 3
     assert (coarse.rays, fine.rays, far.extrapolated) == (64**2, 96**2, True)
@@ -227,13 +155,13 @@ def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monke
 @pytest.fixture
 def few(monkeypatch):
     """One coarse order of each model and small direct sums."""
-    monkeypatch.setattr(psf_cases, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
-    monkeypatch.setattr(psf_cases, "_TOLERANCES", {"fourier": (0.01,)})
+    monkeypatch.setattr(bench, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
+    monkeypatch.setattr(bench, "_TOLERANCES", {"fourier": (0.01,)})
     monkeypatch.setattr(bench, "_FINEST_WAVE", 1)
     monkeypatch.setattr(extended, "PILOT", 20_000)
     monkeypatch.setattr(extended, "PATIENCE", 0.05)
     monkeypatch.setattr(extended, "SQUARE", (16, 24))
-    monkeypatch.setattr(psf_cases, "PIXELS", 7)
+    monkeypatch.setattr(bench, "PIXELS", 7)
 
 
 def test_command_writes_everything(few, tmp_path, capsys):
@@ -263,7 +191,7 @@ def test_progress_adds_up_and_refusals_are_reported(few, monkeypatch):
     def refuse(*arguments):
         raise ValueError("too steep")
 
-    monkeypatch.setattr(bench, "direct_sum", refuse)
+    monkeypatch.setattr(bench.direct_sum, "reference", refuse)
     case = Case(plano_hyperbolic(diameter=1.0), "stigmatic", 0.0, math.inf, 0.005)
     done, said = [], []
     rows = measure([case], repeats=1, threads=1, progress=done.append, say=said.append)

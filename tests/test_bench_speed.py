@@ -14,17 +14,9 @@ from scripts import script
 from raytrace.bench import measure as timing
 from raytrace.bench import speed
 from raytrace.bench.figures import speed_figure
-from raytrace.bench.measure import (
-    Own,
-    errors_of,
-    field_rays,
-    in_turns,
-    leaves_of,
-    slope,
-    squared_radius,
-)
+from raytrace.bench.measure import Own, Row, errors_of, field_rays, in_turns, leaves_of, squared_radius
 from raytrace.bench.report import Measured
-from raytrace.bench.speed import STAGES, Bench, Row, Sizes, document, measure, three_aspheres, with_sensor_leaf
+from raytrace.bench.speed import STAGES, Bench, Sizes, document, measure, slope, three_aspheres, with_sensor_leaf
 from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
@@ -150,7 +142,7 @@ def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
     assert not bool(Limit(built, lens, dtype, safe=True, steps=0).trace(to(rays, dtype=dtype)).valid.all())
 
 
-def test_limits_refuse_what_they_do_not_know(built):
+def test_limits_refuse_unsupported_surfaces(built):
     for lens, safe in ((read_lens("hubble"), True), (three_aspheres(), False)):
         with pytest.raises(ValueError, match="know"):
             Limit(built, lens, torch.float64, safe=safe)
@@ -287,7 +279,7 @@ def test_ratios_are_those_of_the_speeds(measured):
         assert numbers["small_batch_ms"] == pytest.approx(1e3 * small_s)
 
 
-def test_accuracy_stands_beside_every_speed_of_the_tables(measured):
+def test_tables_have_the_accuracy_of_every_speed(measured):
     """nm on the image: rounding of float32 at 20 mm, and of float64."""
     rows, _ = measured
     bound = {"float32": 1e3, "float64": 1e-4}
@@ -338,7 +330,7 @@ def test_targets_are_judged_on_the_right_side():
 
 
 def test_document_has_speeds_by_entrant_in_millions():
-    row = Row("raytrace", "float32", "forward", 64, 1e-3, 5e6, 1.0, None)
+    row = Row("raytrace", "float32", "forward", False, 64, 64, 1e-3, 1e-3, 5e6, 1.0, None, None)
     found = document([row], {"float32": {"two_process_gain": math.inf, "bytes_per_ray": 64.0}})
     assert found["float32"]["millions_per_second"] == {"forward": {"raytrace": {"64": 5.0}}}
     assert found["float32"]["two_process_gain"] is None

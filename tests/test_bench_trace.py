@@ -69,10 +69,10 @@ def test_json_is_one_document_with_errors_of_every_tracer(document):
         assert row["tracer"] == "raytrace"
         assert row["rays"] == 300
         assert row["speed"] > 0
-        assert 0 < row["errors"]["position"] < position
-        assert 0 < row["errors"]["gradient"] < gradient
-        assert (row["errors"]["path"] is None) == (not row["path"])
-        assert not row["path"] or 0 < row["errors"]["path"] < path
+        assert 0 < row["position"] < position
+        assert 0 < row["gradient"] < gradient
+        assert (row["path_error"] is None) == (not row["path"])
+        assert not row["path"] or 0 < row["path_error"] < path
         assert row["ratio"] is None
 
 

@@ -111,10 +111,10 @@ def test_page_and_table_hold_the_figures(tmp_path):
 
 
 def test_script_writes_the_page(monkeypatch, tmp_path):
-    """A few samplings of small kernels."""
+    """A few samplings of small kernels; their errors are of no interest here."""
     few = bench.entrants
     monkeypatch.setattr(bench, "entrants", lambda: few(size=16, sitzmann=200))
-    for name, value in (("_PUPIL", (128,)), ("_RADIAL", ({"tol": 1e-3},)), ("_REFUSED", ()), ("_TRANSFER", (1700,))):
+    for name, value in (("_PUPIL", (128,)), ("_RADIAL", ({"tol": 1e-3},)), ("_REFUSED", ()), ("_TRANSFER", (500,))):
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench, "agreement", lambda scene: 1e-6)
     bench.main(["--repeats", "1", "--docs", str(tmp_path)])

@@ -1,4 +1,4 @@
-"""Budget: what would take too much memory is refused before it begins, in the library and by every command."""
+"""Memory budget: computations beyond it are refused before they start, in the library and by every command."""
 
 import dataclasses
 import importlib
@@ -125,14 +125,14 @@ NASTY = {
 
 
 @pytest.mark.parametrize("name", NASTY)
-def test_what_is_too_much_is_refused_within_seconds(name, lens):
+def test_excessive_requests_are_refused_within_seconds(name, lens):
     began = time.process_time()
     with within(1e9), pytest.raises(OverBudget, match="--max-bytes"):
         NASTY[name](lens)
     assert time.process_time() - began < 10
 
 
-def test_what_takes_long_is_said_before_it_begins(lens):
+def test_long_computations_are_reported_before_they_start(lens):
     """Ideal waves at F/0.1: minutes. The warning made an error stops them."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", TakesLong)
@@ -170,8 +170,8 @@ HEAVY = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("words", "most"), HEAVY)
-def test_memory_stays_within_what_is_allowed(words, most):
-    """A process that is allowed so much either refuses, or takes at most twice that beside what torch takes."""
+def test_memory_stays_within_the_limit(words, most):
+    """A process with a memory limit either refuses, or takes at most twice the limit in addition to torch."""
     code = (
         "import resource, sys; from raytrace.budget import keep_freed_memory; from raytrace.cli import main;"
         "keep_freed_memory(); code = main(sys.argv[1:]);"
@@ -188,18 +188,15 @@ def test_memory_stays_within_what_is_allowed(words, most):
 def test_freed_memory_is_used_again():
     """Pages that the system clears: of twenty blocks of 40 MB one after another, those of a few blocks."""
     code = (
-        "import resource, sys; from raytrace.budget import keep_freed_memory as keep; import torch;"
-        "kept = sys.argv[1] == 'kept'; done = keep() if kept else False;"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
-        "any(torch.ones(10_000_000)[0] == 0 for _ in range(20));"
-        "print(int(done or not kept), resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)"
+        "import resource; from raytrace.budget import keep_freed_memory as keep; import torch;"
+        "faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
+        "blocks = lambda: any(torch.ones(10_000_000)[0] == 0 for _ in range(20));"
+        "start = faults(); blocks(); middle = faults(); able = keep(); blocks();"
+        "print(int(able), middle - start, faults() - middle)"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(raytrace.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    found = {}
-    for way in ("kept", "given back"):
-        done = subprocess.run([sys.executable, "-c", code, way], env=environment, capture_output=True, text=True)
-        able, pages = map(int, done.stdout.split())
-        if not able:
-            pytest.skip("the C library has no mallopt")
-        found[way] = pages
-    assert found["kept"] < 0.5 * found["given back"]
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    able, given_back, kept = map(int, done.stdout.split())
+    if not able:
+        pytest.skip("the C library has no mallopt")
+    assert kept < 0.5 * given_back

@@ -261,7 +261,7 @@ def test_a_run_begins_at_the_optimum_of_the_closed_form(tmp_path, vary, bounds):
     assert {name: record[name] for name in begun} == own.variables.numbers()
 
 
-def test_a_run_begun_by_the_closed_form_goes_on_to_the_same_end(tmp_path):
+def test_a_run_started_from_the_closed_form_resumes_to_the_same_end(tmp_path):
     """Stopped before its first checkpoint it begins there again; behind one it goes on from that."""
     settings = dataclasses.replace(SMALL, start="spectral", model="paraxial")
     pictures = split(dead_leaves(10, size=32))
@@ -278,7 +278,7 @@ def test_a_run_begun_by_the_closed_form_goes_on_to_the_same_end(tmp_path):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes()
 
 
-def test_a_run_that_goes_on_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
+def test_a_resumed_run_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
     """The order is planned for the lens as it begins, not for the one of the checkpoint."""
     planned, plan = [], Camera.plan
 
@@ -312,7 +312,7 @@ def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
         camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
 
 
-def test_a_lens_that_cannot_be_built_has_a_penalty_beside_its_loss_and_is_pushed_back(tmp_path):
+def test_an_unbuildable_lens_has_a_penalty_and_is_pushed_back(tmp_path):
     """An air space of -0.2 mm lacks 0.25 mm of 0.05: a penalty of 0.0625 mm², and a slope that opens it."""
     lens = read_lens(LENS)
     squeezed = lens.replace(2, thickness=number(-0.2))
@@ -466,7 +466,7 @@ def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
     torch.testing.assert_close(slope, (ends[0] - ends[1]) / 2e-4, rtol=1e-4, atol=0)
 
 
-def test_models_without_distortion_are_centred_on_their_own_image():
+def test_models_without_distortion_are_centred_on_their_image():
     own = camera(read_lens(LENS), CodesignSettings(model="paraxial", fields=(0.0, 14.0)))
     distances = number([1.2e4, 2e4, 4e4])
     torch.testing.assert_close(own.kernels(distances, 1), own.kernels(distances, 0))

@@ -62,7 +62,7 @@ def stops_at(cycle):
 
 
 @pytest.mark.parametrize("name", HOW)
-def test_an_interrupted_run_ends_as_one_that_never_was(name, tmp_path, monkeypatch):
+def test_an_interrupted_run_resumes_to_the_same_end(name, tmp_path, monkeypatch):
     """The same variables, merits, dampings and evaluations to the last bit, wherever it was interrupted."""
     monkeypatch.setattr(checkpoint, "EVERY", 0.0)
     how, path, log = HOW[name], tmp_path / "kept.json", tmp_path / "log.csv"
@@ -84,7 +84,7 @@ def test_an_interrupted_run_ends_as_one_that_never_was(name, tmp_path, monkeypat
         assert rows[0] == rows[1]
 
 
-def test_cycles_count_from_the_beginning_and_more_of_them_go_on(tmp_path):
+def test_cycles_count_from_the_start_and_more_cycles_resume(tmp_path):
     path = tmp_path / "kept.json"
     first = rt.optimize(TRIPLET, checkpoint=path, **SPOT | {"cycles": 3})
     assert first.cycles == 3

@@ -34,8 +34,8 @@ def test_nanometres_are_refused_by_every_command(run, command):
 
 @pytest.mark.parametrize("command", ["info", "spot", "focus", "trace", "psf --model paraxial", "distortion", "layout"])
 def test_extrapolation_is_reported_once_for_each_glass(run, command):
-    verb, *options = command.split()
-    found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if verb == "layout" else []))
+    name, *options = command.split()
+    found = run(name, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if name == "layout" else []))
     assert found.code == 0
     warned = [line for line in found.err.splitlines() if "extrapolated" in line]
     assert [line.split(": ")[3].split(" is ")[0] for line in warned] == ["SK2 (SCHOTT)", "SK16 (SCHOTT)", "F5 (SCHOTT)"]
@@ -64,21 +64,21 @@ NA = {"ENPD 12.5": "OBNA 0.1 0", "DISZ INFINITY": "DISZ 200"}
 
 
 @pytest.mark.parametrize("command", ["spot", "spot --rays 500", "focus --field 0", "compare"])
-def test_an_object_na_far_away_is_reported_with_what_would_hold_the_beam(run, command):
+def test_an_object_na_of_a_distant_object_is_reported_with_a_remedy(run, command):
     """An entrance pupil of 5 m in front of a lens of 12 mm."""
     text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
     for old, new in NA.items():
         text = text.replace(old, new)
     Path("na.zmx").write_text(text, encoding="utf-8")
-    verb, *options = command.split()
-    distance = ["--focus-distance" if verb == "compare" else "--object-distance", 25000]
-    found = run(verb, "na.zmx", *distance, *options)
+    name, *options = command.split()
+    distance = ["--focus-distance" if name == "compare" else "--object-distance", 25000]
+    found = run(name, "na.zmx", *distance, *options)
     assert "all " in found.err
     assert "rays lost: missed surface 3" in found.err
     assert "the aperture is an object NA of 0.1, whose entrance pupil is" in found.err
     assert "F-number" in found.err
     assert "nan" not in found.out
-    held = run(verb, "na.zmx", *distance, *options, "--epd", 12.5) if verb != "compare" else None
+    held = run(name, "na.zmx", *distance, *options, "--epd", 12.5) if name != "compare" else None
     assert held is None or "lost" not in held.err
 
 
@@ -120,9 +120,9 @@ LOST = "no ray of field 0 degrees reaches the sensor: all 217 rays lost: vignett
         ("focus --criterion mean", BLOCKED, "no ray reaches the image"),
     ],
 )
-def test_what_has_no_number_is_one_line_that_names_the_cause(run, command, change, message):
-    verb, *options = command.split()
-    found = run(verb, singlet("nasty", change), *options)
+def test_undefined_quantities_are_one_line_with_the_cause(run, command, change, message):
+    name, *options = command.split()
+    found = run(name, singlet("nasty", change), *options)
     assert found.code == 1
     assert found.out == ""
     assert message in found.err.splitlines()[-1]
@@ -145,7 +145,7 @@ def test_focus_by_the_mean_distance_on_a_clipped_image(run):
     assert found.document["sensor_after"] == pytest.approx(100, abs=0.05)
 
 
-def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
+def test_info_prints_infinite_or_a_dash_where_a_quantity_is_undefined(run):
     text = run("info", singlet("plate", PLATE)).out
     assert "nan" not in text
     assert "-inf" not in text
@@ -163,7 +163,7 @@ def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
     assert "nan" not in touching
 
 
-def test_a_cone_that_hardly_anything_passes_gives_no_absurd_numbers(run):
+def test_an_almost_fully_vignetted_cone_gives_finite_numbers(run):
     found = run("wavefront", "double_gauss", "--f-number", 0.5, "--field", 0, "--size", 8, "--json")
     assert "field 0 degrees: the light fills too little of the entrance pupil for Zernike coefficients" in found.err
     assert {row["coefficient"] for row in found.document["results"]} == {None}

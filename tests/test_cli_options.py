@@ -1,6 +1,7 @@
-"""The forms of the command line: one name, one meaning over all commands; several values; what was meant."""
+"""Options of the commands: one name has one meaning; options with several values; suggestions for misspelt options."""
 
 import argparse
+import inspect
 import io
 import json
 import math
@@ -13,10 +14,13 @@ import pandas
 import pytest
 import torch
 
+import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
-from raytrace.cli.options import PICTURES, picture_file
+from raytrace.cli.commands import COMMANDS
+from raytrace.cli.parameters import entries, parameters_of
 from raytrace.cli.run import find_lens
+from raytrace.cli.types import PICTURES, picture_file
 from raytrace.io import read_lens
 from raytrace.maths.sampling import hexapolar
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
@@ -151,7 +155,7 @@ def test_fates_of_a_ray_table_are_those_that_rays_are_counted_by():
     assert not shown[shown.status.isin(["miss", "tir", "unaimed"])].x.notna().any()
 
 
-def test_chief_and_marginal_rays_say_which_they_are(command):
+def test_chief_and_marginal_rays_are_labelled(command):
     words = ("trace", "double_gauss", "--object-distance", 25000, "inf", "--field", "3,4", 10, "--wavelength", 0.5, 0.6)
     code, out, err = command(*words)
     assert code == 0, err
@@ -204,7 +208,7 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot double_gauss --sampling sobol --rings 3", 1, "sobol takes --points"),
     ],
 )
-def test_errors_say_what_may_have_been_meant(command, words, code, message):
+def test_errors_suggest_similar_options(command, words, code, message):
     Path("mine.zmx").write_text("not read")
     found, out, err = command(*words.split())
     assert (found, out) == (code, "")
@@ -213,7 +217,7 @@ def test_errors_say_what_may_have_been_meant(command, words, code, message):
     assert [path.name for path in Path().iterdir()] == ["mine.zmx"]
 
 
-def test_nothing_near_is_nothing_said():
+def test_without_a_similar_option_there_is_no_suggestion():
     assert did_you_mean("--colour", ["--field", "--plot"]) == ""
     assert did_you_mean("Plot", ["plot"]) == "; did you mean plot?"
     assert set(PICTURES) == {".png", ".pdf", ".svg"}
@@ -234,7 +238,7 @@ def test_a_field_out_of_reach_is_reported_with_cause_and_help(command, analysis,
     assert not [*Path().iterdir()]
 
 
-def test_curves_show_the_fields_that_are_in_reach_and_tell_of_the_others(command):
+def test_curves_show_the_reachable_fields_and_report_the_others(command):
     code, out, err = command("ray-fan", "tessar", "--field", 0, 80, "--points", 3, "--json")
     assert code == 0
     assert "warning: no ray of field 80 degrees reaches the sensor" in err
@@ -265,7 +269,7 @@ FLAT += "0,inf,inf,,,\n1,inf,5,N-BK7,10,1\n2,inf,50,,10,\n3,inf,0,,,\n"
         ("compare hubble --focus-distance inf", "give --focus-distance and --object-distance beyond, or inf"),
     ],
 )
-def test_an_analysis_that_shows_nothing_says_so(command, words, message):
+def test_an_analysis_without_results_is_reported(command, words, message):
     Path("flat.csv").write_text(FLAT)
     code, out, err = command(*words.split())
     assert (code, out) == (1, "")
@@ -284,7 +288,7 @@ def test_close_rays_of_a_field_in_any_meridian_have_the_foci_of_its_own(command)
     assert upright[0]["tangential"] != pytest.approx(upright[0]["sagittal"], rel=0.1)
 
 
-def test_a_thinned_table_says_how_many_points_it_lists(command):
+def test_a_thinned_table_states_its_number_of_points(command):
     for name, points, listed in (("ray-fan", 41, 9), ("opd-fan", 21, 5)):
         out = command(name, "tessar", "--field", 0, "--wavelength", 0.55, "--points", points)[1]
         assert out.splitlines()[-1] == f"{listed} of {points} points of each curve; --json lists all"
@@ -310,3 +314,46 @@ def test_axes_do_not_magnify_rounding(tmp_path):
     assert not off_axis.plot().axes[0].texts
     off_line = distortion(lens, fields=[(0, 1), (1, 0)])
     assert off_line.plot().axes[0].lines[0].get_marker() == "o"  # few fields: points are seen
+
+
+# -- options from signatures ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", [command.name for command in COMMANDS if command.verb in rt.PUBLIC])
+def test_parameters_read_from_the_source_are_those_of_the_function(command):
+    verb = command.replace("-", "_")
+    expected, read = inspect.signature(getattr(rt, verb)).parameters, parameters_of(verb)
+    assert [*read] == [*expected]
+    for name, parameter in read.items():
+        if parameter.default is not None:  # one that is no constant in the source is not read
+            assert parameter.default == expected[name].default
+
+
+def test_entries_of_a_docstring_are_help_texts():
+    text = """A sum.
+
+    first, second: numbers, of `first` more
+    often. The rest is no help. third: "a" or "b";
+    fourth: mm."""
+    assert entries(inspect.cleandoc(text), ["first", "second", "third", "fourth"]) == {
+        **dict.fromkeys(("first", "second"), "numbers, of --first more often"),
+        "third": "a or b",
+        "fourth": "mm",
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_option_has_a_help_text(command):
+    parser = argparse.ArgumentParser(add_help=False)
+    command.add_arguments(parser)
+    assert all(action.help for action in parser._actions if not isinstance(action, argparse._SubParsersAction))
+
+
+def test_options_of_other_commands_are_not_built():
+    def count(parser):
+        (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+        return {name: len(child._actions) for name, child in commands.choices.items()}
+
+    every, one = count(build_parser()), count(build_parser("mtf"))
+    assert one["mtf"] == every["mtf"] > 10
+    assert {name for name, number in one.items() if number > 1} == {"mtf"}

@@ -209,7 +209,7 @@ def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     assert {rate for one in rates for rate in one} == {1e-3}
 
 
-def test_a_folder_begun_before_there_was_a_setting_has_its_default(tmp_path):
+def test_a_folder_older_than_a_setting_has_its_default(tmp_path):
     given = dataclasses.asdict(SMALL)
     old = {name: value for name, value in given.items() if name not in ("rays", "decay", "spread", "sampling")}
     (tmp_path / "settings.json").write_text(json.dumps(old))

@@ -80,7 +80,7 @@ def compare(capsys, tmp_path, monkeypatch):
 # ---------------------------------------------------------------- one model
 
 
-def test_a_run_says_what_it_found(run, pictures):
+def test_a_run_reports_its_results(run, pictures):
     code, out, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--json")
     assert code == 0, err
     document, kept = json.loads(out), read("one/outcome.json")
@@ -97,7 +97,7 @@ def test_a_run_says_what_it_found(run, pictures):
     assert f"sensor at {kept['sensor_mm']:.4f} mm" in text
 
 
-def test_a_run_that_was_stopped_goes_on_to_the_same_end(run, pictures, monkeypatch):
+def test_a_stopped_run_resumes_to_the_same_end(run, pictures, monkeypatch):
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "thickness:5")
     assert run(*command, "-o", "whole")[0] == 0
     for step in (("joint", 5), ("refine", 3)):
@@ -163,7 +163,7 @@ def test_the_learned_lens_is_a_file_that_traces(run, command, pictures):
     assert float(read_lens("run/lens.zmx").surfaces[-2].thickness) == read("run/outcome.json")["sensor_mm"]
 
 
-def test_the_files_own_wavelengths_are_taken_when_asked(run, pictures):
+def test_wavelengths_of_the_file_are_an_option(run, pictures):
     options = ("--data", pictures, *SMALL, "--model", "paraxial", "--loss", "spectral", "--json")
     lens = read_lens(raytrace.files.shipped("lenses") / "cooke_triplet.zmx")
     code, out, err = run("cooke_triplet", *options, "--file-wavelengths")
@@ -176,7 +176,7 @@ def test_the_files_own_wavelengths_are_taken_when_asked(run, pictures):
     assert "leave out --wavelength" in err
 
 
-def test_the_penalty_is_said_beside_the_loss(run, pictures):
+def test_the_penalty_is_reported_with_the_loss(run, pictures):
     """Elements thinner than 0.3 mm and thicker than 0.9 mm, of glasses without names; on every row of the log."""
     options = ("--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "--json")
     code, out, err = run("phone", *options, "--glass-thickness", "0.3:0.9", "--edge", "0.1", "-o", "thin")
@@ -303,7 +303,7 @@ def test_words_and_options_that_do_not_fit(run, arguments, message):
 
 
 @pytest.mark.slow
-def test_two_processes_find_what_one_does(run, pictures, tmp_path):
+def test_two_processes_find_the_minima_of_one(run, pictures, tmp_path):
     """Only the order of float32 sums differs: losses agree to 1e-4, and one process speaks."""
     command = ("double_gauss", "--data", str(pictures), *SMALL, "--model", "paraxial")
     assert run(*command, "-o", "one")[0] == 0
@@ -323,7 +323,7 @@ def test_two_processes_find_what_one_does(run, pictures, tmp_path):
 # ---------------------------------------------------------------- compare
 
 
-def test_a_study_that_was_not_begun_is_refused(compare):
+def test_a_study_that_was_not_started_is_refused(compare):
     for options in (("--report-only",), ("--resume",)):
         with pytest.raises(codesign_run.CommandError, match="out: no study was started here"):
             compare("double_gauss", "-o", "out", *options)

@@ -332,7 +332,7 @@ POSES = {
 
 
 @pytest.mark.parametrize("kind", POSES)
-def test_poses_come_back_bit_for_bit(kind):
+def test_poses_round_trip_bit_identically(kind):
     before, after = POSES[kind]
     lens = read_lens("double_gauss").replace(6, before=before, after=after, is_break=kind.startswith("break"))
     assert leaves(again(dataclasses.replace(lens, stop=5))) == leaves(dataclasses.replace(lens, stop=5))
@@ -356,7 +356,7 @@ def test_a_landscape_lens_in_curvatures_by_paraxial_image_heights():
     assert float(rt.spot(lens).centroid[1, 1, 1]) == pytest.approx(3.0, rel=0.02)  # but for distortion
 
 
-def test_a_bend_comes_back_and_what_no_command_tells_is_refused():
+def test_a_fold_round_trips_and_poses_without_a_command_are_refused():
     lens, tilt = read_lens("hubble"), Pose(y=number(2.0), tilt_x=number(30.0))
     mirror = next(k for k, surface in enumerate(lens.surfaces) if surface.is_mirror)
     bent = lens.replace(mirror, before=tilt, after=Pose(tilt_x=number(30.0)))
@@ -387,7 +387,7 @@ def test_a_hybrid_lens_is_sharp_where_its_file_says(sign, sharp):
 
 
 @pytest.mark.parametrize("radius", [1.0, 7.3, 1 / 3])
-def test_phases_come_back_bit_for_bit(radius):
+def test_phases_round_trip_bit_identically(radius):
     phase = RadialPhase(number([-17.3, 1 / 7, 0.0, 1e-30]), number(radius), number(-2.0))
     lens = read_lens("cooke_triplet").replace(2, phase=phase)
     assert leaves(again(lens)) == leaves(lens)
@@ -406,7 +406,7 @@ def test_vignetting_is_converted_as_code_v_does_for_a_lens_of_opticstudio():
 
 
 @pytest.mark.parametrize("factors", [(0.1, 0.3), (1 / 3, 0.7), (-0.167, 0.4315), (1e-9, 0.9), (1e-30, 1.0)])
-def test_vignetting_comes_back_bit_for_bit(factors):
+def test_vignetting_round_trip_bit_identically(factors):
     lens = read_lens("double_gauss")
     given = number([[0.0, a, 0.0] for a in (0.0, factors[0], -factors[0] / 7, factors[1], 0.0)])
     lens = dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=given))
@@ -439,7 +439,7 @@ def test_glasses_by_their_names():
         of(SINGLET.replace("NBK7_SCHOTT", "NBK8_SCHOTT"))
 
 
-def test_a_catalog_beside_the_file_is_found_by_its_name(tmp_path):
+def test_a_catalog_in_the_folder_of_the_file_is_found_by_its_name(tmp_path):
     written = "CC mine\nNM MY-1 1 0 1.6 50 0 -1\nGC\nED 0 0 0 0 0\nCD 2.56 0 0 0 0 0\nLD 0.3 2.5\n"
     (tmp_path / "Mine.agf").write_text(written)
     path = tmp_path / "lens.seq"
@@ -458,7 +458,7 @@ def private(rows: str, word: str) -> str:
 
 
 def test_private_glasses():
-    """Norland gives n_D = 1.56 for NOA61, whose formula stands in files of Edmund Optics, as does the table of E48."""
+    """Norland gives n_D = 1.56 for NOA61, whose formula is in files of Edmund Optics, as does the table of E48."""
     formula = "PWL 550\n'NOA61' LAU 2.36390625 0.0 0.025493134 -0.000580235 -0.349933e-5 0.445404e-7"
     glass = of(private(formula, "'NOA61'"))[0].surfaces[1].glass
     assert float(index(glass, 0.5893)) == pytest.approx(1.56, abs=0.005)
@@ -472,7 +472,7 @@ def test_private_glasses():
     assert "index of X at 587.6 nm is estimated" in of(private("PWL 500 600\n'X' 1.51 1.50", "X"))[1].notes[0]
 
 
-def test_what_is_in_no_catalog_comes_back():
+def test_glasses_of_no_catalog_round_trip():
     lens = of(private("PWL 587.6 500 600\n'X' 1.502 1.51 1.50", "X"))[0]
     for glass in (lens.surfaces[1].glass, constant(1.333), constant(1.333, "WATER"), model_glass(1.6, 40.0)):
         changed = lens.replace(2, glass=glass)
@@ -526,7 +526,7 @@ def test_of_zoom_positions_the_first_is_read_and_reported():
     assert "3 zoom positions (ZOO): the first is read" in report.warnings[0]
 
 
-def test_a_lens_module_of_what_is_known_is_reported():
+def test_a_lens_module_is_reported():
     lens, report = of(SINGLET.replace("STO", "STO\nCCY 0; THC 0\nXYZ 4\nXDE 0.0"))
     status = {keyword.name: keyword.status for keyword in report.keywords}
     assert (status["CCY"], status["XYZ"], status["RDM"]) == ("ignored", "unknown", "read")
@@ -552,7 +552,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_is_not_modelled_is_refused_by_name_line_and_surface(command):
+def test_unmodelled_features_are_refused_by_name_line_and_surface(command):
     with pytest.raises(UnsupportedSurface) as caught:
         of(SINGLET.replace("STO", f"STO\n{command}"))
     assert f"{REFUSED[command]} is not modelled" in str(caught.value)
@@ -588,7 +588,7 @@ def test_what_is_not_modelled_is_refused_by_name_line_and_surface(command):
         ("GO", "S 0 0", "after SI"),
     ],
 )
-def test_what_is_not_settled_or_wrong_is_refused_with_its_reason(old, new, message):
+def test_ambiguous_or_wrong_commands_are_refused_with_the_reason(old, new, message):
     text = SINGLET.replace("1e14", "500") if "finite" in message else SINGLET
     with pytest.raises(LensFileError) as caught:
         of(text.replace(old, new, 1))
@@ -596,7 +596,7 @@ def test_what_is_not_settled_or_wrong_is_refused_with_its_reason(old, new, messa
     assert "\n" not in str(caught.value)
 
 
-def test_every_command_that_is_read_is_met_in_one_file_which_comes_back():
+def test_a_file_with_every_supported_command_round_trips():
     lens, report = of(EVERYTHING)
     met = {keyword.name for keyword in report.keywords if keyword.status == "read"}
     wanted = (
@@ -636,7 +636,7 @@ def test_a_written_lens_is_one_that_code_v_reads():
         ({"glass": constant(1.5, "two words")}, "one word"),
     ],
 )
-def test_what_a_sequence_cannot_hold_is_refused(changes, message, tmp_path):
+def test_data_that_a_sequence_cannot_hold_are_refused(changes, message, tmp_path):
     with pytest.raises(LensFileError, match=message) as caught:
         write_lens(read_lens("double_gauss").replace(3, **changes), tmp_path / "lens.seq")
     assert caught.value.surface == 3
@@ -671,7 +671,7 @@ def test_a_file_cut_off_anywhere_is_no_shorter_lens():
 
 @settings(max_examples=400, deadline=None)
 @given(seed=st.integers(0, 2**63), which=st.integers(0, 4))
-def test_damaged_files_give_a_lens_that_comes_back_or_a_clear_error(seed, which):
+def test_damaged_files_give_a_lens_that_round_trips_or_a_clear_error(seed, which):
     text = (ASPHERE, DOUBLE_GAUSS.format("PIM", -0.4), EVERYTHING, QUESTAR, THREE_MIRRORS)[which]
     read_damaged(Path("lens.seq"), damaged(text.encode(), random.Random(seed)))
 

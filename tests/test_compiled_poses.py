@@ -146,7 +146,7 @@ def test_all_of_a_system_is_compiled(name):
 @pytest.mark.parametrize("with_path", [True, False])
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 5e-3)])
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
+def test_the_adjoint_equals_autograd(name, dtype, close, with_path):
     surfaces, rays, how = given(name, dtype, with_path=with_path)
     weights = drawn(7, 3, 300, seed=8).to(dtype)
 

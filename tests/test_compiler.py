@@ -1,4 +1,4 @@
-"""What is executed was written by nobody else: folders, links, files; a library that somebody planted is not run."""
+"""Only compiled code of this user is run: checks of folders, links and files; a planted library is refused."""
 
 import ctypes
 import os
@@ -81,7 +81,7 @@ def test_links_are_followed_step_by_step(tmp_path):
     assert "too many links" in refused(tmp_path / "round")
 
 
-def test_what_belongs_to_others_is_refused(tmp_path, monkeypatch):
+def test_files_of_other_users_are_refused(tmp_path, monkeypatch):
     """To another user our own folders and files are somebody else's (root's folders he has to trust)."""
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "file").chmod(0o600)
@@ -283,7 +283,7 @@ def test_the_compiler_is_not_looked_for_in_the_current_folder(tmp_path, monkeypa
 
 
 def test_the_compiler_runs_in_a_private_folder(tmp_path, monkeypatch):
-    """What it looks for beside itself, `as` or what CPATH names, is not the user's current folder's."""
+    """Programs that the compiler starts (`as`) and folders in CPATH are not those of the current folder."""
     monkeypatch.setenv("PATH", os.pathsep.join([".", os.environ["PATH"]]))
     done = library.run_compiler("/bin/sh", "-c", "pwd; echo $PATH", folder=tmp_path)
     place, path = done.stdout.splitlines()

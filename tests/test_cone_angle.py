@@ -44,7 +44,7 @@ def test_a_lens_at_other_conditions_keeps_its_cone():
     assert np.isclose(float(lens.aperture.value), 160.0)
 
 
-def test_what_is_traced_of_a_cone_beyond_a_right_angle_is_reported(tmp_path):
+def test_the_traced_part_of_a_cone_beyond_a_right_angle_is_reported(tmp_path):
     path = tmp_path / "ellipse.zmx"
     write_lens(ellipse(160.0), path)
     with pytest.warns(UserWarning, match=r"ellipse\.zmx:\d+: a cone of .* within 20 degrees of the axis"):

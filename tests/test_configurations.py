@@ -85,7 +85,7 @@ def saved_alike(one, other) -> bool:
     return True
 
 
-#: An operand, its values, and the file saved in each of the configurations: (what stands there, what it becomes).
+#: An operand, its values, and the file saved in each of the configurations: (text of the file, its replacement).
 ASPHERE = "TYPE EVENASPH\nPARM 1 0\nPARM 2 1e-5"
 RAIM = "PWAV 2\nRAIM 0 0"
 CASES = {
@@ -176,7 +176,7 @@ def test_a_scanning_mirror_turns_the_light_by_twice_its_angle_and_its_pickup_tur
             assert saved_alike(one, other)
 
 
-def test_what_no_operand_names_is_shared_and_derivatives_reach_both():
+def test_numbers_without_an_operand_are_shared_by_configurations_with_derivatives():
     lens = read(file(tail=two("THIC", 1, "4", "5.5")))[0]
     values = lens.operands[0].numbers.clone().requires_grad_()
     curvature = lens.surfaces[2].curvature.clone().requires_grad_()
@@ -237,7 +237,7 @@ def test_a_configuration_that_is_not_there_is_refused():
         ("THIC 1 {} 1e{}99", "too large"),
     ],
 )
-def test_what_is_not_followed_is_reported_and_the_configuration_refused(line, said):
+def test_unsupported_operands_are_reported_and_the_configuration_refused(line, said):
     text = file(tail=operands(line.format(1, 0), line.format(2, 7)))
     lens, report = read(text)
     number = text.splitlines().index(line.format(1, 0)) + 1
@@ -276,7 +276,7 @@ def test_unknown_known_and_missing_operands_are_reported():
         assert piece in said
 
 
-def test_what_rays_are_solved_for_is_reported_where_operands_bend_them():
+def test_ray_solves_that_operands_change_are_reported():
     solved = {"stop": "MAZH 0 0"}
     text = file(tail=two("THIC", 1, "4", "5"), **solved)
     assert any(
@@ -311,6 +311,30 @@ def test_pickups_are_followed_and_written_and_other_rules_left(name, tmp_path):
     assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
 
 
+def test_a_focal_length_that_is_picked_up_is_followed_by_its_reciprocal(tmp_path):
+    ideal = "TYPE PARAXIAL\nPARM 1 50\nPARM 2 1"
+    stop = "TYPE PARAXIAL\nPARM 1 150\nPARM 2 1\nPPAR 1 1 3 0 0"
+    text = file(tail=two("PRAM", 1, "50", "80", 1), surface=ideal, stop=stop)
+    text = text.replace("CURV 0.02", "CURV 0").replace("CURV -0.02", "CURV 0")
+    lens, report = read(text)
+    assert not any("not followed" in line for line in (*report.warnings, *report.notes))
+    powers = [float(one.surfaces[2].phase.power_y) for one in lens.configurations]
+    assert powers == pytest.approx([1 / 150, 1 / 240], rel=1e-15)
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
+    broken = text.replace("PPAR 1 1 3 0 0", "PPAR 1 1 2 50 0")  # with an offset the reciprocal is not proportional
+    with pytest.raises(ValueError, match="picked up by a rule that is not followed"):
+        read(broken)[0].configuration(2)
+
+
+def test_terms_of_another_radius_are_followed_and_not_written(tmp_path):
+    surface = "TYPE XASPHERE\nXDAT 1 1\nXDAT 2 10\nXDAT 3 0.1"
+    lens = read(file(tail=two("EDVA", 1, "10", "5", 2), surface=surface))[0]
+    assert [one.surfaces[1].coefficients.tolist() for one in lens.configurations] == [[0.1 / 10**2], [0.1 / 5**2]]
+    with pytest.raises(LensFileError, match="EDVA 1 2: terms of another number or radius"):
+        write_lens(lens, tmp_path / "lens.zmx")
+
+
 def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
     tail = operands('MOFF 0 1 "far" 0 0', 'MOFF 0 2 "near" 0 0', "CWGT 0 1 1 0 0", "CWGT 0 2 2.5 0 0")
     lens = read(file(tail=tail))[0]
@@ -319,7 +343,7 @@ def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
     assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
 
 
-def test_a_table_says_that_it_holds_one_configuration(tmp_path):
+def test_a_table_reports_that_it_holds_one_configuration(tmp_path):
     lens = read(file(tail=two("THIC", 1, "4", "5")))[0].configuration(2)
     with pytest.warns(LensFileWarning, match="other configurations, 2 in all"):
         write_lens(lens, tmp_path / "lens.csv")
@@ -364,7 +388,7 @@ def test_the_command_opens_any_configuration(zoom, capsys):
     assert "configuration 2" in capsys.readouterr().err
 
 
-def test_info_says_which_configuration_it_is(zoom, capsys):
+def test_info_prints_the_configuration(zoom, capsys):
     assert main(["info", "zoom.zmx", "--configuration", "2"]) == 0
     assert re.search(r"configuration +2 of 2\n", capsys.readouterr().out)
     assert main(["info", "zoom.zmx", "--json"]) == 0
@@ -374,7 +398,7 @@ def test_info_says_which_configuration_it_is(zoom, capsys):
     assert "configuration" not in capsys.readouterr().out
 
 
-def test_check_shows_what_differs(zoom, capsys):
+def test_check_lists_differences_between_configurations(zoom, capsys):
     assert main(["check", "zoom.zmx"]) == 0
     out = capsys.readouterr().out
     assert re.search(r"THIC 1 +4 +5\n", out)

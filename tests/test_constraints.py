@@ -1,4 +1,4 @@
-"""What an optimisation keeps to, as words: each word tells the number of the lens that it names."""
+"""Constraints of an optimisation as words: each word names a quantity of the lens."""
 
 import re
 from pathlib import Path
@@ -103,7 +103,7 @@ def test_a_condition_may_be_of_one_configuration(lens):
         ("efl@2=50", "configuration 2; this lens has 1"),
     ],
 )
-def test_what_cannot_be_held_is_refused(lens, hold, said):
+def test_impossible_constraints_are_refused(lens, hold, said):
     with pytest.raises(BadHold, match=re.escape(said)):
         conditions_of(lens, hold)
 
@@ -116,7 +116,7 @@ def test_without_a_field_off_the_axis_there_is_no_image_height(lens):
 # -- held while a lens is optimised ------------------------------------------------------------------------------------
 
 
-def test_what_is_held_is_met_when_a_lens_is_optimised():
+def test_constraints_are_met_by_an_optimised_lens():
     lens = rt.read_lens("cooke_triplet")
     track = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
     hold = f"efl=99 total_track<={track - 0.5} thickness:1=3.2"
@@ -135,7 +135,7 @@ def test_a_zoom_lens_is_held_in_each_configuration():
     assert after == pytest.approx([lengths[0] - 0.5, lengths[1] + 0.5], rel=1e-7)
 
 
-def test_what_is_held_is_in_millimetres_also_beside_a_merit_function_in_inches():
+def test_constraints_are_in_millimetres_for_a_merit_function_in_inches():
     lens = rt.read_lens("cooke_triplet")
     inches = rt.Merit(rt.Merit.default(lens).rows, 25.4)
     found = rt.optimize(lens, merit=inches, vary="curvature sensor", hold="efl=99", cycles=6)

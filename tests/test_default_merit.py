@@ -15,7 +15,7 @@ PRINTED = 1e-6  # the files hold six to twelve digits
 
 SQUARE = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
-#: Files whose default merit function stands as it was made, and what it was made with beside what the file says.
+#: Files with an unchanged default merit function, and the options with which it was made.
 STORED = {
     "Project_X__AchromaticAt800nmF25mm.ZMX": {},
     "Project_X__Apochromat3.zmx": {"rings": 5},
@@ -87,7 +87,7 @@ def test_the_rows_of_a_triplet_have_the_weights_that_opticstudio_prints():
     assert first[6].numbers[3] < 0
 
 
-@pytest.mark.parametrize("fields", [[0, 7], [(3, 0), (0, 7)]], ids=["on y", "beside y"])
+@pytest.mark.parametrize("fields", [[0, 7], [(3, 0), (0, 7)]], ids=["on y", "off y"])
 @pytest.mark.parametrize(("rings", "arms"), [(3, 6), (4, 8), (6, 12)])
 def test_the_weighted_sum_over_rows_is_an_integral_over_the_pupil(fields, rings, arms):
     """Σ w f(P) of a field and wavelength is its share of ∬ f dP, exact for polynomials up to the order of the rule."""
@@ -103,7 +103,7 @@ def test_the_weighted_sum_over_rows_is_an_integral_over_the_pupil(fields, rings,
     assert len(outer) == rings * (arms // 2 if fields == [0, 7] else arms)
 
 
-def test_weights_of_fields_and_wavelengths_are_the_lens_s_own_or_those_given():
+def test_weights_of_fields_and_wavelengths_are_those_of_the_lens_or_given():
     lens = rt.read_lens("double_gauss").at(fields=[0, 7, 14], wavelengths=[0.5, 0.6])
     one = sum(row.weight for row in DefaultMerit().rows(lens))
     assert one == pytest.approx(np.pi, rel=1e-12)
@@ -163,7 +163,7 @@ def test_other_kinds_have_operands_of_their_own():
         ("spot", {"wavelength_weights": [-1]}, "0 or more"),
     ],
 )
-def test_what_cannot_be_made_is_refused(kind, options, said):
+def test_impossible_merit_functions_are_refused(kind, options, said):
     with pytest.raises(BadMerit, match=re.escape(said)):
         DefaultMerit(kind, **options).rows(rt.read_lens("double_gauss"))
 

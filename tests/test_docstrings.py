@@ -1,12 +1,13 @@
 """Names in docstrings: every dotted one in backticks is a module, or something of a module, a class or a lens."""
 
 import ast
+import functools
 import importlib
 import re
+from pathlib import Path
 from types import ModuleType
 
-import pytest
-from test_layers import FLOORS, MODULES, PACKAGE, parsed, room
+from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 import raytrace
 
@@ -15,12 +16,16 @@ DOTTED = re.compile(r"`((?:\w+\.)+\w+)(?:\([^`]*)?`")
 CODE, DATA = ("py", "cpp", "h"), ("csv", "json", "pt", "zmx")
 #: Libraries, and other people's programs that a reader of their files speaks of.
 ELSEWHERE = ("nn", "seq_model", "torch")
-#: Rooms whose modules a name may mean; those of the others only from inside of them.
+#: Packages whose modules any docstring may name; modules of the others are named within their package only.
 LIBRARY = {*FLOORS} - {"bench", "cli", "plot"}
-#: Classes, as (module, name).
-CLASSES = [
-    (name, node.name) for name in MODULES for node in parsed(MODULES[name]).body if isinstance(node, ast.ClassDef)
-]
+
+
+@functools.cache
+def classes() -> list[tuple[str, str]]:
+    """Classes, as (module, name)."""
+    return [
+        (name, node.name) for name in MODULES for node in parsed(MODULES[name]).body if isinstance(node, ast.ClassDef)
+    ]
 
 
 def named(name: str) -> set[str]:
@@ -47,15 +52,17 @@ def is_there(dotted: str, name: str) -> bool:
     if first in ELSEWHERE or words[-1:] in [[data] for data in DATA]:
         return True
     if words[-1:] in [[code] for code in CODE]:
-        return any(PACKAGE.rglob(dotted))
+        return any(PACKAGE.rglob(dotted)) or (Path(__file__).parent / dotted).exists()
     if dotted in MODULES or first == "rt":
         return dotted in MODULES or words[0] in raytrace.PUBLIC
-    homes = [module(one) for one in MODULES if one.split(".")[-1] == first and room(one) in (room(name), *LIBRARY)]
+    within = (package_of(name), *LIBRARY)
+    homes = [module(one) for one in MODULES if one.split(".")[-1] == first and package_of(one) in within]
     homes += [getattr(home, first) for home in (module(name), raytrace) if hasattr(home, first)]
-    classes = [
-        one for one in CLASSES if one[1] in (first, first.capitalize()) and room(one[0]) in (room(name), *LIBRARY)
+    homes += [
+        getattr(module(where), one)
+        for where, one in classes()
+        if one in (first, first.capitalize()) and package_of(where) in within
     ]
-    homes += [getattr(module(where), one) for where, one in classes]
     for home in homes:
         try:
             for word in words:
@@ -66,13 +73,10 @@ def is_there(dotted: str, name: str) -> bool:
     return False
 
 
-#: Modules with such names but those that need the extra [bench].
-NAMING = [name for name in MODULES if not name.startswith("bench.peers") and named(name)]
-
-
-@pytest.mark.parametrize("name", NAMING)
-def test_dotted_names_in_docstrings_are_there(name):
-    assert [dotted for dotted in sorted(named(name)) if not is_there(dotted, name)] == []
+def test_dotted_names_in_docstrings_are_there():
+    """In all modules but those that need the extra [bench]."""
+    names = [name for name in MODULES if not name.startswith("bench.peers")]
+    assert [(name, dotted) for name in names for dotted in sorted(named(name)) if not is_there(dotted, name)] == []
 
 
 def test_a_name_of_the_past_is_not_there():

@@ -35,7 +35,7 @@ def test_air_has_the_index_that_opticstudio_takes():
     assert air_index(float64(0.55), 20.0, 0.0).item() == 1.0
 
 
-#: dn/dT in 1e-6/K at 1060.0 nm, e and g, beside air and beside vacuum, from SCHOTT's data sheet of N-BK7.
+#: dn/dT in 1e-6/K at 1060.0 nm, e and g, relative to air and to vacuum, from SCHOTT's data sheet of N-BK7.
 LINES = (1.0600, 0.5460740, 0.4358343)
 DATA_SHEET = {
     (-40, -20): ((2.4, 2.9, 3.3), (0.3, 0.8, 1.2)),
@@ -68,7 +68,7 @@ def test_a_catalog_at_its_own_temperature_is_the_catalog():
     assert thermal(find_glass("S-BSL7")).reference == 25.0
 
 
-def test_pressure_alone_leaves_the_index_beside_vacuum():
+def test_pressure_alone_leaves_the_index_relative_to_vacuum():
     """The glass is as it was; the lens's wavelength and the lens's air are other ones."""
     glass, line = find_glass("SK16", catalogs=["SCHOTT"]), float64(0.55)
     air = air_index(line, 20.0, 1.0)
@@ -107,7 +107,7 @@ def test_vacuum_of_the_catalog_is_vacuum_everywhere():
 
 
 @pytest.mark.parametrize("glass", [constant(1.333, "WATER"), model_glass(1.517, 64.2), AIR])
-def test_a_medium_given_by_numbers_keeps_its_index_beside_the_air_around_it(glass):
+def test_a_medium_given_by_numbers_keeps_its_index_relative_to_air(glass):
     line = float64([0.45, 0.6])
     expected = refractive_index(glass, line)
     assert torch.equal(index_in(glass, line, place(60.0, 0.2)), expected)
@@ -207,7 +207,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     assert lens.at(f_number=4).environment is None
 
 
-def test_what_is_not_given_of_an_environment_stays():
+def test_unspecified_conditions_of_an_environment_stay():
     lens = rt.read_lens("double_gauss").at(temperature=40)
     assert lens.environment.pressure.item() == 1.0
     lens = lens.at(pressure=0.5).at(object_distance=1e4)
@@ -276,7 +276,7 @@ def test_temperatures_side_by_side():
         (dict(temperature="warm"), "'warm' is not a number"),
     ],
 )
-def test_what_no_air_has_is_refused(conditions, said):
+def test_impossible_temperatures_and_pressures_are_refused(conditions, said):
     with pytest.raises(ValueError, match=said):
         rt.read_lens("double_gauss").at(**conditions)
 
@@ -321,14 +321,16 @@ def test_temperature_and_pressure_are_conditions_of_a_command(command):
     assert rt.info(vacuum_cell()).document()["surfaces"][3]["environment"] == {"temperature": 20.0, "pressure": 0.0}
 
 
-def test_the_command_tells_a_glass_at_a_temperature(command):
+def test_the_command_prints_a_glass_at_a_temperature(command):
     code, out, err = command("glass", "N-BK7", "--temperature", 30, "--wavelength", *LINES)
     assert code == 0, err
-    slopes = [line.split()[4:6] for line in out.splitlines() if line.startswith("  n(")]
-    assert [
-        tuple(round(1e6 * float(number.removesuffix("/K")), 1) for number in column)
-        for column in zip(*slopes, strict=True)
-    ] == [*DATA_SHEET[20, 40]]
+    headings, units, *rows = out.splitlines()[-2 - len(LINES) :]
+    assert headings.split() == ["wavelength", "index", "dn/dT,", "air", "dn/dT,", "vacuum"]
+    assert units.split() == ["µm", "1/K", "1/K"]
+    slopes = [line.split()[2:] for line in rows]
+    assert [tuple(round(1e6 * float(number), 1) for number in column) for column in zip(*slopes, strict=True)] == [
+        *DATA_SHEET[20, 40]
+    ]
     found = json.loads(command("glass", "N-BK7", "--pressure", 0, "--json")[1])
     assert found["dn_dt"] == pytest.approx(found["dn_dt_absolute"])
     assert [*json.loads(command("glass", "N-BK7", "--json")[1])][-1] == "indices"
@@ -381,7 +383,7 @@ TABLE = "# temperature: {}\n# wavelengths: 0.55\n# fields: 0\n# aperture: EPD 5\
         ),
     ],
 )
-def test_a_table_says_what_it_cannot_read(tmp_path, temperature, rest, said):
+def test_a_table_reports_columns_that_it_cannot_read(tmp_path, temperature, rest, said):
     path = tmp_path / "lens.csv"
     path.write_text(TABLE.format(temperature, rest), encoding="utf-8")
     if said:
@@ -434,7 +436,7 @@ def cell_file(folder, environment="20 1 1", operands=OPERANDS, glass="SK16"):
     return path
 
 
-def test_a_file_tells_which_surfaces_stand_in_another_pressure(tmp_path):
+def test_a_file_stores_surfaces_at_another_pressure(tmp_path):
     lens, report = read_lens_with_report(cell_file(tmp_path))
     assert not report.warnings
     assert [k for k, surface in enumerate(lens.surfaces) if surface.environment] == [3, 4, 5]

@@ -86,7 +86,7 @@ def run(model, seed, *, l1_joint, l1_drt, focus, sensor, by_distance=None):
 
 
 def paper(by_distance=None, **changed):
-    """Runs that say what the paper says, but for some of the models; by_distance: less 0.04, beside the loss of DRT."""
+    """Runs with the figures of the paper, except some models; by_distance: 0.04 less than the loss of DRT."""
     at = by_distance and {z: loss - 0.043 for z, loss in by_distance.items()}
     return [
         run(
@@ -133,7 +133,7 @@ def number_of(beginning):
     return TEXTS[number]
 
 
-def test_the_papers_own_numbers_answer_yes():
+def test_the_numbers_of_the_paper_answer_yes():
     found = paper(by_distance={"10000": 0.049, "15000": 0.060, "25000": 0.044, "50000": 0.050})
     assert {claim.answer for claim in claims(found, TIMES, SEEN)} == {"yes"}
     of = {claim.text: claim for claim in claims(found, TIMES, SEEN)}
@@ -198,7 +198,7 @@ def test_gains_at_distances_are_those_over_the_better_of_both():
     assert f"{100 * (0.0524 / 0.040 - 1):+.1f} % at 50 m" in claims(found, ())[everywhere].figures
 
 
-def test_a_claim_that_is_not_answered_says_why():
+def test_a_claim_that_is_not_answered_has_a_reason():
     """Not by a run that is missing where all have ended, but more than the sensor varied, or at other distances."""
     judged = {one.text: one for one in claims(paper(), TIMES, dataclasses.replace(SEEN, settled={}))}
     early, near = (judged[number_of(text)] for text in ("The focus is near", "All lose less at 10 m"))
@@ -212,7 +212,7 @@ def test_a_claim_that_is_not_answered_says_why():
     assert runs[number_of("The focus is near")].figures == "no finished run of fourier"
 
 
-def test_what_a_course_is_settled_after():
+def test_a_course_is_settled_after_its_last_change():
     assert settled([25.0, 30.0, 33.0, 34.0, 34.5]) == 0.4
     assert settled([34.0, 34.0]) == 0
 

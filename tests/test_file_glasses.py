@@ -1,4 +1,4 @@
-"""What lens files leave to be found: glasses that are picked up, fields beyond twelve, long waves."""
+"""Glasses of lens files: pickups, substitutes, estimates by glass code; fields beyond twelve; long wavelengths."""
 
 import dataclasses
 import re
@@ -57,7 +57,7 @@ def test_a_pickup_of_another_glass_than_its_name_is_reported():
     )
 
 
-def test_fields_beyond_twelve_stand_in_lines_of_their_own(tmp_path):
+def test_fields_beyond_twelve_have_separate_lines(tmp_path):
     """FEFD: x, y, weight and vignetting factors of the 13th and every further field; written so again, also in cm."""
     y = list(range(12))
     head = {
@@ -108,7 +108,7 @@ def test_nanometres_that_a_person_types_are_refused():
         check_media(read(file(W1="WAVM 1 5 1"))[0], torch.tensor([5.0]))
 
 
-#: The singlet with a glass that no catalog holds, in every format; that with nd and Vd beside it, where it has a place.
+#: The singlet with a glass that no catalog holds, in every format; that with nd and Vd, where the format stores them.
 UNKNOWN = {
     ".zmx": file().replace("GLAS N-BK7 0 0 1.5 40", "GLAS XK99 0 0 1.5168 64.17"),
     ".csv": "# stop: 1\n# F/5\nradius,thickness,glass,nd,νd\n50,4,XK99,1.5168,64.17\n-50,47.5,,,\n",
@@ -200,7 +200,7 @@ def sequence(waves: str, glass: str, private: str = "", **options):
 
 @pytest.mark.parametrize("name", ["755276", "1.7552:27.6", "755200.276000"])
 def test_indices_beyond_the_lines_of_a_glass_by_its_code_are_refused_unless_asked_for(name):
-    """At 404.7 nm the formula errs by more than 1e-4, which is named with the ways out; between F and C it stands."""
+    """At 404.7 nm the formula errs by more than 1e-4, which is reported with remedies; not between F and C."""
     _, report = sequence("656.27 587.56 546.1 486.13", name)
     assert not report.warnings
     with pytest.raises(LensFileError, match=rf"index of {name} at 404\.7 nm is est.*to about \d\.\de-03.*=formula"):
@@ -221,7 +221,7 @@ def test_an_estimate_of_a_glass_by_its_code_that_is_good_is_noted():
     assert "the index of 517642 at 660 nm is estimated by a formula, to about" in report.notes[0]
 
 
-def test_estimates_of_glasses_of_makers_are_as_good_as_said():
+def test_estimates_of_catalog_glasses_are_as_good_as_reported():
     """Of SCHOTT's glasses at 404.7 nm: in nine of ten the estimate errs by less than three times what is said."""
     glasses = [glass for glass in shipped_catalog("SCHOTT").glasses.values() if glass.wavelength_range[0] < 0.4]
     held = 0

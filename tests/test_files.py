@@ -44,7 +44,7 @@ def test_a_table_without_rows_has_its_headings():
 @pytest.mark.parametrize(
     "write", [lambda path: write_json(path, {"a": object()}), lambda path: write_table(path, [{"a": 1}], ["b"])]
 )
-def test_what_cannot_be_written_leaves_the_file_as_it_was(tmp_path, write):
+def test_a_failed_write_leaves_the_file_unchanged(tmp_path, write):
     path = tmp_path / "kept"
     write_text(path, "größer")
     with pytest.raises((TypeError, KeyError)):
@@ -53,6 +53,6 @@ def test_what_cannot_be_written_leaves_the_file_as_it_was(tmp_path, write):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_document_comes_back(tmp_path):
+def test_a_document_round_trips(tmp_path):
     write_json(tmp_path / "found.json", {"radius": 0.1, "fields": [0, None]})
     assert json.loads((tmp_path / "found.json").read_text()) == {"radius": 0.1, "fields": [0, None]}

@@ -27,7 +27,7 @@ AXIS = torch.zeros(2, 1, dtype=torch.float64)
 
 
 def rms(system, **options):
-    """Mean square radius over fields and wavelengths of a lens as it stands, retraced."""
+    """Mean square radius over fields and wavelengths of the unchanged lens, retraced."""
     return spot_of(image_rays(system, POINTS, **options), WEIGHTS).mean_square_radius
 
 
@@ -191,7 +191,7 @@ def test_moments_and_parabola_of_a_lost_spot_are_nan():
     assert mean_rms_radius(double_gauss(), POINTS, WEIGHTS, fields=LOST).isnan()
 
 
-def test_mean_rms_radius_is_what_focus_makes_least():
+def test_focus_minimises_the_mean_rms_radius():
     system, distances = double_gauss(), [10000.0, 50000.0]
     best = focus_of_rms(system, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
     radii = [

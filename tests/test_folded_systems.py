@@ -1,4 +1,4 @@
-"""Lenses whose axis bends: folds change nothing, tilted sensors are geometry, and moving everything moves nothing."""
+"""Folded and tilted systems: folds change no image, tilted sensors follow geometry, rigid motion changes nothing."""
 
 import dataclasses
 import math
@@ -189,7 +189,7 @@ def test_a_perfect_lens_has_no_wavefront_of_its_own():
             assert float(rt.wavefront(one, size=15).rms.max()) < 1e-9
 
 
-def test_a_spectrum_stands_apart_on_the_sensor():
+def test_a_spectrum_is_separated_on_the_sensor():
     """Wavelengths land where the grating sends them; each spot is small about its own centroid alone."""
     found = rt.spot(bends.spectrometer().at(fields=[0.0]), reference="chief")
     y = found.centroid[1, 0]

@@ -1,4 +1,4 @@
-"""Commands on lenses whose axis bends: a figure that shows all of it, or one line that says why there is none."""
+"""Commands on folded systems: a figure that shows the whole system, or one line with the reason for its absence."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from raytrace.words import named, with_article
 
 
 @pytest.mark.parametrize("command", ["incidence", "rms-over-field", "distortion-grid", "distortion", "field-curvature"])
-def test_what_needs_fields_says_so_by_the_name_of_the_lens(run, tmp_path, command):
+def test_analyses_over_fields_name_a_lens_without_fields(run, tmp_path, command):
     """A curve over one field point is an empty figure."""
     figure = tmp_path / "figure.png"
     outcome = run(command, "spectrometer", "--plot", str(figure))
@@ -35,7 +35,7 @@ def test_what_needs_fields_says_so_by_the_name_of_the_lens(run, tmp_path, comman
         (["compare", "folded_relay"], "ask for kernels of one model by `psf`"),
     ],
 )  # fmt: skip
-def test_a_refusal_names_the_surface_and_what_else_there_is(run, tmp_path, argv, said):
+def test_a_refusal_names_the_surface_and_the_alternatives(run, tmp_path, argv, said):
     outcome = run(*(str(tmp_path / word) if word == "OUT.csv" else word for word in argv))
     assert (outcome.code, outcome.out) == (1, "")
     assert said in outcome.err

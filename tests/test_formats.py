@@ -50,7 +50,7 @@ def readable(path: Path) -> Lens | None:
         return None
 
 
-# -- round trips ------------------------------------------------------------------------------------------------------
+# -- round trips -------------------------------------------------------------------------------------------------------
 
 
 def test_the_double_gauss_is_that_of_the_publication_in_both_files():
@@ -77,7 +77,7 @@ def test_own_lenses_are_read_without_a_warning(path):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
-def test_every_number_comes_back_bit_for_bit(path, suffix, tmp_path):
+def test_every_number_round_trip_bit_identically(path, suffix, tmp_path):
     lens = read_lens(path)
     write_lens(lens, tmp_path / f"lens{suffix}")
     assert leaves(read_lens(tmp_path / f"lens{suffix}", strict=True)) == leaves(lens)
@@ -99,7 +99,7 @@ def without_intent(lens):
 
 @pytest.mark.skipif(not CORPUS, reason="the corpus of real files is not at hand")
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
-def test_real_files_come_back_bit_for_bit(path, tmp_path):
+def test_real_files_round_trip_bit_identically(path, tmp_path):
     lens = readable(path)
     if lens is None:
         pytest.skip("refused by name")
@@ -143,7 +143,7 @@ def test_any_64_bit_number_survives(suffix, curvature, conic, thickness, terms, 
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_media_that_are_in_no_catalog_come_back(suffix, tmp_path):
+def test_media_of_no_catalog_round_trip(suffix, tmp_path):
     by_figures_alone = suffix == ".seq"  # neither a name of a model glass nor its partial dispersion
     for glass in (
         constant(1.333),
@@ -157,7 +157,7 @@ def test_media_that_are_in_no_catalog_come_back(suffix, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_texts_of_any_language_come_back(suffix, tmp_path):
+def test_texts_of_any_language_round_trip(suffix, tmp_path):
     lens = read_lens("double_gauss").replace(2, comment='Fläche, "zwei"; 表面')
     lens = dataclasses.replace(lens, name="Größe #1: λ", notes=("x" * 431, "a, b; c: d,", "# e"))
     write_lens(lens, tmp_path / f"lens{suffix}")
@@ -166,7 +166,7 @@ def test_texts_of_any_language_come_back(suffix, tmp_path):
     assert again.notes == lens.notes
 
 
-# -- what cannot be written -------------------------------------------------------------------------------------------
+# -- what cannot be written --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_texts_of_any_language_come_back(suffix, tmp_path):
         ({"apertures": (Aperture("circular", (0.0, 1.0)),) * 2}, ".zmx", "has one"),
     ],
 )
-def test_what_a_format_cannot_hold_is_refused(changes, suffix, message, tmp_path):
+def test_data_that_a_format_cannot_hold_are_refused(changes, suffix, message, tmp_path):
     with pytest.raises(LensFileError, match=message) as caught:
         write_lens(read_lens("double_gauss").replace(3, **changes), tmp_path / f"lens{suffix}")
     assert caught.value.surface == 3
@@ -223,7 +223,7 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
         write_lens(read_lens("double_gauss"), tmp_path / "no such folder" / "lens.zmx")
 
 
-# -- the door ---------------------------------------------------------------------------------------------------------
+# -- reading and writing -----------------------------------------------------------------------------------------------
 
 
 def test_suffixes_and_paths_that_are_no_lens_files(tmp_path):
@@ -266,7 +266,7 @@ def test_10000_surfaces_are_refused_with_the_line(suffix, tmp_path):
     assert caught.value.line is not None
 
 
-def test_what_is_accepted_but_lossy_is_warned_of_once(tmp_path):
+def test_lossy_data_are_warned_of_once(tmp_path):
     path = tmp_path / "lens.csv"
     path.write_text("surface,radius,thickness\nstop,,3\nimage,,\n")
     with pytest.warns(LensFileWarning, match="no wavelengths"):
@@ -299,7 +299,7 @@ def test_long_lines_do_not_hang(line, name):
     read_damaged(Path(name), content)
 
 
-# -- damaged files ----------------------------------------------------------------------------------------------------
+# -- damaged files -----------------------------------------------------------------------------------------------------
 
 _NUMBERS = "nan inf -inf INFINITY 1e999 1e308 -1e308 1e-320 0 -1 1 2 24 99 12345678901234567890 1_0 ١ 1,5 -0.0 10,20"
 _NAMES = '___BLANK MIRROR AIR 517642 STANDARD EVENASPH COORDBRK SURF STOP IN M METER 1.5/ = ( ) # : nm + é \x00 " ""'
@@ -404,10 +404,10 @@ def test_a_file_cut_off_anywhere_is_no_shorter_lens(path):
         assert len(cut.surfaces) == len(lens.surfaces)
 
 
-# -- the verbs --------------------------------------------------------------------------------------------------------
+# -- the commands ------------------------------------------------------------------------------------------------------
 
 
-def test_check_tells_what_was_read():
+def test_check_reports_the_data_read():
     found = rt.check("double_gauss")
     lens, report = read_lens_with_report("double_gauss")
     assert str(found) == str(report)
@@ -418,7 +418,7 @@ def test_check_tells_what_was_read():
     assert set(frame.status) <= {"read", "ignored", "unknown"}
 
 
-def test_check_refuses_what_cannot_be_traced(tmp_path):
+def test_check_refuses_untraceable_lenses(tmp_path):
     path = tmp_path / "still.zmx"
     text = (ROOT / "lenses" / "singlet.zmx").read_text()
     path.write_text(text.replace("FTYP 0", "FTYP 1"))  # heights of an object at infinity
@@ -427,7 +427,7 @@ def test_check_refuses_what_cannot_be_traced(tmp_path):
         rt.check(path)
 
 
-def test_convert_says_what_it_wrote(tmp_path):
+def test_convert_reports_the_file_written(tmp_path):
     found = rt.convert("double_gauss", tmp_path / "copy.csv")
     source, target = shipped("lenses") / "double_gauss.zmx", tmp_path / "copy.csv"
     assert str(found) == f"{target}: 13 surfaces from {source}"

@@ -14,8 +14,8 @@ from raytrace.maths.bivariate import powers
 from raytrace.maths.numerics import to
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
-from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial
-from raytrace.system.shapes import KINDS, relief
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial, relief
+from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, sag_at, vertex_curvature, vertex_curvatures
 from raytrace.tracing.trace import trace_surfaces
 
@@ -144,7 +144,7 @@ def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
         close(basis[j - 1], true, atol=1e-15)
 
 
-def test_polynomial_terms_stand_in_their_order():
+def test_polynomial_terms_are_in_order():
     assert powers(9) == [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
     x, y = points(50, 5.0, 1)
     sag_terms = polynomial()
@@ -254,7 +254,7 @@ def test_a_toroid_of_conic_minus_one_and_negative_radius(engine):
 
 
 @both_engines
-def test_float32_misses_what_float64_misses(engine):
+def test_float32_and_float64_miss_the_same_rays(engine):
     face = freeform("biconic", 1 / 8, -1.0, 1 / 9, 0.2)
     rays = start(*bundle(400, 9.0, 0.5))
     end, single = (

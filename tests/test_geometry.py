@@ -1,4 +1,4 @@
-"""What of a lens cannot be made: surfaces that close too early, negative gaps, surfaces that cross, thin edges."""
+"""Unbuildable geometry: surfaces that end within their aperture, negative spaces, crossing surfaces, thin edges."""
 
 import dataclasses
 import math
@@ -67,7 +67,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_cannot_be_made_is_found_with_its_figures(case):
+def test_unbuildable_geometry_is_reported_with_figures(case):
     made, (number, kind, amount), words = CASES[case]
     found = defects(made())[0]
     assert (found.surface, found.kind) == (number, kind)
@@ -92,7 +92,7 @@ GOOD = {
 
 
 @pytest.mark.parametrize("case", GOOD)
-def test_what_can_be_made_is_not_warned_of(case):
+def test_buildable_geometry_is_not_warned_of(case):
     assert defects(GOOD[case]()) == ()
 
 

@@ -93,7 +93,7 @@ def test_first_and_second_derivatives_in_wavelength_and_coefficients(formula):
     assert gradgradcheck(n, (coefficients, wavelengths), rtol=1e-5, atol=1e-5)
 
 
-# -- next to a pole, beyond it, and where there is nothing -----------------------------------------------------------
+# -- next to a pole, beyond it, and where there is nothing -------------------------------------------------------------
 
 
 def test_index_and_slope_next_to_a_pole_are_exact_to_rounding():
@@ -183,7 +183,7 @@ def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zer
         assert all((gradient == 0.0).all() for gradient in gradients if gradient is not None)
 
 
-# -- the door ---------------------------------------------------------------------------------------------------------
+# -- the public functions ----------------------------------------------------------------------------------------------
 
 
 def test_index_warns_outside_the_range_and_names_glass_wavelength_and_range():
@@ -192,7 +192,7 @@ def test_index_warns_outside_the_range_and_names_glass_wavelength_and_range():
     assert n[1].item() == pytest.approx(3.895422492943524, rel=4 * ULP)  # mpmath
 
 
-def test_index_refuses_what_has_none_and_names_place_glass_wavelength_formula_and_range():
+def test_a_missing_index_is_refused_with_place_glass_wavelength_formula_and_range():
     with pytest.raises(InvalidIndex) as caught:
         check_wavelengths(BK7, [0.55, 10.0], where="a.zmx:31, surface 2")
     for part in ("a.zmx:31, surface 2", "N-BK7 (SCHOTT)", "at 10 µm", "sellmeier_1", "0.3 to 2.5 µm"):
@@ -202,7 +202,7 @@ def test_index_refuses_what_has_none_and_names_place_glass_wavelength_formula_an
             index(BK7, wrong)
 
 
-def test_inside_the_range_and_at_its_ends_nothing_is_said():
+def test_no_warning_inside_the_range_and_at_its_ends():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         index(BK7, float64([0.3, 0.55, 2.5]))
@@ -220,7 +220,7 @@ def test_a_mirror_has_no_index():
         refractive_index(MIRROR, float64(0.5))
 
 
-# -- shapes, dtypes, transforms --------------------------------------------------------------------------------------
+# -- shapes, dtypes, transforms ----------------------------------------------------------------------------------------
 
 
 def test_any_shape_and_the_dtype_of_the_wavelength():
@@ -259,7 +259,7 @@ def test_torch_func_transforms_and_compile_accept_it():
     assert torch.equal(compiled(BK7, wavelengths), refractive_index(BK7, wavelengths))
 
 
-# -- figures of a glass -----------------------------------------------------------------------------------------------
+# -- figures of a glass ------------------------------------------------------------------------------------------------
 
 
 def test_bk7_has_its_published_figures():
@@ -277,7 +277,7 @@ def test_a_medium_without_dispersion_has_abbe_number_zero():
     assert nd(AIR) == 1.0
 
 
-# -- model glass and MIL code -----------------------------------------------------------------------------------------
+# -- model glass and MIL code ------------------------------------------------------------------------------------------
 
 FIT_LINES = float64([0.5876, 0.4861, 0.6563, 0.4358])
 
@@ -334,7 +334,7 @@ def test_model_glass_refuses_numbers_that_are_no_glass(numbers):
         model_glass(*numbers)
 
 
-def test_sellmeier_refuses_what_does_not_pair():
+def test_sellmeier_refuses_unpaired_coefficients():
     with pytest.raises(ValueError, match="as many strengths as poles"):
         sellmeier([1.0, 2.0], [0.01])
     assert sellmeier([1.0] * 4, [0.01] * 4).formula == "sellmeier_3"

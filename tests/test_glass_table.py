@@ -46,6 +46,6 @@ def test_indices_have_derivatives():
         ([], [], "0 indices"),
     ],
 )
-def test_what_is_no_table_is_refused(wavelengths, indices, message):
+def test_malformed_tables_are_refused(wavelengths, indices, message):
     with pytest.raises(ValueError, match=message):
         from_table(wavelengths, indices)

@@ -76,7 +76,7 @@ def test_an_order_at_its_cut_off(engine, dtype, glass, off):
 
 
 @both_engines
-def test_what_is_lost_steers_nothing(engine):
+def test_failed_rays_have_no_gradient(engine):
     """The derivatives of all rays are those of the rays that arrive, of tilts, phases and toroids alike."""
     rays = beam(
         torch.linspace(-12, 12, 49, dtype=torch.float64), slope=torch.where(torch.arange(49) % 3 == 0, 0.4, 0.0)
@@ -125,7 +125,7 @@ def test_a_toroid_is_the_sheet_of_its_vertex(engine, dtype):
 @both_engines
 @DTYPES
 def test_a_cone_at_its_vertex(engine, dtype):
-    """z = a r has no normal there, and is met across its axis; beside it rays are bent by the slope a."""
+    """z = a r has no normal on its axis, where rays cross it; off the axis the slope a refracts rays."""
     slope = real([0.2, 0.0, 1e-4]).requires_grad_()
     cone = surface(None, 2.0, 1.5, kind="odd asphere", coefficients=slope)
     end = trace([cone, IMAGE], beam([0.0, 1e-30, 1e-9, -1e-9, 1.0]), index=[ONE, real(1.5), real(1.5)], dtype=dtype)
@@ -161,7 +161,7 @@ def test_an_ideal_lens_at_any_slope(engine, dtype, steep):
 @pytest.mark.parametrize("kind", [{}, {"curvature": 0.02}, {"glass": MIRROR}, {"glass": 1.5}])
 @pytest.mark.parametrize("name", ["tilt_x", "tilt_y"])
 def test_a_surface_edge_on(engine, dtype, kind, name):
-    """Rays along z in and beside its plane; none of them is a number less."""
+    """Rays along z in its plane and off it; no coordinate is undefined."""
     rays = beam([-1.0, 0.0, 1.0, 1e-300], x=[-1.0, 0.0, 1.0, -1e-300])
     index = [ONE, real(1.5), real(1.5)] if kind.get("glass") == 1.5 else None
     for tilt in (90.0, 90 + 1e-12, 90 - 1e-12, 270.0):
@@ -170,7 +170,7 @@ def test_a_surface_edge_on(engine, dtype, kind, name):
         assert_no_nan(trace([edge, IMAGE], rays, index=index, dtype=dtype), leaf)
 
 
-def test_the_medium_goes_on_through_a_break_and_a_mirror_behind_it():
+def test_the_medium_continues_through_a_break_and_a_mirror_behind_it():
     """A Mangin mirror with a break inside its glass and one that undoes it is the one without."""
     glass = rt.find_glass("N-BK7")
     turn = {"x": 0.5, "tilt_x": 8.0, "tilt_y": -3.0}
@@ -218,7 +218,7 @@ def test_breaks_that_undo_each_other(engine, dtype, far):
 @both_engines
 @pytest.mark.parametrize("tiny", [1e-12, 1e-300])
 def test_a_tiny_tilt_has_its_tiny_effect(engine, tiny):
-    """A mirror turned by α turns light by 2α, and nothing of it is lost beside 1."""
+    """A mirror turned by α turns light by 2α, to the rounding of 1."""
     mirror = surface(None, -1.0, MIRROR, before=pose(tilt_x=tiny), after=pose(tilt_x=-tiny))
     image = trace([mirror, IMAGE], beam([0.0]))
     assert_close(image.position[1].abs(), vector(math.radians(2 * tiny)), rtol=1e-12, atol=0)
@@ -226,7 +226,7 @@ def test_a_tiny_tilt_has_its_tiny_effect(engine, tiny):
 
 @both_engines
 @DTYPES
-def test_what_stands_far_away_is_missed_or_plane(engine, dtype):
+def test_distant_surfaces_are_missed_or_plane(engine, dtype):
     """A ball 10¹² mm aside is missed and steers nothing; a plane there is the plane here."""
     aside = real(1e12).requires_grad_()
     ball = surface(0.02, 3.0, before=Pose(y=aside))

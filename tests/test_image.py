@@ -137,7 +137,7 @@ def test_an_extension_mirrors_at_both_borders_and_tapers_without_a_jump():
     assert float(jumps.max()) < 0.1 < float((ramp - ramp.roll(1, -1)).abs().max())
 
 
-def test_what_does_not_fit_is_refused():
+def test_mismatched_shapes_are_refused():
     with pytest.raises(ValueError, match="a kernel of 9 × 3 pixels on a picture of 8 × 8"):
         blur(torch.zeros(8, 8), torch.zeros(9, 3))
     with pytest.raises(ValueError, match="boundary 'wrap': expected valid, circular"):
@@ -270,7 +270,7 @@ def test_noise_has_the_deviation_asked_for_and_repeats_with_its_seed():
     assert float((first - picture).mean()) == pytest.approx(0.0, abs=1e-3)
 
 
-def test_every_sample_has_its_own_deviation():
+def test_every_sample_has_an_independent_deviation():
     picture = torch.full((3, 1, 300, 300), 0.5, dtype=torch.float64)
     sigma = torch.tensor([0.001, 0.004, 0.01], dtype=torch.float64).reshape(3, 1, 1, 1)
     noise = add_noise(picture, sigma, generator=generator(6)) - picture

@@ -1,4 +1,4 @@
-"""A focal length held: by a number that is solved for, exact in the lens, its derivatives and its bounds."""
+"""A focal-length constraint met by a solved number: exact in the lens, its derivatives and its bounds."""
 
 import dataclasses
 
@@ -54,7 +54,7 @@ def test_another_focal_length_in_mm(lens):
     assert focal_length(Variables(lens, SPACES, hold="efl=100")()) == pytest.approx(100, rel=1e-12)
 
 
-def test_derivatives_through_what_is_solved_for(lens):
+def test_derivatives_through_the_solved_number(lens):
     """Of the lens alone, and of the error of its pictures, to central differences."""
     variables = Variables(lens, "thickness:2,9,5,6 curvature:1", hold="efl")
     free = {name: one for name, one in variables.named_parameters()}
@@ -113,12 +113,12 @@ def test_a_diverging_lens_is_held(lens):
         ),
     ],
 )
-def test_what_cannot_be_held_is_refused(lens, vary, hold, bounds, message):
+def test_impossible_constraints_are_refused(lens, vary, hold, bounds, message):
     with pytest.raises(BadVariables, match=message):
         Variables(lens, vary, hold=hold, bounds=bounds)
 
 
-def test_bounds_of_what_is_solved_for_are_a_penalty(lens):
+def test_bounds_of_the_solved_number_are_a_penalty(lens):
     """The square of what it lacks, mm²; no step of an optimiser clamps it, for it is no parameter."""
     variables = Variables(lens, SPACES, hold="efl", bounds={"thickness_6": (12.4, 12.5)})
     assert (float(variables.violation().detach()), variables.beyond()) == (0.0, "")
@@ -131,7 +131,7 @@ def test_bounds_of_what_is_solved_for_are_a_penalty(lens):
 
 
 def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
-    """With so little room for the spaces about the stop that the one that is solved for stands at an end."""
+    """With so little room for the spaces about the stop that the solved space is at an end of its bounds."""
     bounds = "thickness_2:0.1,1.5 thickness_9:0.1,1.5 thickness_5:14.2,14.3 thickness_6:12.4,12.5"
     settings = dataclasses.replace(SMALL, model="gaussian", size=21, bounds=bounds)
     found = closed_form(lens, settings, patch_spectrum(dead_leaves(4, size=64), 36))
@@ -143,7 +143,7 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
 
 
 def test_a_held_space_below_nothing_is_reported_with_the_end_of_the_sensor(lens):
-    """It has no bounds of its own, while the sensor stands at an end of its bounds."""
+    """It has no bounds of its own, while the sensor is at an end of its bounds."""
     bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
     own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
     spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)

@@ -1,4 +1,4 @@
-"""Bounds: what would take more than any machine has is refused before the work, and no pipe is waited for."""
+"""Limits of input: excessive sizes are refused before the computation, and pipes are not read."""
 
 import os
 
@@ -75,7 +75,7 @@ def test_samplings_that_fit_into_no_memory_are_refused(rule):
         ("trace singlet --rays /dev/zero", "/dev/zero: cannot be read: is not a regular file"),
     ],
 )
-def test_commands_say_so_in_one_line(command, message, capsys):
+def test_commands_report_limits_in_one_line(command, message, capsys):
     assert main(command.split()) == 1
     err = capsys.readouterr().err
     assert message in err

@@ -196,7 +196,7 @@ def test_the_stop_is_as_large_as_the_marginal_ray_that_aims():
 def test_a_lost_marginal_ray_leaves_the_others_aimed():
     """A ball whose entrance pupil is wider than itself: the rim misses it, what can pass is aimed.
 
-    The stop stands behind the ball's focus and so is seen inverted.
+    The stop is behind the ball's focus and so is seen inverted.
     """
     elements = [surface(1 / 5, 10.0, 1.3), surface(-1 / 5, 20.0), surface(None, 5.0)]
     system = lens(elements, stop=3, aperture=("entrance_pupil_diameter", 11.0), field=fields(y=(0.0, 4.0)))

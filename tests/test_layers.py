@@ -12,7 +12,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 
-#: Floor of every room, a folder or a file directly under raytrace/; inside a room imports only have to run one way.
+#: Layer of every package, a folder or a file directly under raytrace/; within one, imports have no cycles.
 FLOORS = {
     # knows no optics: words of messages; files that travel with the package, processes that share one computation
     "words": -2,
@@ -25,24 +25,25 @@ FLOORS = {
     "pages": 1,
     "stores": 1,
     "settings": 1,
-    # nouns
+    # data and physics
     "materials": 2,
     "system": 3,
     # lens files
     "io": 4,
-    # verbs
+    # computations
     "tracing": 5,
     "psf_models": 6,
     "analysis": 7,
     "wave_optics": 7,
     "optimization": 8,
     "imaging": 9,
+    "viewer": 10,
     # pages of experiments
     "experiments": 11,
     "cli": 12,
     # measurements: nothing imports them
     "bench": 13,
-    # the package's door
+    # the public API
     "public": 14,
     "__init__": 14,
     "__main__": 14,
@@ -58,7 +59,7 @@ SHOWN_BY = {
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas")
+DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn")
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -81,15 +82,15 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def room(name: str) -> str:
+def package_of(name: str) -> str:
     return name.split(".")[0]
 
 
 def floor(name: str) -> int:
-    """The floor of the room that a module stands in."""
-    if room(name) not in FLOORS:
-        pytest.fail(f"raytrace/{room(name)} stands on no floor: add it to FLOORS in {__file__}")
-    return FLOORS[room(name)]
+    """The layer of the package of a module."""
+    if package_of(name) not in FLOORS:
+        pytest.fail(f"raytrace/{package_of(name)} has no layer: add it to FLOORS in {__file__}")
+    return FLOORS[package_of(name)]
 
 
 def imported(node: ast.AST) -> list[str]:
@@ -134,13 +135,13 @@ def folder_of(name: str) -> str | None:
 def test_imports_only_from_lower_floors(name):
     for other in imports(MODULES[name]):
         assert other != "<relative>", "relative imports hide the floor: write from raytrace.x import y"
-        if other in MODULES and room(other) != room(name):
+        if other in MODULES and package_of(other) != package_of(name):
             assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other} (floor {floor(other)})"
 
 
-@pytest.mark.parametrize("folder", sorted({room(name) for name in MODULES if "." in name}))
-def test_imports_inside_a_room_run_one_way(folder):
-    inside = {name: path for name, path in MODULES.items() if room(name) == folder}
+@pytest.mark.parametrize("folder", sorted({package_of(name) for name in MODULES if "." in name}))
+def test_imports_within_a_package_have_no_cycles(folder):
+    inside = {name: path for name, path in MODULES.items() if package_of(name) == folder}
     remaining = {
         name: [o for o in (*imports(path), *_folders(name, imports(path))) if o in inside and o != name]
         for name, path in inside.items()
@@ -153,13 +154,13 @@ def test_imports_inside_a_room_run_one_way(folder):
 
 
 def _folders(name: str, others: list[str]) -> list[str]:
-    """Folders whose __init__ an import runs on its way, but for those that the module stands in itself."""
+    """Folders whose __init__ an import runs, except the folders of the module itself."""
     found = [folder_of(other) for other in others if other in MODULES]
     return [folder for folder in found if folder and not name.startswith(f"{folder}.")]
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not COMMANDS.match(name)])
-def test_imports_stand_at_the_top_of_the_file(name):
+def test_imports_are_at_the_top_of_the_file(name):
     """An import inside a function, a condition or a class hides a dependency; commands alone defer them, for speed."""
     tree = parsed(MODULES[name])
     at_top = {id(node) for node in tree.body}
@@ -228,12 +229,13 @@ DISTRIBUTIONS = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed."""
+    """But for those of `bench`, which measures what is installed; those of the viewer are its extra."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {re.match(r"[\w-]+", name)[0] for name in project["dependencies"]}
-    library = (path for name, path in MODULES.items() if room(name) != "bench")
+    extra = project["optional-dependencies"]["view"]
+    declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extra)}
+    library = (path for name, path in MODULES.items() if package_of(name) != "bench")
     roots = {name.split(".")[0] for path in library for name in imports(path)}
-    others = roots - set(sys.stdlib_module_names) - {room(name) for name in MODULES} - {"raytrace"}
+    others = roots - set(sys.stdlib_module_names) - {package_of(name) for name in MODULES} - {"raytrace"}
     assert {DISTRIBUTIONS.get(name, name) for name in others} <= declared
 
 

@@ -1,4 +1,4 @@
-"""Where surfaces stand in space, and folded systems drawn as they stand."""
+"""Frames of surfaces in space, and layouts of folded systems."""
 
 import math
 
@@ -106,7 +106,7 @@ def test_a_decentred_aperture_shows_that_part_of_a_mirror():
 
 
 def test_rays_by_wavelength_show_the_spectrum_on_the_image():
-    """Where the rays of every colour land stands beside the layout, in the colour and place of the traced ones."""
+    """The landing points of every wavelength are drawn beside the layout, in the colours of the traced rays."""
     lens = rt.read_lens("spectrometer")
     figure = rt.layout(lens, wavelengths=[0.45, 0.55, 0.65]).plot()
     lines = [line for line in figure.axes[1].lines if line.get_marker() == "."]

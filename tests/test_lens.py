@@ -42,7 +42,7 @@ def test_wavelengths_that_lenses_and_mirrors_are_made_for_pass(wavelength):
 
 
 @pytest.mark.parametrize("wrong", [0.0, -0.55, float("inf"), float("nan")])
-def test_what_is_no_wavelength_is_refused(wrong):
+def test_impossible_wavelengths_are_refused(wrong):
     with pytest.raises(ImplausibleWavelength):
         check_unit(vector(0.55, wrong))
 
@@ -83,7 +83,7 @@ def test_other_wavelengths_count_alike_and_the_first_is_primary():
     assert torch.equal(with_wavelengths(found, vector(0.5), vector(2.0)).wavelength_weights, vector(2.0))
 
 
-def test_files_are_believed_and_what_is_no_wavelength_is_refused_when_read_and_written(tmp_path):
+def test_wavelengths_of_files_are_accepted_and_impossible_ones_refused(tmp_path):
     """A wavelength of 486 µm is warned of by the range of the glass; tables, which people type, need the unit."""
     text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
     wrong = tmp_path / "nm.zmx"

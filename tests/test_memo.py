@@ -81,7 +81,7 @@ def test_values_and_derivatives_are_those_of_a_full_trace(k):
 
 
 @pytest.mark.parametrize("angle", [0.0, 3.0])
-def test_what_has_changed_is_traced_anew(angle):
+def test_changed_surfaces_are_retraced(angle):
     """A curvature without gradient, changed in place, and back again; a mirror as well."""
     lens, memo = double_gauss(), Memo()
     for factor in (1.0, 1.01, 1.0):

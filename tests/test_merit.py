@@ -157,8 +157,8 @@ def test_long_tables_share_lines_and_list_every_row_when_asked(lens):
         str(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6), each=each)) for each in (False, True)
     )
     rows = len(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6)).row)
-    assert len(every.splitlines()) == 2 + rows
-    assert len(together.splitlines()) == 2 + 3
+    assert len(every.splitlines()) == 3 + rows  # the merit, headings and units
+    assert len(together.splitlines()) == 3 + 3
     assert str(rt.Merit.default(lens)).count("TRAC") == 21
 
 
@@ -176,7 +176,7 @@ def test_a_stored_merit_is_that_of_the_oracle(name):
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_says_what_the_verb_does(command):
+def test_the_command_prints_the_result_of_the_function(command):
     code, out, err = command("evaluate", "double_gauss", "--merit", "spot", "--rings", 4, "--arms", 8)
     assert code == 0, err
     assert out.startswith("merit 0.14")
@@ -216,7 +216,7 @@ def test_the_figure_shows_the_parts(command):
         (("--merit", "spot", "--configuration", 2), "configuration 2"),
     ],
 )
-def test_what_cannot_be_evaluated_is_one_line(command, words, said):
+def test_errors_of_evaluate_are_one_line(command, words, said):
     code, out, err = command("evaluate", "double_gauss", *words)
     assert code in (1, 2)
     assert out == ""

@@ -222,7 +222,7 @@ READERS = {
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name, tmp_path, capfd):
     read, refused = survive(READERS[name](tmp_path), 200, seed=1)
-    assert read  # what is never read tests nothing behind the door
+    assert read  # unread files would test nothing
     assert refused
     capfd.readouterr()  # libtiff speaks to the terminal
 
@@ -274,7 +274,7 @@ def test_an_archive_is_no_npy_and_a_bomb_no_npz(tmp_path):
         read_npz(bytes(content))
 
 
-def test_arrays_come_back(tmp_path):
+def test_arrays_round_trip(tmp_path):
     given = {"heights": np.arange(6.0).reshape(2, 3), "by_columns": np.asfortranarray(np.eye(3, 2)), "glass": "PMMA"}
     np.savez_compressed(tmp_path / "a.npz", empty=np.zeros((0, 3)), **given)
     found = read_npz((tmp_path / "a.npz").read_bytes())

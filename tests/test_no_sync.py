@@ -198,6 +198,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
     assert not bool(found[0][0].all())
 
 
+@pytest.mark.slow  # 5 s for every step on a device without numbers; that no step reads one is shown above
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}
     given = {name: torch.empty(shape, dtype=torch.float64, device="meta") for name, shape in shapes.items()}

@@ -1,4 +1,4 @@
-"""Operands of aberrations: against the verbs of analysis, stored figures, and derivatives against differences."""
+"""Operands of aberrations: against the analyses, stored figures, and derivatives against differences."""
 
 import dataclasses
 from pathlib import Path
@@ -191,7 +191,7 @@ def test_rows_that_a_lens_cannot_have(case):
         Evaluation(Model(lens), rows)
 
 
-@pytest.mark.skipif(not STORED.exists(), reason="needs the development files beside the checkout")
+@pytest.mark.skipif(not STORED.exists(), reason="needs the development files in ../shared")
 def test_stored_colours_and_first_order():
     """Of an achromat, a relay and an objective, by an independent program."""
     achromat = rt.read_lens(STORED / "Project_X__AchromaticAt800nmF25mm.ZMX")

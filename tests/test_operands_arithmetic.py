@@ -56,7 +56,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_rows_of_numbers_come_to(case):
+def test_values_of_arithmetic_rows(case):
     row, expected = CASES[case]
     assert values_of("thick lens", [*CONSTANTS, row])[-1] == pytest.approx(expected, rel=1e-14)
 
@@ -66,7 +66,7 @@ def test_every_row_of_the_table_has_a_case():
 
 
 @pytest.mark.parametrize("row", [Row("SQRT", (2, 0)), Row("ASIN", (1, 0)), Row("DIVI", (1, 5)), Row("RECI", (5, 0))])
-def test_what_is_no_number_is_lost(row):
+def test_undefined_values_count_as_failed(row):
     """A row that takes the value of a lost one is lost too."""
     model, rows = model_of("thick lens"), [*CONSTANTS, Row("CONS"), Row("OPVA", (7, 0), weight=1.0), row]
     found = Evaluation(model, rows)(model.start, derivatives=True)
@@ -202,7 +202,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_rows_that_name_what_is_not_there(case):
+def test_rows_that_refer_to_missing_rows(case):
     rows, message = BAD[case]
     with pytest.raises(BadRow, match=message):
         Evaluation(model_of("thick lens"), rows)

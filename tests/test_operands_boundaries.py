@@ -230,7 +230,7 @@ def case(request):
     return model, rows, Evaluation(model, rows)
 
 
-def test_every_row_is_what_its_definition_says(case):
+def test_every_row_follows_its_definition(case):
     model, rows, evaluation = case
     found = evaluation(model.start)
     for row, computed in zip(rows, found.values, strict=True):
@@ -239,7 +239,7 @@ def test_every_row_is_what_its_definition_says(case):
 
 
 def test_derivatives_of_every_row_are_those_of_finite_differences(case):
-    """Also where a row complies, and where a surface stands exactly at the target it does not move."""
+    """Also where a row complies, and where a surface meets the target exactly its row is constant."""
     model, rows, evaluation = case
     found = evaluation(model.start, derivatives=True)
     assert np.array_equal(found.values, evaluation(model.start).values, equal_nan=True)
@@ -277,7 +277,7 @@ FILES = ("AchromaticAt800nmF25mm.ZMX", "sc_cooke2.ZMX", "sc_hamm1.zmx", "COTS-00
 @pytest.mark.parametrize("name", FILES)
 def test_rows_of_real_files_are_those_of_an_independent_program(name):
     if not MERIT.exists():
-        pytest.skip("the files stand beside the repository")
+        pytest.skip("the files are in ../shared")
     path = next(path for path in MERIT.iterdir() if path.name.endswith(name))
     files = json.loads((MERIT / "oracle.json").read_text())["files"]
     oracle = {one["row"]: one for one in next(one for one in files if one["file"] == path.name)["values"]}
@@ -320,7 +320,7 @@ UNLIKE = {
 def test_semi_diameters_are_those_that_opticstudio_stored():
     """136 of 143 automatic ones in 41 files to 1e-6."""
     if not (MERIT.exists() and CORPUS.exists()):
-        pytest.skip("the files stand beside the repository")
+        pytest.skip("the files are in ../shared")
     paths = {
         path.name: path for folder in (CORPUS, MERIT) for path in folder.iterdir() if path.suffix.lower() == ".zmx"
     }
@@ -351,7 +351,7 @@ def plate(thickness: float):
     return automatic(lens([surface(None, thickness, 1.5), surface(None, 20.0)]), margin=(0.0, 0.0))
 
 
-def test_a_row_switches_without_a_jump_and_stands_still_where_it_complies():
+def test_a_boundary_row_is_continuous_and_constant_where_it_complies():
     model = Model(plate(3.0), (Vary(1, "thickness"),))
     evaluation = Evaluation(model, [Row("MNCG", (1, 2), target=4.0, weight=1.0)])
     computed = [evaluation(np.array([t]), derivatives=True) for t in (3.0, 4.0 - 1e-9, 4.0, 4.0 + 1e-9, 7.0)]

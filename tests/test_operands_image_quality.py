@@ -80,7 +80,7 @@ def clipped(part: float) -> rt.Lens:
     return lens.replace(lens.stop, apertures=vignetting_aperture(part * abs(float(rt.first_order(lens).stop_height))))
 
 
-def test_a_rectangular_grid_counts_what_apertures_let_through():
+def test_a_rectangular_grid_counts_unvignetted_rays():
     lens, (points, weights) = clipped(0.6), square(12)
     rays = image_rays(lens, points, fields=at(lens))
     assert 10 < int(rays.valid[0, 1].sum()) < 0.6 * len(weights)
@@ -116,7 +116,7 @@ VARIABLES = (Vary(1, "curvature"), Vary(4, "thickness"), Vary(6, "curvature"), V
 @pytest.mark.parametrize("target", [0.0, 0.5])
 @pytest.mark.parametrize("operand", ["RSCE", "RSCH", "RWCE", "RWCH", "RSRE", "RSRH", "RWRE", "RWRH"])
 def test_derivatives_of_rms(operand, target):
-    """With a target of 0 the row stands as a vector: JᵀJ is not compared, but Jᵀr, the slope of the row's square."""
+    """With a target of 0 the row is a vector: JᵀJ is not compared, but Jᵀr, the slope of the row's square."""
     model = Model(clipped(0.7), VARIABLES)
     asked = [Row(operand, (4, 0), (*FIELD, 0, 0), target, 1.0), Row(operand, (3, 1), (0.3, 0.2, 0, 0), target, 2.0)]
     evaluation = Evaluation(model, asked)
@@ -325,7 +325,7 @@ def test_a_function_that_gives_no_numbers_is_refused():
 
 
 def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
-    """Its row has a name in every result; in a lens file a text stands for it, with a warning."""
+    """Its row has a name in every result; in a lens file a text replaces it, with a warning."""
     lens = rt.read_lens("cooke_triplet")
     found = rt.optimize(
         lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=4

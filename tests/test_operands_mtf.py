@@ -126,6 +126,6 @@ def test_polynomials_carry_derivatives_back_to_their_rays():
 
 
 def test_beams_that_apertures_clip_go_by_a_grid():
-    """A mirror telescope's second mirror stands in the light."""
+    """The secondary mirror of a telescope obscures the beam."""
     lens = rt.read_lens("hubble")
     assert np.abs(values(lens, rows(lens, 20.0, sampling=3)) - of_analysis(lens, 20.0)).max() < 1.2e-3

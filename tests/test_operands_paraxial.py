@@ -106,7 +106,7 @@ def first_order_rows(name):
     last = len(LENSES[name].surfaces) - 1
     operands = [*NAMES, "PIMH", "WFNO", "EFNO", "TOTR", "PETC"]
     left = () if is_near(name) else ("PMAG", "OBSN")
-    left += ("TOTR",) if name == "telescope" else ()  # surface 1 stands just where the secondary does
+    left += ("TOTR",) if name == "telescope" else ()  # surface 1 is at the secondary
     rows = [Row(operand) for operand in operands if operand not in left]
     return [*rows, Row("EFFL", (0, 1)), Row("TTHI", (1, last - 1)), Row("TFNO", (1, 1)), Row("SFNO", (0, 1))]
 

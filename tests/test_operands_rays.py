@@ -1,4 +1,4 @@
-"""Operands of rays: derivatives against differences, also of rays on inner surfaces and beside rays that are lost."""
+"""Operands of rays: derivatives against differences, also on inner surfaces and with failed rays."""
 
 import math
 
@@ -15,7 +15,7 @@ from raytrace.system.optimization_data import Row
 pytestmark = pytest.mark.usefixtures("compiler")
 
 
-GROUPED = ("TR", "AN")  # operands of rays beside others
+GROUPED = ("TR", "AN")  # operands of rays relative to others
 
 
 def rows_of(name):

@@ -123,7 +123,7 @@ def groups(asked: list[Row]) -> list[list[int]]:
     return list(found.values())
 
 
-def test_opdx_is_what_no_piston_and_tilt_make_smaller():
+def test_opdx_is_minimal_over_piston_and_tilt():
     """Least squares: what is left is at right angles to 1, x and y, by weight, in every field and colour."""
     lens = rt.read_lens("double_gauss_28deg")
     asked = rows("OPDX", fields=[(0.3, 0.6), (0.0, 0.7)])
@@ -149,7 +149,7 @@ def test_opdm_has_no_mean():
         assert np.abs(found[places] - (plain[places] - mean)).max() < 1e-10
 
 
-def test_half_a_pupil_tells_the_tilt_of_the_whole():
+def test_half_a_pupil_gives_the_tilt_of_the_whole():
     """Rows of a symmetric lens leave out the half of the pupil where x < 0: no tilt along x then."""
     lens = rt.read_lens("double_gauss_28deg")
     part = [(0.0, 0.9), (0.5, 0.5), (0.7, -0.2), (0.3, -0.8)]
@@ -171,7 +171,7 @@ def test_a_row_without_weight_shows_a_value_and_changes_no_other():
     assert np.abs(values(lens, alone) - values(lens, equal)).max() < 1e-12
 
 
-def test_a_fit_leaves_out_what_is_not_there():
+def test_a_fit_leaves_out_missing_rays():
     basis = np.stack([np.ones(6), np.arange(6.0)], 1)
     weights, there = np.array([1.0, 2, 1, 3, 1, 1]), np.array([1, 1, 0, 1, 1, 1], dtype=bool)
     numbers = np.array([0.3, -1.0, 99.0, 4.0, 1.0, 0.5])

@@ -66,7 +66,7 @@ def test_every_exception_is_that_of_a_case():
         assert [case for case in CASES if re.search(pattern, case["id"])], pattern
 
 
-def test_exit_pupil_of_the_objective_by_an_own_trace():
+def test_exit_pupil_of_the_objective_by_an_independent_trace():
     """y' = y + t u, n'u' = nu - y c (n' - n), backwards in nothing but numbers from the centre and rim of the stop."""
     lens = opticstudio_answers.system("objective_f27")
     data = first_order(lens)

@@ -1,4 +1,4 @@
-"""Optimising: the step, the descent, the verb and its command."""
+"""Optimising: the step, the descent, the function and its command."""
 
 import dataclasses
 import json
@@ -267,7 +267,7 @@ def bent_too_far(lens):
     return lens.replace(4, curvature=torch.tensor(-0.06, dtype=torch.float64))
 
 
-def test_what_a_failed_ray_misses_by_has_the_derivative_of_differences(triplet):
+def test_the_miss_of_a_failed_ray_has_the_derivative_of_differences(triplet):
     problem = problem_of(bent_too_far(triplet), "curvature thickness")
     x = problem.model.start
     found = problem.evaluated(x)
@@ -295,7 +295,7 @@ def test_a_lens_that_loses_rays_gets_them_back(triplet):
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
+def test_the_document_has_the_fixed_keys_and_the_lens_round_trips(command_line):
     words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary"]
     done = command_line(*words, "curvature sensor", "--json", "-o", "better.zmx", "--cycles", 6)
     assert done.code == 0, done.err
@@ -337,7 +337,7 @@ def test_log_checkpoint_and_resume(command_line, tmp_path):
         (["--merit", "spots", "--vary", "curvature"], "did you mean spot"),
     ],
 )
-def test_what_cannot_be_optimised_is_reported_in_a_line(words, said, command_line):
+def test_errors_of_optimize_are_one_line(words, said, command_line):
     assert said in command_line("optimize", "cooke_triplet", *words).error
 
 
@@ -375,7 +375,7 @@ def of_files():
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("known", [*of_files()])
-def test_a_file_comes_as_far_as_is_known_from_where_it_stands_and_from_a_moved_start(known):
+def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(known):
     lens = rt.read_lens(FILES / known["file"])
     found = rt.optimize(lens, seconds=20)
     assert found.merit_after <= found.merit_before * (1 + 1e-9)
@@ -408,7 +408,7 @@ def test_labels_of_the_merit_history_differ(fell):
 
 
 def test_lenses_and_spots_before_and_after_are_drawn_on_one_scale():
-    """Spots of 100 µm and 7 µm: dots in panels of one size, the small ones enlarged beside a factor."""
+    """Spots of 100 µm and 7 µm: dots in panels of one size, the small ones enlarged with their factor."""
     found = rt.optimize(rt.read_lens("double_gauss"), merit="spot", vary="sensor", cycles=1)
     assert float(rt.spot(found.lens).rms_radius.max()) < 0.8 * float(rt.spot(found.before).rms_radius.max())
     figure = optimize_report(found)

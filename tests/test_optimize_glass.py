@@ -104,7 +104,7 @@ def test_glasses_to_choose_from_are_current_and_cover_the_wavelengths(triplet):
 # -- the expansion -----------------------------------------------------------------------------------------------------
 
 
-def test_the_expansion_of_a_linear_merit_is_what_the_others_reach():
+def test_the_expansion_of_a_linear_merit_predicts_the_minimum():
     """Residuals linear in all: the least over the variables that follow, with equalities, found by elimination."""
     draw = np.random.default_rng(2)
     J, r = draw.normal(size=(30, 7)), draw.normal(size=30)
@@ -120,7 +120,7 @@ def test_the_expansion_of_a_linear_merit_is_what_the_others_reach():
 
 
 @pytest.mark.slow
-def test_what_is_predicted_ranks_what_is_reached(triplet):
+def test_predicted_merits_rank_the_optimised_merits(triplet):
     """Spearman's correlation, over glasses from all of the map, each optimised in place of the last one's."""
     choice = choice_of(triplet)
     start = least_squares(
@@ -211,7 +211,7 @@ def test_the_command_prints_the_sequence(capsys):
 # -- interrupted -------------------------------------------------------------------------------------------------------
 
 
-def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypatch):
+def test_interrupted_exchanges_resume(triplet, tmp_path, monkeypatch):
     """Ended hard behind the first exchanges, and begun again from the checkpoint: the same lens to the last digit."""
     path, done = tmp_path / "kept.json", []
     how = {"merit": MERIT, "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 5, "checkpoint": path}

@@ -1,4 +1,4 @@
-"""Opening: starts that lose their light, opened step by step; never more is lost than at the start."""
+"""Vignetted starts of an optimisation are opened step by step; no step vignettes more rays than the start."""
 
 import dataclasses
 

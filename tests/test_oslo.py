@@ -246,7 +246,7 @@ def test_path_differences_in_waves_are_those_that_oslo_traces():
 
 @pytest.mark.filterwarnings("ignore")
 def test_the_first_wavelength_is_the_primary_one():
-    """OSLO's chief ray of 14°, mm: of the F line where that stands first."""
+    """OSLO's chief ray of 14°, mm: of the F line where that is the first wavelength."""
     for waves, height in (("0.48613 0.58756 0.65627", 24.945679), ("0.58756 0.48613 0.65627", 24.9495)):
         found = FORMATS[".len"].read(double_gauss(f"WV {waves}; WW 1 1 1"), "lens.len")[0].at(ray_aiming="real")
         rays = rt.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
@@ -337,7 +337,7 @@ def test_the_order_and_the_signs_of_tilts(order):
     here, behind = frames(found)[1:3]
     assert (here.axes - expected).abs().max() < 1e-15
     assert (here.origin - (expected @ shift if "-" in order else shift)).abs().max() < 1e-14
-    assert (behind.axes - expected).abs().max() < 1e-15  # what follows stands in the axes of the surface
+    assert (behind.axes - expected).abs().max() < 1e-15  # the following surfaces are in the axes of the surface
     assert (behind.origin - here.origin - 2 * expected[:, 2]).abs().max() < 1e-14
 
 
@@ -392,7 +392,7 @@ def test_the_pentaprism_of_the_user_guide():
         assert float(entrance.axes[:, 2] @ leaving.axes[:, 2]) == pytest.approx(0, abs=1e-12)
         path = (first.origin - entrance.origin, second.origin - first.origin, leaving.origin - second.origin)
         assert sum(float(leg.norm()) for leg in path) == pytest.approx(2 * (2 + math.sqrt(2)), abs=1e-5)
-        # The face at which light leaves stands at right angles on the one at which it comes, an edge of 1 away.
+        # The exit face is at right angles to the entrance face, an edge of 1 away.
         corner = leaving.origin - entrance.origin
         assert abs(float(corner @ entrance.axes[:, 2])) == pytest.approx(1, abs=1e-5)
         assert abs(float(corner @ leaving.axes[:, 2])) == pytest.approx(1, abs=1e-5)
@@ -440,7 +440,7 @@ def test_a_singlet_is_read_number_for_number():
     check(found)
 
 
-def test_commands_stand_on_lines_or_between_semicolons_in_any_case():
+def test_commands_are_separated_by_lines_or_semicolons_in_any_case():
     one = text(SINGLET, "EBR 5; ANG 7")
     lines = one.replace("; ", "\n").replace("RD", "rd").replace("GLA N-BK7", "gla  n-bk7  // a comment; NXT")
     assert "rd 50" in lines
@@ -548,7 +548,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_is_not_modelled_is_refused_by_name_and_place(command):
+def test_unmodelled_features_are_refused_by_name_and_place(command):
     with pytest.raises(UnsupportedSurface, match=REFUSED[command]) as caught:
         lens((FAR, f"RD 50; GLA N-BK7; TH 4; {command}", "RD -50; TH 40"), "EBR 5")
     assert caught.value.line == 4
@@ -595,7 +595,7 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
         ((FAR, "RFL; TH -4", "PK GLA -1"), "EBR 5", "picks up a mirror"),
     ],
 )
-def test_what_cannot_be_read_is_refused_in_a_line(surfaces, system, message):
+def test_unreadable_files_are_refused_in_a_line(surfaces, system, message):
     waves = "" if "WV" in system else "WV 0.58756; WW 1"
     pattern = message if ".*" in message else message.replace("(", r"\(").replace(")", r"\)")
     with pytest.raises(LensFileError, match=pattern) as caught:
@@ -625,7 +625,7 @@ def test_a_file_that_is_no_lens_or_cut_off_is_refused(content, message):
         FORMATS[".len"].read(content, "lens.len")
 
 
-def test_a_command_that_stands_again_is_warned_of():
+def test_a_repeated_command_is_warned_of():
     _, report = read((FAR, "RD 50; RD 60; GLA N-BK7; TH 4", "TH 50"), "EBR 5; FNO 4; ANG 1; OBH -1e19")
     text = "\n".join(report.warnings)
     assert "RD occurs again (first in line 4); the last is used" in text

@@ -1,4 +1,4 @@
-"""Outputs: checked before the work, never an input, replaced as a whole; what cannot be written is printed."""
+"""Output files: checked before the computation, never an input, replaced as a whole; unsaved results are printed."""
 
 import os
 import re
@@ -90,7 +90,7 @@ def test_a_result_that_cannot_be_saved_is_printed(lens, command_line, monkeypatc
         assert document.document
 
 
-def test_what_a_search_cannot_write_is_reported_and_its_minima_are_printed(lens, command_line, monkeypatch):
+def test_files_that_a_search_cannot_write_are_reported_and_its_minima_are_printed(lens, command_line, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device", "minimum_01.zmx")
 
@@ -105,7 +105,7 @@ def test_what_a_search_cannot_write_is_reported_and_its_minima_are_printed(lens,
 # -- replaced as a whole ----------------------------------------------------------------------------------------------
 
 
-def test_what_a_killed_writer_left_is_removed_and_what_another_writes_is_not(tmp_path):
+def test_remains_of_a_killed_writer_are_removed_and_files_of_another_kept(tmp_path):
     path = tmp_path / "kept.json"
     (tmp_path / ".kept.json.0123456789ab.tmp").write_text("half")
     (tmp_path / ".kept.json.backup.tmp").write_text("not ours")

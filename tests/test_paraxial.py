@@ -286,7 +286,7 @@ def test_the_working_f_number_is_of_the_sine_of_the_real_ray():
     assert bool(working_f_number(lens([surface(0.2, 10.0, 1.5)], aperture=("entrance_pupil_diameter", 12.0))).isnan())
 
 
-def test_info_prints_what_does_not_exist_as_a_dash(capsys, tmp_path):
+def test_info_prints_undefined_quantities_as_a_dash(capsys, tmp_path):
     afocal = lens([surface(None, 5.0, 1.5), surface(None, 20.0)], field=fields("angle", (3.0,)))
     write_lens(afocal, tmp_path / "plate.csv")
     assert main(["info", str(tmp_path / "plate.csv")]) == 0

@@ -101,7 +101,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_such_picture_is_refused(name):
+def test_invalid_pictures_are_refused(name):
     call, words = REFUSED[name]
     with pytest.raises(ValueError, match=words):
         call()

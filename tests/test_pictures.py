@@ -37,7 +37,7 @@ def test_colours_become_luma(folder):
     assert int(red[0, 0]) == round(0.299 * 255)
 
 
-def test_what_holds_no_pictures_is_said(folder, tmp_path):
+def test_folders_without_pictures_are_reported(folder, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(NoPictures, match="no such folder"):
         files(tmp_path / "nowhere")
@@ -80,7 +80,7 @@ def test_an_epoch_takes_as_many_crops_of_every_picture():
     assert sorted(order(12, epoch=0)) == list(range(12))
 
 
-def test_a_digest_tells_pictures_apart():
+def test_a_digest_distinguishes_pictures():
     """Every pixel, shape and place counts; copies and views are the same."""
     one = np.arange(6, dtype=np.uint8).reshape(2, 3)
     assert digest([one, one + 1]) == digest((one.copy(), np.flip(np.flip(one + 1))))

@@ -195,7 +195,7 @@ def test_rays_of_a_near_object_start_on_it_and_those_of_a_far_one_in_front_of_th
     assert -50 < lengths.pop() < 0
 
 
-def test_layout_says_what_it_shows(double_gauss):
+def test_layout_describes_its_rays(double_gauss):
     text = words(rt.layout(double_gauss.at(object_distance=25000.0)).plot())
     for expected in (double_gauss.name, "EFL 99.51 mm", "F/2.99", "object at 25 m", "0°", "10°", "14°", "20 mm"):
         assert expected in text
@@ -254,7 +254,7 @@ def test_panels_share_one_scale_and_are_centred_on_the_centroid():
         assert 0.85 * float(whole.geometric_radius[f]) < farthest <= float(whole.geometric_radius[f]) * (1 + 1e-12)
 
 
-def test_a_field_that_no_ray_survives_says_so(double_gauss):
+def test_a_fully_vignetted_field_is_reported(double_gauss):
     blind = double_gauss.replace(6, apertures=(Aperture("circular", (0.0, 20.0), obscures=True),))
     assert "no ray reaches" in words(rt.spot(blind, rings=4).plot())
     with pytest.raises(rt.NoFocus, match="no ray reaches the image"):

@@ -80,7 +80,7 @@ def test_titles_longer_than_the_page_are_broken():
 
 
 @pytest.mark.parametrize("command", ["mtf", "encircled-energy"])
-def test_curves_are_drawn_finer_than_they_are_printed_and_what_was_asked_is_marked(drawn, command):
+def test_curves_are_finer_than_tables_and_requested_points_are_marked(drawn, command):
     option, asked = ("--frequency", ["5", "20"]) if command == "mtf" else ("--radius", ["0.01", "0.05"])
     for words in ([], [option, *asked]):
         (panel,) = drawn(command, "double_gauss", "--field", "0", "14", *words).axes
@@ -171,7 +171,7 @@ def test_colours_of_fields_are_never_given_twice():
     assert max(bright) < 220  # and seen on white
 
 
-def test_dots_of_a_spot_stand_for_equal_areas_of_the_pupil():
+def test_dots_of_a_spot_represent_equal_areas_of_the_pupil():
     """So many dots as area inside every ring, and those dots are what is drawn, whatever rule makes the numbers."""
     dots = even_hexapolar(12)
     radius = torch.hypot(*dots)

@@ -1,4 +1,4 @@
-"""What the prescription of a lens says of surfaces that are more than conics."""
+"""Remarks of the prescription on surfaces that are not conics."""
 
 import pytest
 from test_zemax_types import CASES, read, text
@@ -29,7 +29,7 @@ def test_a_surface_is_described_in_the_words_of_the_field(name):
     assert remarks(lens.surfaces[2]) == REMARKS[name]
     row = str(rt.info(lens)).split("\n")[-3]
     assert row.endswith(", ".join([*(["conic -0.4"] if name == "standard" else []), *REMARKS[name], "the second"])) or (
-        ", ".join(REMARKS[name]) in row and name in ("toroid", "biconic")  # their conic stands before
+        ", ".join(REMARKS[name]) in row and name in ("toroid", "biconic")  # their conic comes first
     )
     assert (row.split()[1] == "-") == ("break" in name)
 

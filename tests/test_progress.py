@@ -39,7 +39,7 @@ def test_a_log_gets_lines_also_while_a_step_lasts(quick, capsys):
     assert not module._open
 
 
-def test_a_short_command_says_nothing(capsys):
+def test_a_short_command_prints_no_progress(capsys):
     with heartbeat("info"):
         assert list(progress([1, 2, 3], "field")) == [1, 2, 3]
     assert capsys.readouterr().err == ""
@@ -58,7 +58,7 @@ def test_a_terminal_gets_a_bar_and_no_lines(quick, monkeypatch):
     assert re.search(r"spot: +0%.*0/5", terminal.getvalue())
 
 
-def test_what_is_abandoned_is_closed(quick, capsys):
+def test_abandoned_progress_is_closed(quick, capsys):
     with pytest.raises(ValueError, match="broken"), heartbeat("psf"), progress(10, "kernel"):
         raise ValueError("broken")
     assert not module._open

@@ -51,7 +51,7 @@ def rms(values: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("model", CHEAP)
-def test_shapes_and_what_the_result_says_of_itself(model):
+def test_shapes_and_description_of_the_result(model):
     result = psf(
         made_for(model, double_gauss()),
         model,
@@ -215,7 +215,7 @@ def test_energy_is_the_transmitted_share(model):
 # Models chosen, rays counted ------------------------------------------------------------------------------------------
 
 
-def test_auto_chooses_by_the_scene_and_says_why():
+def test_auto_chooses_by_the_scene_and_gives_the_reason():
     options = {"fields": field(0.0), "tol": 0.1}
     far = psf(slow(double_gauss()), object_distances=number([1500.0]), grid=grid(0.5, 5), **options)
     assert far.model == "paraxial"
@@ -248,7 +248,7 @@ def test_number_of_rays_is_kept_to():
         psf(double_gauss(), Gaussian(rays=1), **options)
 
 
-def test_an_order_repeats_what_a_tolerance_found():
+def test_an_order_repeats_the_result_of_a_tolerance():
     options = {"fields": field(14.0), "object_distances": number([1e4]), "center": "chief"}
     result = psf(double_gauss(), "gaussian", tol=1e-3, **options)
     again = psf(double_gauss(), Gaussian(order=result.order), **options)
@@ -277,7 +277,7 @@ def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
     assert true <= float(loose.error)
 
 
-def test_a_tolerance_out_of_reach_is_said():
+def test_an_unreachable_tolerance_is_reported():
     with pytest.warns(NotConverged, match="gaussian: the estimated error .* stays above the tolerance 1e-11"):
         result = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
     assert float(result.error) > 1e-11
@@ -327,7 +327,7 @@ def test_numbers_of_another_model_are_refused(name, numbers, message):
 
 
 @pytest.mark.parametrize("model", TRACED)
-def test_a_blocked_lens_is_an_error_and_a_window_beside_the_light_is_not(model):
+def test_a_blocked_lens_is_an_error_and_a_dark_window_is_not(model):
     with pytest.raises(EmptyPsf, match="no ray reaches the sensor"):
         psf(blocked(double_gauss()), model, fields=field(0.0), object_distances=number([1e4]), grid=grid(0.01, 5))
     if model != "wave":

@@ -17,7 +17,7 @@ FORM += ["--pixel", "0.005", "--size", "21", "--sensor-distance", "57.88", "--f-
 KEYS = {"object_distance", "field", "centroid", "covariance", "energy", "error", "rays"}
 
 
-def test_json_is_one_document_distance_major_with_nothing_beside_it(capsys):
+def test_json_is_one_document_distance_major_without_other_output(capsys):
     assert main([*FORM, "--json"]) == 0
     said = capsys.readouterr()
     assert said.err == ""
@@ -85,7 +85,7 @@ def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_pa
         (["--model", "paraxial", "--plot", "psf.bmp"], 2, ".png, .pdf, .svg"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(capsys, words, code, message):
+def test_invalid_options_are_refused_in_one_line(capsys, words, code, message):
     assert main(["psf", LENS, *words]) == code
     said = capsys.readouterr()
     assert said.out == ""
@@ -142,7 +142,7 @@ def test_without_fields_the_command_and_the_library_take_those_of_the_lens(tmp_p
         np.testing.assert_array_equal(arrays["centre"], result.grid.centre.numpy())
 
 
-def test_what_is_printed_is_the_width_of_the_kernel_that_is_written(tmp_path, capsys):
+def test_the_printed_width_is_that_of_the_written_kernel(tmp_path, capsys):
     """The telescope's: diffraction a thousand times wider than its rays, which are named as such."""
     out = tmp_path / "psf.npz"
     words = ["psf", "hubble", "--field", "0", "-o", str(out)]
@@ -162,7 +162,7 @@ def test_what_is_printed_is_the_width_of_the_kernel_that_is_written(tmp_path, ca
     assert "rays' σ x" in text
 
 
-def test_wavelengths_are_said_to_be_summed_or_keep_an_axis(tmp_path, capsys):
+def test_wavelengths_are_summed_or_keep_an_axis(tmp_path, capsys):
     out, words = tmp_path / "psf.npz", ["psf", "telephoto", "--model", "gaussian", "--tol", "1e-5"]
     words += ["--object-distance", "1e5", "inf"]
     assert main([*words, "--json", "-o", str(out)]) == 0
@@ -189,7 +189,7 @@ def test_wavelengths_are_said_to_be_summed_or_keep_an_axis(tmp_path, capsys):
         assert said in capsys.readouterr().out
 
 
-def test_kernels_whose_light_is_elsewhere_say_so(capsys):
+def test_kernels_that_miss_the_light_are_reported(capsys):
     assert main(["psf", LENS, "--model", "gaussian", "--field", "14"]) == 0
     assert "--center chief" in capsys.readouterr().out
     assert main(["psf", LENS, "--model", "gaussian", "--field", "14", "--center", "chief"]) == 0

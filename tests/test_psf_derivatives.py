@@ -81,7 +81,7 @@ def moved(kind: str, unit: torch.Tensor, pixels: Grid) -> tuple[Scene, Grid]:
 
 
 def pixels_at(model: str, pitch: float = 0.03, size: int = 3) -> Grid:
-    """A window beside the centroid: nothing in it is symmetric."""
+    """A window off the centroid: nothing in it is symmetric."""
     whole = Grid(scalar(1.0), 1, 1, vector(0.0, 0.0))
     order = 3 if model == "gaussian" else 0
     centroid = MODELS[model].kernels(moved("index", scalar(0.0), whole)[0], whole, order=order).centroid.flatten()
@@ -180,7 +180,7 @@ def test_symmetry_hides_no_derivative_by_the_field(transform, angle):
 
 @pytest.mark.parametrize("model", ["gaussian", "drt"])
 def test_derivative_by_a_field_on_the_axis_under_transforms(model):
-    """Windows beside the axis: light moves out of them in x and in y alike."""
+    """Windows off the axis: light moves out of them in x and in y alike."""
     lens, pixels = base(), Grid(scalar(0.03), 2, 2, vector(0.01, 0.01))
 
     def energy(fields):

@@ -123,7 +123,7 @@ def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(field, name):
     assert float(slope) == pytest.approx(float(difference), rel=2e-3, abs=1e-6)
 
 
-def test_half_of_a_symmetric_fan_stands_for_all_of_it(monkeypatch):
+def test_half_of_a_symmetric_fan_represents_all_of_it(monkeypatch):
     """Kernels, moments and gradients of a field along y from the lines of x > 0, and from all lines."""
     system = sharp_double_gauss()
     bend = system.surfaces[2].curvature.clone().requires_grad_()

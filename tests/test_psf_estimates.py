@@ -17,7 +17,7 @@ from raytrace.io import read_lens
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import grid
 from raytrace.psf_models import NotConverged, drt, fourier, psf, wave
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.result import Kernels, polychromatic
 from raytrace.system.lens import Lens, SystemAperture

@@ -11,9 +11,9 @@ from problems import MICROMETRE, double_gauss, scalar, vector
 from raytrace.io import read_lens
 from raytrace.maths.sampling import Grid, gauss_rings, grid, sobol
 from raytrace.psf_models import gaussian
-from raytrace.psf_models import pixels as rules
+from raytrace.psf_models import gaussian as rules
 from raytrace.psf_models.drt import trace_clearances
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import beam_share, scene, trace_scene

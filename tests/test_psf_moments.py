@@ -32,7 +32,7 @@ def sums(kernel: torch.Tensor, window) -> tuple[torch.Tensor, ...]:
 
 
 @pytest.mark.parametrize("model", WAVES)
-def test_what_is_said_of_waves_is_the_width_of_their_kernel_not_of_the_rays(model):
+def test_the_reported_width_of_waves_is_that_of_the_kernel_not_of_the_rays(model):
     """The telescope's rays meet in 0.01 µm, its diffraction pattern is a thousand times wider."""
     result = psf(read_lens("hubble"), model, fields=axis(), tol=1e-3)
     *_, xx, _, yy = sums(result.kernel[0, 0], result.grid)
@@ -72,7 +72,7 @@ def test_moments_of_waves_off_the_axis_are_those_of_a_fine_kernel():
 
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian", "drt"])
-def test_geometric_models_keep_their_own_moments_whatever_the_window(model):
+def test_geometric_models_keep_their_moments_whatever_the_window(model):
     lens = read_lens("double_gauss")
     wide, narrow = (
         psf(lens, model_of(model, order=0 if model != "gaussian" else 4), fields=axis(), grid=grid(number(0.005), size))
@@ -124,7 +124,7 @@ def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
     torch.testing.assert_close(by_window.kernel.sum((-2, -1)), torch.ones(3, 2, 3, dtype=torch.float64))
 
 
-def test_the_lenses_own_fields_are_seen_about_their_chief_rays():
+def test_default_fields_are_centred_on_their_chief_rays():
     lens = read_lens("double_gauss")
     result, asked = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
     assert result.kernel.shape[1] == 3

@@ -64,7 +64,7 @@ def test_bias_of_the_smooth_kernel_is_its_second_moment(width):
     assert float(variance) == pytest.approx(1 / 12 + width**2 / 7, abs=1e-6)
 
 
-def test_edge_share_of_a_cell_is_its_own_integral_and_finite_without_width():
+def test_edge_share_of_a_cell_is_its_integral_and_finite_without_width():
     s = (torch.arange(2000, dtype=torch.float64) + 0.5) / 1000 - 1
     for a, b, z in ((0.3, 0.1, 0.05), (0.1, -0.3, -0.25), (0.2, 0.2, 0.35), (0.3, 0.0, 0.1)):
         counted = (a * s[:, None] + b * s < z).double().mean()

@@ -114,7 +114,7 @@ def test_a_positive_field_lands_at_positive_y_at_f_tan_theta(model):
 
 
 @pytest.mark.parametrize("model", WAVES)
-def test_a_window_beside_the_light_holds_next_to_nothing(model):
+def test_a_window_off_the_light_has_almost_no_energy(model):
     """Of the rings at v = 100 Airy units, 2/(π v) lies outside, and of that a window of one part in a thousand."""
     s = scene_of(slow(beam=4.0), 0.0, 25e3)
     result = psf(slow(beam=4.0), model, fields=field(0.0), object_distances=number([25e3]), tol=0.1,
@@ -123,7 +123,7 @@ def test_a_window_beside_the_light_holds_next_to_nothing(model):
     assert bool(torch.isfinite(result.kernel).all())
 
 
-def test_a_tolerance_below_rounding_is_said():
+def test_a_tolerance_below_rounding_is_reported():
     with pytest.warns(NotConverged, match="wave: the estimated error .* stays above the tolerance 1e-09"):
         result = psf(slow(beam=3.0), "wave", fields=field(0.0), object_distances=number([25e3]), grid=grid(0.01, 3),
                     tol=1e-9)  # fmt: skip
@@ -184,7 +184,7 @@ def test_a_parabolic_mirror_is_perfect(obstruction):
 
 
 @pytest.mark.parametrize("defocus", [0.15, 0.5, 1.5])
-def test_the_residual_is_what_debyes_integral_leaves_out(defocus):
+def test_the_residual_is_the_error_of_debyes_integral(defocus):
     """Defocused 11 mm behind the exit pupil, by a phase of up to 0.16 rad: against wavelets of exact distances."""
     focus, diameter = 12.0, 2.4
     surfaces = [problems.surface(None, 1.0, 1.5), problems.surface(-2 / focus, focus - defocus, conic=-2.25)]

@@ -1,6 +1,7 @@
-"""The front door: a lens from plain numbers, under other conditions, and the public names."""
+"""The public API: a lens from plain numbers, under other conditions, and the public names."""
 
 import argparse
+import functools
 import importlib
 import inspect
 import json
@@ -30,7 +31,7 @@ ROWS = [
 ]
 
 
-def test_every_public_name_is_what_the_table_says_when_all_of_the_package_is_imported():
+def test_every_public_name_matches_the_table_after_importing_all_modules():
     """No module may stand in a function's place: `import raytrace.x` puts x into the package."""
     without = ("raytrace.bench.peers", "raytrace.__main__")  # these need the extra [bench], or run
     for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
@@ -132,7 +133,7 @@ def test_conditions_are_those_asked_for_and_the_rest_stays():
         (lambda lens: rt.lens(ROWS, stop=1, f_number=4, field_kind="angles"), "expected one of angle"),
     ],
 )
-def test_what_makes_no_lens_is_reported(call, said):
+def test_invalid_lenses_are_reported(call, said):
     lens = rt.lens(ROWS, stop=1, f_number=5)
     with pytest.raises(ValueError, match=re.escape(said)):
         call(lens)
@@ -230,8 +231,8 @@ def test_a_lens_is_focused_by_every_criterion(tmp_path):
         rt.focus(lens, fields=[80])
 
 
-def test_a_curvature_goes_through_every_verb():
-    """lens.replace with a tensor that requires a gradient: every verb carries it, or shows the lens all the same."""
+def test_every_function_has_a_derivative_with_respect_to_a_curvature():
+    """lens.replace with a tensor that requires a gradient: every function carries it, or prints the lens unchanged."""
     lens = rt.read_lens("cooke_triplet")
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     bent = lens.replace(3, curvature=curvature)
@@ -274,9 +275,9 @@ def test_a_lens_shows_itself():
     assert "<pre>" in batch._repr_html_()
 
 
-# -- one verb, one door ------------------------------------------------------------------------------------------------
+# -- functions and their commands --------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own; those of bench, codesign and wave are none.
+#: Commands of one public function; not those of bench, codesign and wave.
 VERBS = [command for command in COMMANDS if command.verb in rt.PUBLIC]
 #: Those that need no merit function.
 OF_A_LENS = [c for c in VERBS if c.run is None and c.name not in ("evaluate", "optimize", "search")]
@@ -289,7 +290,7 @@ def options_of(command) -> set[str]:
 
 
 @pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
-def test_a_command_has_the_options_of_its_verb(command):
+def test_a_command_has_the_options_of_its_function(command):
     verb = getattr(rt, command.verb)
     keywords = inspect.signature(verb).parameters
     own = {name for name in options_of(command) if not name.startswith("plot_")} - {*RUNNER_OPTIONS}
@@ -317,11 +318,14 @@ def assert_alike(one, other) -> None:
 
 
 @pytest.mark.parametrize("command", OF_A_LENS, ids=lambda command: command.name)
-def test_a_command_prints_what_its_verb_gives(command, capsys):
+def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
+    """As JSON by the function itself; as text the result already computed."""
     assert main([command.name, "cooke_triplet", "--json"]) == 0
     printed = capsys.readouterr().out
     found = getattr(rt, command.verb)(rt.read_lens("cooke_triplet"))
     assert_alike(json.loads(printed), found.document())
+    verb = getattr(rt, command.verb)
+    monkeypatch.setattr(rt, command.verb, functools.wraps(verb)(lambda *_, **options: found))
     assert main([command.name, "cooke_triplet"]) == 0
     assert capsys.readouterr().out == f"{found}\n"
 
@@ -386,7 +390,7 @@ def test_an_element_at_the_stop_of_a_lens_and_an_element_as_a_lens():
     (small,) = rt.elements("singlet", aperture=1.0)
     traced = rt.element_lens(small, sensor_distance=35.5, object_distance=1000.0, substrate=0.5)
     focus = rt.paraxial_image_distance(traced, traced.surfaces[0].thickness)
-    assert float(focus) == pytest.approx(35.5, rel=2e-3)  # the plane face stands half a millimetre before the thin one
+    assert float(focus) == pytest.approx(35.5, rel=2e-3)  # the plane face is half a millimetre in front of the thin one
 
 
 # -- analyses ----------------------------------------------------------------------------------------------------------
@@ -456,7 +460,7 @@ def test_an_analysis_takes_plain_numbers_and_tabulates_prints_and_draws_itself(
     assert (tmp_path / "command.png").stat().st_size > 10_000
 
 
-def test_analyses_carry_a_gradient_and_tell_what_they_lack():
+def test_analyses_have_gradients_and_report_failed_fields():
     lens = rt.read_lens("cooke_triplet")
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     found = rt.mtf(lens.replace(3, curvature=curvature), frequencies=[20], fields=[9])
@@ -481,7 +485,7 @@ def test_errors_speak_of_keywords_from_python_and_of_options_from_the_command(ca
     assert "--rings belongs to --sampling gauss, hexapolar; sobol takes --points" in capsys.readouterr().err
 
 
-def test_a_result_without_columns_says_that_it_is_no_table():
+def test_a_result_without_columns_refuses_to_be_a_table():
     class Words(Result):
         """Of words alone."""
 

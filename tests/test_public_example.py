@@ -1,4 +1,4 @@
-"""The door as it was promised: every line runs as written, and gives what it says."""
+"""A script with the public API: every line runs as written."""
 
 import numpy as np
 import pytest

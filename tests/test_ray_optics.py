@@ -136,7 +136,7 @@ def test_decentres_and_odd_terms(read):
 
 
 def test_a_diffractive_surface_has_its_power(read):
-    """p = c r² at the reference wavelength: a power of -2 c, beside that of the refraction."""
+    """p = c r² at the reference wavelength: a power of -2 c, added to that of the refraction."""
     element = part(
         "DiffractiveElement", coefficients=[-1e-3], ref_wl=587.5618, order=1, phase_fct_name="radial_phase_fct"
     )
@@ -165,7 +165,7 @@ def test_a_diffractive_surface_has_its_power(read):
         (json.dumps(model(*SINGLET)).replace("4.0", "9" * 5000), LensFileError, "no JSON file|a finite number"),
     ],
 )
-def test_what_is_not_modelled_or_damaged_is_refused_by_name(changed, error, message, read):
+def test_unmodelled_or_damaged_data_are_refused_by_name(changed, error, message, read):
     with pytest.raises(error, match=message):
         read(changed)
 

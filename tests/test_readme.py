@@ -1,4 +1,4 @@
-"""README.md keeps its word: its commands are the ones that run, its examples work, its links and pictures exist."""
+"""README.md: its commands and examples run, its links and pictures exist."""
 
 import re
 import shlex
@@ -11,6 +11,14 @@ from raytrace.cli import codesign_run, main
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+OVERVIEW = (ROOT / "docs" / "reference" / "overview.md").read_text(encoding="utf-8")
+#: Pages whose Python runs, each in one namespace of its own; `lens` and `torch` are those of the README's example.
+PYTHON = [
+    ROOT / "README.md",
+    *(ROOT / "docs" / "reference" / f"{name}.md" for name in ("lens_files", "rays", "psf", "learning")),
+]
+#: Pages of every public name with an example each.
+API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -22,15 +30,15 @@ def first_block(heading: str) -> list[str]:
 
 
 def examples() -> list[str]:
-    """Every `raytrace …` of the README's shell blocks, without comments and without the installation before it."""
+    """Every `raytrace …` in shell blocks of the README and the overview, without comments and the installation."""
     found = []
-    for block in re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", README, re.M | re.S):
+    for block in re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", README + OVERVIEW, re.M | re.S):
         for line in block.replace("\\\n", " ").splitlines():
             for part in re.split(r"&&|;|\|", line.split(" #")[0].removeprefix("$ ")):
                 words = shlex.split(part)
                 if words and Path(words[0]).name == "raytrace":
                     found.append(shlex.join(words[1:]))
-    return found
+    return list(dict.fromkeys(found))
 
 
 def test_command_one_installs_and_focuses():
@@ -83,11 +91,57 @@ def test_examples_run(line, tmp_path, monkeypatch, capsys):
             assert Path(words[words.index(option) + 1]).stat().st_size > 0
 
 
+def test_readme_is_one_screen():
+    assert len(README.split()) <= 900
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
+def test_python_runs(page, tmp_path, monkeypatch, capsys):
+    import torch
+
+    import raytrace as rt
+
+    (tmp_path / "lenses").symlink_to(ROOT / "lenses")
+    monkeypatch.chdir(tmp_path)
+    lens = rt.read_lens("double_gauss").at(object_distance=25e3)
+    names = {"torch": torch, "rt": rt, "lens": lens}
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, page.name, "exec"), names)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", API, ids=lambda page: page.stem)
+def test_examples_of_public_names_run(page, tmp_path, monkeypatch):
+    import dataclasses
+    import os
+    import warnings
+
+    import torch
+
+    import raytrace as rt
+
+    monkeypatch.chdir(tmp_path)
+    names = {"dataclasses": dataclasses, "os": os, "warnings": warnings, "torch": torch, "rt": rt}
+    names |= {"lens": rt.read_lens("double_gauss"), "triplet": rt.read_lens("cooke_triplet")}
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
+        exec(compile(block, page.name, "exec"), names)
+
+
+def test_every_public_name_has_an_example():
+    import raytrace as rt
+
+    blocks = re.findall(r"^```python\n(.*?)^```", "".join(page.read_text("utf-8") for page in API), re.M | re.S)
+    assert {*rt.PUBLIC} == {*re.findall(r"\brt\.(\w+)", "".join(blocks))}
+
+
 def test_every_command_is_shown():
-    """As an example, or by its name in the text about the analyses, which all work alike."""
+    """As an example, or by its name in the table of the overview."""
     from raytrace.cli.commands import COMMANDS
 
-    shown = {line.split()[0] for line in examples()} | set(re.findall(r"`([\w-]+)`", README))
+    shown = {line.split()[0] for line in examples()} | set(re.findall(r"`([\w-]+)`", OVERVIEW))
     assert {command.name for command in COMMANDS} <= shown
 
 

@@ -58,7 +58,7 @@ def dense(kernel: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 
 @pytest.mark.parametrize(("shape", "spot"), [((16, 16), 5), ((15, 20), 5), ((16, 12), 4)])
 @pytest.mark.parametrize("build", [wiener, towards_measurement])
-def test_inverts_what_can_be_inverted(build, shape, spot):
+def test_frequencies_with_signal_are_inverted(build, shape, spot):
     """Noise-free, |H| ≥ 0.2, γ = 1e-10: the picture within 1e-6, not shifted; so for even kernels, and pictures not
     square."""
     kernel = 0.4 * draws(spot, spot, seed=3) / spot**2
@@ -212,7 +212,7 @@ def test_depth_invariant_error_without_light_or_noise():
 
 
 @pytest.mark.parametrize("size", [(12, 12), (11, 14), (14, 11), (9, 9)])
-def test_half_the_frequencies_tell_all(size):
+def test_half_the_frequencies_determine_all(size):
     """Even and odd, colours, derivatives too: `depth_invariant_error` of the transfer functions."""
     kernels, S, sigma = draws(3, 2, 6, 5, seed=1).requires_grad_(), power_law(size), 0.3
     half, full = kernel_error(kernels, S, sigma), depth_invariant_error(transfer_functions(kernels, size), S, sigma)
@@ -282,7 +282,7 @@ def test_margins_and_psnr():
         within(estimate, 5)
 
 
-def test_what_does_not_fit_is_refused():
+def test_mismatched_shapes_are_refused():
     with pytest.raises(ValueError, match="'circular', an image of 8 × 8 pixels, a filter of 12 × 12: expected equal"):
         restore(torch.zeros(8, 8), torch.zeros(12, 12))
     with pytest.raises(ValueError, match="boundary 'valid'"):

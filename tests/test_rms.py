@@ -23,7 +23,7 @@ def own_fields(system):
     return torch.stack([system.fields.x, system.fields.y])
 
 
-def test_each_wavelength_is_that_of_its_map_and_own_spheres_add_as_squares():
+def test_each_wavelength_is_that_of_its_map_and_separate_spheres_add_as_squares():
     own = rms_over_field(TRIPLET, fields=own_fields(TRIPLET), reference="own", pupil=gauss_rings(14, 56))
     torch.testing.assert_close(own.rms, wavefront(TRIPLET, size=8).rms, rtol=1e-9, atol=1e-12)
     weights = TRIPLET.wavelength_weights / TRIPLET.wavelength_weights.sum()

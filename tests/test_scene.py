@@ -97,7 +97,7 @@ def test_fields_under_a_transform_have_no_symmetry(transform):
     assert set(seen) == {"none"}
 
 
-def test_fields_beside_a_transform_keep_their_symmetry():
+def test_fields_under_a_transform_keep_their_symmetry():
     lens, fields, seen = of(double_gauss(), AXIS).lens, vector(0.0, 0.0)[:, None], []
 
     def look(curvature):

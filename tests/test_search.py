@@ -1,4 +1,4 @@
-"""Searching: starts, the journal, minima each once, the verb and its command."""
+"""Global search: starts, the journal, distinct minima, the function and its command."""
 
 import json
 import os
@@ -240,7 +240,7 @@ def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k
     curves = np.linalg.eigvalsh(found.curves)
     assert curves[0] < -1e-9 < curves[1]
     for sign in (1.0, -1.0):
-        state = stage.problem.state(place.beside(stage, sign), False)
+        state = stage.problem.state(place.displaced(stage, sign), False)
         assert np.sqrt(state.cost) < size
         assert np.abs(state.held).max() < 1e-9
 
@@ -316,7 +316,7 @@ def test_tasks_that_are_known_are_not_done_again_and_a_torn_line_is(tmp_path):
         Journal(tmp_path, about, 0.0).each([task("d")], 2)
 
 
-def test_what_goes_on_ends_as_what_was_never_interrupted(plate, found, tmp_path):
+def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
     class Bar:
         """Interrupts at the fifth start."""
 
@@ -341,7 +341,7 @@ def test_what_goes_on_ends_as_what_was_never_interrupted(plate, found, tmp_path)
 
 
 @pytest.mark.slow
-def test_processes_find_what_one_does(plate, found, tmp_path):
+def test_processes_find_the_minima_of_one(plate, found, tmp_path):
     rt.write_lens(plate, tmp_path / "plate.csv")
     words = "plate.csv --merit spot --vary curvature thickness --glass-thickness 2:8 --edge 1 --rings 2 --hold efl=50"
     command = [
@@ -385,7 +385,7 @@ def test_the_folder_holds_lenses_a_table_and_figures(found, tmp_path):
     assert rt.spot(own).rms_radius.reshape(-1).tolist() == pytest.approx(found.spots[0].tolist(), rel=1e-6)
 
 
-def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
+def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
     words = ["search", "singlet", "--merit", "spot", "--vary", "curvature sensor", "--hold", "efl=50", "-o", "minima"]
     done = command_line(*words, "--starts", 2, "--json")
     assert done.code == 0, done.err
@@ -415,6 +415,6 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
         (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
     ],
 )
-def test_what_cannot_be_searched_is_reported_in_a_line(words, said, plate, command_line, tmp_path):
+def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_path):
     rt.write_lens(plate, tmp_path / "plate.csv")
     assert said in command_line("search", "plate.csv", *words).error

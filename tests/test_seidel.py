@@ -151,7 +151,7 @@ def test_a_curvature_carries_its_derivatives():
     assert gradcheck(sums, (curvature, conic))
 
 
-def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():
+def test_undefined_coefficients_are_nan_and_asymmetric_lenses_refused():
     afocal = lens([surface(0.02, 150.0), surface(None, 10.0)], field=FIELD)  # a curved dummy: no power
     assert bool(torch.isnan(seidel(afocal, kind="transverse").contributions).all())
     assert bool((seidel(afocal).contributions == 0).all())

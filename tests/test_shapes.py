@@ -21,14 +21,14 @@ from raytrace.io.source import LensFileError
 from raytrace.maths.numerics import value
 from raytrace.maths.sampling import gauss_rings, grid, sobol
 from raytrace.psf_models import psf
-from raytrace.system import shapes
+from raytrace.system import sag_terms, shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.parameter_paths import number_at, parameter_paths, with_number
 from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
-from raytrace.system.surface import sag, sag_at
+from raytrace.system.surface import sag, sag_and_derivatives, sag_at
 from raytrace.tracing.compiled import is_expressible, trace_engine
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -107,7 +107,7 @@ def test_odd_asphere_is_its_formula_in_fifty_digits(engine):
 
 def test_slopes_are_the_derivatives_of_the_sag():
     u = vector(0.01, 0.5, 20.0).requires_grad_()
-    S, dS, d2S = shapes.sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
+    S, dS, d2S = sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
     (slope,) = torch.autograd.grad(S.sum(), u, create_graph=True)
     (bend,) = torch.autograd.grad(slope.sum(), u)
     assert_close(slope, dS, rtol=1e-13, atol=0)
@@ -241,8 +241,8 @@ def dome(u, coefficients, highest, along):
 def made_up(monkeypatch):
     kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
     monkeypatch.setitem(shapes.KINDS, "dome", kind)
-    ripple = shapes.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
-    monkeypatch.setitem(shapes.SAG_TERMS, "Ripple", ripple)
+    ripple = sag_terms.SagTermKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
+    monkeypatch.setitem(sag_terms.SAG_TERMS, "Ripple", ripple)
 
 
 FACES = {
@@ -348,7 +348,7 @@ class TestWhatHasToKnow:
         ):
             plain.replace(1, kind="cone")
 
-    def test_files_hold_it_or_say_that_they_do_not(self, name, tmp_path):
+    def test_files_store_it_or_report_that_they_do_not(self, name, tmp_path):
         system = system_of(name)
         for suffix in (".zmx", ".csv"):
             path = tmp_path / f"{name}{suffix}"
@@ -378,7 +378,7 @@ class TestWhatHasToKnow:
 # ---------------------------------------------------------------- polygons
 
 SLIT = CORPUS / "zmx" / "Project_X__sc_slit.ZMX"
-#: A square ring of ±4 mm with a hole of ±2 mm and a triangle beside it, each closed.
+#: A square ring of ±4 mm with a hole of ±2 mm and a triangle outside it, each closed.
 CORNERS = (-4, -4, 4, -4, 4, 4, -4, 4, -4, -4, -2, -2, -2, 2, 2, 2, 2, -2, -2, -2, 6, 1, 8, 1, 7, 3, 6, 1)
 
 
@@ -397,7 +397,7 @@ def through(x, y):
 
 @both_engines
 @pytest.mark.parametrize("obscures", [False, True])
-def test_polygons_pass_what_lies_within_an_odd_number_of_them(engine, obscures):
+def test_polygons_pass_points_within_an_odd_number_of_them(engine, obscures):
     grid_of = torch.linspace(-9, 9, 73, dtype=torch.float64)  # corners and sides among them
     x, y = (part.reshape(-1) for part in torch.meshgrid(grid_of, grid_of, indexing="xy"))
     position = torch.stack([x, y, torch.zeros_like(x)])

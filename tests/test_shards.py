@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_training import fit
 
 import raytrace as rt
 from raytrace import shards
@@ -29,7 +30,7 @@ FOCUS = 57.662  # mm, sensor of the double Gauss
 
 #: Conditions of `raytrace.psf_models.psf`: every axis is cut, and every decision differs between the blocks of a scene.
 CASES = {
-    # A field on the axis is round, one in y-z a mirror image of itself, one beside it neither.
+    # A field on the axis is round, one in y-z a mirror image of itself, one off it neither.
     "fields": {"model": "gaussian", "fields": [[0.0, 0.0, 5.0], [0.0, 9.0, 5.0]], "center": "chief", "order": 3},
     "fields of a map": {"model": "drt", "fields": [[0.0, 0.0], [0.0, 2.0]], "center": "chief", "order": 1},
     # Cells are as fine as the largest blur needs, of all object distances.
@@ -80,8 +81,11 @@ def cases() -> dict[str, dict[str, np.ndarray]]:
 
 
 def work(folder: str) -> None:
-    """What each process of `test_two_processes_compute_what_one_does` runs."""
+    """Each process of `test_two_processes_compute_and_train_as_one_does`: kernels, ten steps of training, an error."""
     with shards.processes() as share:
+        weights = fit(Path(folder, "training of two"), 10)
+        if share.rank == 0:
+            torch.save(weights, Path(folder, "weights.pt"))
         found = {f"{name}/{key}": t for name, numbers in cases().items() for key, t in numbers.items()}
         np.savez(Path(folder, f"{share.rank}.npz"), **found)
         try:
@@ -132,8 +136,11 @@ def run_function(call: str, *, folder: Path, processes: int = 2) -> subprocess.C
 # ---------------------------------------------------------------- several processes
 
 
-def test_two_processes_compute_what_one_does(tmp_path):
-    """Every model, each axis of a scene cut in turn, to rounding and in both processes; an error of one is of all."""
+def test_two_processes_compute_and_train_as_one_does(tmp_path):
+    """One start of torchrun. Kernels of every model, each axis of a scene cut in turn, to rounding in both processes;
+
+    weights after ten steps of Adam, to 1e-12; an error of one process is raised in all.
+    """
     done = run_function(f"work({str(tmp_path)!r})", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     together = [np.load(tmp_path / f"{rank}.npz") for rank in range(2)]
@@ -141,9 +148,10 @@ def test_two_processes_compute_what_one_does(tmp_path):
         for key, expected in numbers.items():
             first, second = (found[f"{name}/{key}"] for found in together)
             np.testing.assert_array_equal(first, second, err_msg=f"{name}: {key} of the processes")
-            # An estimated error is a small difference of sums, and stands for two digits.
+            # An estimated error is a small difference of sums, and has two digits.
             close = 1e-9 if key == "error" else ROUNDING
             np.testing.assert_allclose(first, expected, rtol=close, atol=close, err_msg=f"{name}: {key}")
+    torch.testing.assert_close(torch.load(tmp_path / "weights.pt"), fit(tmp_path / "one", 10), atol=1e-12, rtol=1e-12)
     assert (tmp_path / "0.txt").read_text() == "FailedElsewhere: the share of 1 makes no sense"
     assert (tmp_path / "1.txt").read_text() == "ValueError: the share of 1 makes no sense"
 
@@ -152,7 +160,7 @@ COMMAND = ("psf", "double_gauss", "--model", "drt", "--rays", "200", "--field", 
 
 
 @pytest.mark.slow
-def test_torchrun_writes_what_the_command_writes_once(command, tmp_path):
+def test_torchrun_writes_the_output_of_the_command_once(command, tmp_path):
     code, out, _ = command(*COMMAND, "-o", "one.npz", "--plot", "one.png")
     assert code == 0
     done = begin("-m", "raytrace", *COMMAND, "-o", "two.npz", "--plot", "two.png", folder=tmp_path)
@@ -182,7 +190,7 @@ def test_a_killed_process_ends_the_job_with_one_line_and_no_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_refusal_is_said_once(tmp_path):
+def test_a_refusal_is_reported_once(tmp_path):
     done = begin("-m", "raytrace", "psf", "double_gaus", folder=tmp_path)
     assert done.returncode != 0
     assert done.stderr.count("raytrace: error: double_gaus: no such lens file") == 1, done.stderr

@@ -1,4 +1,4 @@
-"""What is shipped beside the code: type hints, and where the frozen figures of the tests come from."""
+"""Type hints of the package, and the sources of the frozen oracles."""
 
 import inspect
 import json
@@ -20,7 +20,7 @@ FUNCTIONS = [name for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))
 
 
 def test_type_checkers_know_that_the_package_has_hints():
-    """The file stands in the package as it is installed, and the wheel takes the whole of that folder."""
+    """The file is in the installed package, and the wheel takes the whole of that folder."""
     assert (Path(rt.__file__).parent / "py.typed").is_file()
     build = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]
     assert build["targets"]["wheel"]["packages"] == ["raytrace"]
@@ -44,7 +44,7 @@ def test_every_file_of_oracles_is_described_and_every_described_file_is_there():
             assert (ORACLES / generator).is_file(), generator
 
 
-def test_the_figures_of_dispersion_are_what_their_generator_prints():
+def test_dispersion_oracles_equal_the_output_of_their_generator():
     pytest.importorskip("mpmath")
     done = subprocess.run([sys.executable, ORACLES / "make_dispersion.py"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ FILES = sorted((DOCS / "elements").glob("*.npy"))
 SMOOTH = sorted(file for file in (DOCS / "elements").glob("*.json") if not file.stem.endswith(".npy"))
 
 
-def test_they_are_two_hundred_kilobytes_at_most_and_say_what_they_are():
+def test_elements_are_two_hundred_kilobytes_at_most_and_labelled():
     assert FILES
     assert SMOOTH
     assert sum(file.stat().st_size for file in (DOCS / "elements").iterdir()) <= 200_000
@@ -44,13 +44,17 @@ def test_etched_ones_have_their_levels_and_relief(file):
     np.testing.assert_allclose(heights / step, np.round(heights / step), atol=2e-3 * levels)
 
 
-@pytest.mark.parametrize("name", ["learned-0.01.npy", "learned-smooth-0.01.json"])
-def test_learned_elements_are_judged_as_the_page_has_them(name, tmp_path):
-    """Sharp leaves, both filters, noise 0.01: to a hundredth of a dB, from the file alone."""
+@pytest.fixture(scope="module")
+def sharp_leaves():
     leaves = dead_leaves(40, size=256, smallest=LEAVES["sharp leaves"])
-    bank = Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
+    return Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
+
+
+@pytest.mark.parametrize("name", ["learned-0.01.npy", "learned-smooth-0.01.json"])
+def test_learned_elements_are_judged_as_the_page_has_them(sharp_leaves, name, tmp_path):
+    """Sharp leaves, both filters, noise 0.01: to a hundredth of a dB, from the file alone."""
     element = read_element(DOCS / "elements" / name, aperture=5.0)
-    result = errors_of(Kept(tmp_path, [bank]).transfer((element,)), WaveCameraConfig(), bank)
+    result = errors_of(Kept(tmp_path, [sharp_leaves]).transfer((element,)), WaveCameraConfig(), sharp_leaves)
     with (DOCS / "noise.csv").open(newline="") as file:
         wanted = {
             row["filter"]: (float(row["psnr"]), float(row["mean_psnr"]))

@@ -1,4 +1,4 @@
-"""Less work: reuse, planes, symmetry and shared parts give the same numbers as all of the work."""
+"""Shortcuts (reuse of rays, planes, symmetry, shared parts) give the same numbers as the full computation."""
 
 import dataclasses
 import functools
@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import field_rays, slope, with_leaf
-from raytrace.bench.speed import with_sensor_leaf
+from raytrace.bench.measure import field_rays, with_leaves
+from raytrace.bench.speed import slope, with_sensor_leaf
 from raytrace.io import read_lens
 from raytrace.maths.sampling import grid, sobol
 from raytrace.psf_models import MODELS, fourier, model_of, psf
@@ -39,13 +39,19 @@ def bound(what):
 double_gauss = partial(read_lens, "double_gauss")
 
 
+def of_last_radius(lens: Lens) -> tuple[Lens, Tensor]:
+    """The lens with its last curvature as a leaf, and the leaf."""
+    lens, (leaf,) = with_leaves(lens, [(11, "curvature")])
+    return lens, leaf
+
+
 def _traced(count: int) -> dict[str, tuple[Callable, Callable]]:
     """Pairs of calls that trace so many rays."""
     lens, rays = double_gauss(), field_rays(double_gauss(), count)
-    bent, leaf = with_leaf(lens, 1, "curvature")
+    bent, (leaf,) = with_leaves(lens, [(1, "curvature")])
     planes = f"planes: {sum(one.is_plane for one in lens.surfaces[1:])} of {len(lens.surfaces) - 1} surfaces"
     return {
-        "prefix: step of the last radius, Memo over none": _remembered(*with_leaf(lens, 11, "curvature"), count),
+        "prefix: step of the last radius, Memo over none": _remembered(*of_last_radius(lens), count),
         "prefix: step of the sensor distance, Memo over none": _remembered(*with_sensor_leaf(lens), count),
         f"{planes} over spheres of curvature 0, forward": tuple(
             functools.partial(_end, each, rays) for each in (lens, with_spheres_for_planes(lens))
@@ -165,7 +171,7 @@ CASES = cases(64, 2)
 
 
 @pytest.mark.parametrize(("engine", "what", "less", "full"), CASES, ids=[f"{case[0]} {case[1]}" for case in CASES])
-def test_less_work_gives_the_same_result(engine, what, less, full):
+def test_a_shortcut_gives_the_same_result(engine, what, less, full):
     with trace_engine(engine):
         for _ in range(2):  # a Memo is filled by the first call
             a, b = less(), full()
@@ -175,9 +181,9 @@ def test_less_work_gives_the_same_result(engine, what, less, full):
 
 
 @pytest.mark.parametrize(("number", "again"), [(None, 1), (11, 2)])
-def test_memo_of_the_cases_traces_only_what_moves(number, again):
+def test_memo_of_the_cases_traces_only_changed_surfaces(number, again):
     """Surfaces crossed by a second call: the image alone, or also the last one before it."""
-    lens, _ = with_sensor_leaf(double_gauss()) if number is None else with_leaf(double_gauss(), 11, "curvature")
+    lens, _ = with_sensor_leaf(double_gauss()) if number is None else of_last_radius(double_gauss())
     bundle = (
         lens,
         torch.zeros(2, 1, dtype=torch.float64),

@@ -96,14 +96,14 @@ def test_vignetted_ray_keeps_its_coordinates_and_a_missed_one_ends():
     assert last.position[:, 1].tolist() == [0.0, 0.0, 0.0]
 
 
-def test_thickness_behind_a_mirror_is_negative_and_light_comes_back():
+def test_thickness_behind_a_mirror_is_negative_and_light_returns():
     system = lens([surface(None, 10.0), surface(-0.01, -50.0, MIRROR)], stop=2)
     out = trace_lens(system, launch(system, vector(0.0, 0.1).reshape(2, 1)), system.wavelengths[0])
     assert out.direction[2] < 0
     assert out.position[2] == 0
 
 
-def test_check_refuses_what_cannot_be_traced():
+def test_check_refuses_untraceable_lenses():
     check(double_gauss())
     for broken in (
         double_gauss(stop=0),

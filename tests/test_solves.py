@@ -57,7 +57,7 @@ def test_every_kind_is_tried():
 
 
 @pytest.mark.parametrize("kind", RULES)
-def test_what_follows_meets_its_rule(kind):
+def test_solved_numbers_meet_their_rule(kind):
     solve = RULES[kind]
     model, x, _ = moment_of((solve,))
     lens = model.lens_at(x)
@@ -224,7 +224,7 @@ def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations(
         assert float(here.surfaces[8].thickness) == pytest.approx(value_of(numbers[8, "thickness"]), rel=1e-14)
 
 
-def test_what_an_operand_moves_is_named_once():
+def test_numbers_changed_by_an_operand_are_named_once():
     lens = zoom()
     found = freedom(lens, "thickness:3,8")
     assert found.variables == (Vary(3, "thickness", 1, 0), Vary(3, "thickness", 2, 0))
@@ -244,7 +244,7 @@ def test_what_an_operand_moves_is_named_once():
 def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
     """5.0376… mm at an edge in inches, 42.3517… mm by the real ray through 0.7 of the pupil; paraxially 41.6005."""
     if not (CORPUS / "zmx" / path).exists():
-        pytest.skip("the files stand beside the repository")
+        pytest.skip("the files are in ../shared")
     lens = rt.read_lens(CORPUS / "zmx" / path)
     (solve,) = (one for one in lens.optimization_data.solves if one.kind == kind)
     found = Model(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]

@@ -13,6 +13,7 @@ from test_hardcases import of_kind
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
+from raytrace.maths.sampling import hexapolar
 from raytrace.system.rays import Rays
 from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
@@ -199,10 +200,10 @@ def test_radii_about_another_point_follow_the_theorem_of_parallel_axes():
 
 def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     """`--weights equal --reference chief`: as the library has it, and not what the defaults give."""
-    hexapolar = ["spot", "cooke_triplet", "--sampling", "hexapolar", "--rings", "6", "--json"]
+    arguments = ["spot", "cooke_triplet", "--sampling", "hexapolar", "--rings", "6", "--json"]
     found = []
     for options in ([], ["--weights", "equal", "--reference", "chief"]):
-        assert main([*hexapolar, *options]) == 0
+        assert main([*arguments, *options]) == 0
         found.append(json.loads(capsys.readouterr().out))
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     fields = torch.stack([lens.fields.x, lens.fields.y])
@@ -211,4 +212,4 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     torch.testing.assert_close(radii, 1e3 * expected.rms_radius, rtol=1e-12, atol=0)
     assert found[0]["reference"] == "centroid"
     assert all(a["rms_radius_um"] != b["rms_radius_um"] for a, b in zip(*(d["results"] for d in found), strict=True))
-    assert main([*hexapolar, "--rays", "1000", "--reference", "chief"]) == 1
+    assert main([*arguments, "--rays", "1000", "--reference", "chief"]) == 1

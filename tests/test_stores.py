@@ -1,4 +1,4 @@
-"""Stores: records line by line, schemas, and damaged journals, outcomes and labels, each with one clear error."""
+"""Stores: records line by line, schemas, and clear errors for damaged journals, outcomes and labels."""
 
 import json
 import math
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from raytrace import stores
 from raytrace.experiments import Store
 from raytrace.files import append_text
 from raytrace.imaging.codesign import Outcome
@@ -84,6 +85,7 @@ REFUSED = {
     "'b' is missing": (record({"a": number(), "b": text}), {"a": 1}),
     "a: b: found": (record({"a": record({"b": text})}), {"a": {"b": 2}}),
     "c: found": (record({}, {"c": text}), {"c": 2}),
+    "found a list of 1, expected names and values": (record({}, {"c": text}), ["c"]),
     'found "d", expected "a" or null': (exactly("a", None), "d"),
     "expected a text": (either(number(), text), []),
     "found 'colour', expected model": (fields_of(Outcome), {"colour": 1}),
@@ -92,7 +94,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_a_schema_says_what_was_found_and_expected(words):
+def test_a_schema_reports_found_and_expected_values(words):
     check, value = REFUSED[words]
     with pytest.raises(Unfit) as error:
         check(value)
@@ -142,7 +144,7 @@ def test_many_damaged_lines_are_counted(tmp_path):
     assert "lines: 50 damaged lines in all" in str(said[-1].message)
 
 
-def test_what_cannot_be_appended_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+def test_a_failed_append_leaves_the_file_unchanged(tmp_path, monkeypatch):
     """A disk that is full in the middle of a record."""
     path = tmp_path / "lines"
     append_text(path, "1\n")
@@ -326,6 +328,14 @@ def test_a_store_does_not_wait_for_a_pipe(name, tmp_path):
         STORES[name](tmp_path / "kept", IDENTITY)
 
 
+@pytest.mark.parametrize("name", STORES)
+def test_a_store_reads_no_file_above_its_bound(name, tmp_path, monkeypatch):
+    STORES[name](tmp_path / "kept", IDENTITY)
+    monkeypatch.setattr(stores, "_MOST", 8)
+    with pytest.raises(OSError, match="is larger than"):
+        STORES[name](tmp_path / "kept", IDENTITY)
+
+
 def test_files_of_a_run_are_no_pipes(tmp_path):
     run = Run(tmp_path, {"a": 1})
     for path in (run.checkpoint, run.log):
@@ -337,7 +347,7 @@ def test_files_of_a_run_are_no_pipes(tmp_path):
             read()
 
 
-def test_arrays_of_a_store_come_back_and_damaged_ones_are_refused(tmp_path):
+def test_arrays_of_a_store_round_trip_and_damaged_ones_are_refused(tmp_path):
     given = {"heights": np.arange(6.0).reshape(2, 3)}
     for compute in (lambda: given, None):
         found = Store(tmp_path, IDENTITY).arrays("a", compute)

@@ -352,7 +352,7 @@ def test_a_spot_that_no_ray_reaches_makes_the_mean_nan_and_no_derivative():
         mean_square_gradient(system, curvatures, 300, fields=both, empty="error")
 
 
-def test_gradient_by_the_door_takes_plain_numbers():
+def test_the_public_gradient_takes_plain_numbers():
     curvatures = [s.curvature.clone().requires_grad_() for s in double_gauss().surfaces if s.curvature is not None]
     system = bent(curvatures, scalar(1.0))
     plain = rt.mean_square_gradient(system, curvatures, 300, fields=[0, 7.0], wavelengths=[0.55])
@@ -381,7 +381,7 @@ def test_too_small_a_budget_is_refused():
     assert stream_spot(double_gauss(), 10, max_bytes=196608).launched == 10
 
 
-def test_chunk_shrinks_with_the_budget_and_what_is_kept():
+def test_chunk_shrinks_with_the_budget_and_the_stored_rays():
     of_lens = shot(double_gauss(), vector(0.0, 0.0), scalar(0.55))
     sizes = [chunk_size(of_lens, b) for b in (2 * 10**5, 10**6, 10**7, 10**9)]
     assert sizes == sorted(sizes)
@@ -474,7 +474,7 @@ def test_command_gives_the_spot_of_few_rays(command):
     assert [line.split() for line in lines[0]] == [line.split() for line in lines[1]]
 
 
-def test_command_shows_a_bar_beside_the_results(command, monkeypatch):
+def test_command_shows_a_progress_bar(command, monkeypatch):
     monkeypatch.setattr("raytrace.cli.progress._is_terminal", lambda: True)
     code, out, err = command("spot", "double_gauss", "--rays", 2000, "--json")
     assert code == 0

@@ -159,7 +159,7 @@ def test_a_diameter_is_halved_and_a_semi_diameter_is_not():
         ("No,R,d,thing,νd,φ", "column 'thing' holds numbers"),
     ],
 )
-def test_what_a_column_means_is_not_guessed(headings, message):
+def test_ambiguous_columns_are_refused(headings, message):
     with pytest.raises(LensFileError, match=message) as caught:
         read(summilux(headings, "No R d n V D"))
     assert caught.value.line is not None
@@ -293,7 +293,7 @@ def test_numbers_as_people_write_them():
         ("stop,50,4,-1.5\n2,-50,40,\nimage,,,\n", "index d is -1.5"),
     ],
 )
-def test_what_stands_elsewhere_is_asked_for(rows, message):
+def test_missing_data_are_requested(rows, message):
     if message is None:
         assert float(nd(read("No,R,d,nd\n" + rows)[0].surfaces[1].glass)) == 0.0015
         return
@@ -301,7 +301,7 @@ def test_what_stands_elsewhere_is_asked_for(rows, message):
         read("No,R,d,nd\n" + rows)
 
 
-def test_a_radius_of_zero_on_a_lens_is_said():
+def test_a_radius_of_zero_on_a_lens_is_reported():
     rows = "No,R,d,nd\n1,0,4,1.5\n2,50,3,\nstop,0,3,\n3,-50,4,1.5\n4,0.0,40,\nimage,0,,\n"
     _, report = read(rows)
     assert report.warnings == ("lens.csv:5: radius 0 of surface 1, 5 is taken as a plane; write inf if it is one",)
@@ -321,7 +321,7 @@ def test_an_object_without_a_distance_is_far_away():
     assert float(read(rows.format(""), SYSTEM + "# object distance: 250\n")[0].surfaces[0].thickness) == 250
 
 
-def test_the_image_that_a_table_lacks_is_added_and_said():
+def test_a_missing_image_surface_is_added_and_reported():
     lens, report = read("No,R,d,nd\nstop,50,4,1.5\n2,-50,40,\n")
     assert [float(surface.thickness) for surface in lens.surfaces[1:]] == [4, 40, 0]
     assert "no row of the image: added 40 mm behind the last surface" in report.warnings[0]

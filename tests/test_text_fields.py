@@ -1,4 +1,4 @@
-"""Texts of a lens come back from tables whatever they hold; what a .zmx file cannot carry is refused or said."""
+"""Names, notes and comments of a lens round-trip through tables; others are refused in .zmx files or reported."""
 
 import dataclasses
 import warnings
@@ -40,7 +40,7 @@ def texts_of(lens) -> tuple:
 @example(" both ", "\ttab\t", "two\nlines")
 @example("image", "No,R,d,nd", "nan")
 @pytest.mark.parametrize("suffix", TABLES)
-def test_any_text_comes_back_from_a_table(suffix, tmp_path_factory, name, note, comment):
+def test_any_text_round_trips_through_a_table(suffix, tmp_path_factory, name, note, comment):
     lens = with_texts(name, note, comment)
     path = tmp_path_factory.mktemp("texts") / f"lens{suffix}"
     with warnings.catch_warnings(action="error"):
@@ -52,7 +52,7 @@ def test_any_text_comes_back_from_a_table(suffix, tmp_path_factory, name, note, 
 @given(name=NASTY, note=NASTY, comment=NASTY)
 @example(" a", "b ", "\tc")
 @example("Notes...", "Notes...", "x" * 500)
-def test_a_zmx_file_brings_a_text_back_or_refuses_it_or_says_so(tmp_path_factory, name, note, comment):
+def test_a_text_round_trips_through_a_zmx_file_or_is_refused_or_reported(tmp_path_factory, name, note, comment):
     lens = with_texts(name, note, comment)
     path = tmp_path_factory.mktemp("texts") / "lens.zmx"
     with warnings.catch_warnings(record=True) as caught:
@@ -73,14 +73,14 @@ def test_a_warning_names_the_text_that_a_zmx_file_loses(tmp_path):
 
 @settings(max_examples=30)
 @given(name=NASTY, note=NASTY, comment=NASTY)
-def test_any_text_comes_back_from_pandas(name, note, comment):
+def test_any_text_round_trips_through_pandas(name, note, comment):
     lens = with_texts(name, note, comment)
     assert texts_of(lens_from_frame(to_frame(lens))) == texts_of(lens)
 
 
 @settings(max_examples=500)
 @given(st.lists(NASTY.filter(bool), min_size=1))
-def test_words_come_back(listed):
+def test_words_round_trip(listed):
     assert source.words(" ".join(map(source.word, listed))) == listed
 
 
@@ -98,7 +98,7 @@ def test_plain_texts_stay_plain():
     ],
 )
 @pytest.mark.parametrize("suffix", [".csv", ".zmx"])
-def test_what_would_not_be_read_again_is_not_written(changes, message, suffix, tmp_path):
+def test_texts_that_could_not_be_read_are_not_written(changes, message, suffix, tmp_path):
     lens = dataclasses.replace(read_lens(LENSES / "double_gauss.zmx"), **changes)
     path = tmp_path / f"lens{suffix}"
     with pytest.raises(LensFileError, match=message):

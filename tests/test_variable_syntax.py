@@ -1,4 +1,4 @@
-"""Words for what varies and what follows."""
+"""Syntax of variables, solves and pickups."""
 
 import re
 
@@ -40,7 +40,7 @@ def test_surfaces_and_groups(lens):
     assert names(lens, "sensor thickness:11 thickness") == ["thickness_11", *(f"thickness_{k}" for k in range(1, 11))]
 
 
-def test_what_is_not_modelled_yet_is_modelled_at_zero(lens):
+def test_absent_terms_vary_from_zero(lens):
     """Terms of an asphere, a conic and a pose are 0 at the start, and the lens is what it was."""
     found = freedom(lens, "a4:3 a8:3 conic:3 tilt:5 curvature:6")
     model = Model(found.lens, found.variables, found.solves)
@@ -76,7 +76,7 @@ def test_numbers_that_differ_between_configurations_vary_in_each(zoom):
     assert model.start == pytest.approx([float(zoom.surfaces[5].thickness), 12.4281, 16.0])
 
 
-def test_what_follows(lens):
+def test_solves_and_pickups(lens):
     (pickup,) = freedom(lens, "thickness curvature:4 = - 2 * curvature:3 + 0.001").solves
     assert (pickup.surface, pickup.quantity, pickup.kind) == (4, "curvature", "pickup")
     assert (pickup.source, pickup.scale, pickup.offset) == (3, -2.0, 0.001)
@@ -90,7 +90,7 @@ def test_what_follows(lens):
     assert [(one.surface, one.source) for one in both] == [(5, 2), (7, 2)]
 
 
-def test_a_lens_keeps_to_what_follows(lens):
+def test_a_lens_keeps_its_solves(lens):
     found = freedom(lens, "curvature:1,3 curvature:5=-curvature:3 curvature:11=f_number(2.5)")
     model = Model(found.lens, found.variables, found.solves)
     at = model.lens_at(model.start * [1.01, 0.99])
@@ -101,7 +101,7 @@ def test_a_lens_keeps_to_what_follows(lens):
     )
 
 
-def test_what_the_file_says_holds_where_no_word_says_otherwise(lens):
+def test_variables_of_the_file_apply_unless_specified_otherwise(lens):
     import dataclasses
 
     solve = Solve(11, "thickness", "marginal_height", (0.0, 0.0))
@@ -138,7 +138,7 @@ def test_what_the_file_says_holds_where_no_word_says_otherwise(lens):
         ("curvature thickness:11=3", "expected a number that it follows"),
     ],
 )
-def test_what_cannot_be_varied_is_refused(lens, vary, said):
+def test_impossible_variables_are_refused(lens, vary, said):
     with pytest.raises(BadVariables, match=re.escape(said)):
         freedom(lens, vary)
 

@@ -215,7 +215,7 @@ def test_bounds_hold_after_a_step():
         ("thickness:0", "surface 0"),
     ],
 )
-def test_what_cannot_be_varied_is_refused(vary, message):
+def test_impossible_variables_are_refused(vary, message):
     with pytest.raises(BadVariables, match=message):
         Variables(read_lens("double_gauss"), vary)
 
@@ -360,7 +360,7 @@ def test_a_telescope_of_mirrors_can_be_built():
 
 
 def test_elements_either_side_of_a_stop_may_not_touch():
-    """Each air space beside the stop is buildable, the two elements would overlap by 3 mm beyond its rim."""
+    """Each air space about the stop is buildable, the two elements would overlap by 3 mm beyond its rim."""
     variables = Variables(read_lens("double_gauss"), "thickness:5,6")
     with torch.no_grad():
         variables.get_parameter("thickness_5").fill_(2.4882 - 14.253)

@@ -44,7 +44,7 @@ S, OF_LEAVES = spectrum(PICTURES), digest(LEAVES.samples)
 QUICK = DesignSettings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
 
 
-def test_light_beyond_the_window_comes_back_as_haze():
+def test_light_beyond_the_window_is_added_as_haze():
     """A picture of one shade keeps it; without haze it would darken by what misses the window."""
     H = transfer(psf(scene(baseline("fresnel", aim()), WaveCameraConfig(depths=(1000.0,), size=31))), 64)
     assert torch.allclose(H[..., 0, 0].real, torch.ones(1, 3, dtype=torch.float64), atol=1e-12)
@@ -248,7 +248,7 @@ def test_mirrored():
     assert result.tolist() == [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]]
 
 
-def test_the_table_says_what_it_knows():
+def test_the_table_lists_known_values():
     content = Content("leaves", PICTURES[:6], PICTURES[6:])
     result = table_of([content], elements_of(["singlet", "fresnel"], SMALL, S, learned={}), SMALL)
     assert list(result["leaves"]) == ["fresnel", "singlet"]

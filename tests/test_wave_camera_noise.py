@@ -1,4 +1,4 @@
-"""Extended depth of field over noise: the octant beside the kernels, errors picture by picture, their intervals."""
+"""Extended depth of field over noise: the octant against full kernels, errors of each picture, their intervals."""
 
 import dataclasses
 import json
@@ -278,7 +278,7 @@ def test_strengths_fall_with_the_noise():
 
 
 @pytest.mark.slow
-def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
+def test_the_command_learns_evaluates_and_resumes(capsys, monkeypatch, tmp_path):
     """One row, one noise, two starts; the second time everything is kept, and the figures are the same."""
     monkeypatch.setattr(wave_run, "LEAF_COUNT", 4)
     words = ["--rows", "learned-smooth", "--noises", "0.01", "--starts", "2", "--steps", "1"]

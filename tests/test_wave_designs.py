@@ -336,7 +336,7 @@ def test_the_achromat_takes_another_engine_and_leaves_grad_mode_alone():
 
 @pytest.mark.parametrize("name", [name for name in BASELINES if name != "achromat"])
 @pytest.mark.parametrize("exact", [False, True])
-def test_gradients_reach_what_the_camera_is(name, exact):
+def test_gradients_reach_all_numbers_of_the_camera(name, exact):
     x = number([0.1, -0.23, 0.31])
 
     def waves(sensor, focus, wavelength):

@@ -190,14 +190,14 @@ def test_pixels_lie_around_the_axis_with_row_0_at_the_smallest_y():
     assert torch.equal(result, h.flatten())
 
 
-def test_a_pixel_is_flat_between_its_edges_and_the_last_one_goes_on():
+def test_a_pixel_is_constant_between_its_edges_and_the_last_one_extends():
     h = torch.arange(4, dtype=torch.float64).expand(4, 4)
     x = number([-99.0, -2.0, -1.001, -0.999, -0.001, 0.0, 0.999, 1.0, 99.0])
     result = height(element(Pixels(h, number(1.0))), x, 0 * x)
     assert result.tolist() == [0, 0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_rings_begin_on_the_axis_and_the_last_one_goes_on():
+def test_rings_start_on_the_axis_and_the_last_one_extends():
     rings = element(Rings(number([5.0, 6.0, 7.0]), number(0.5)))
     r = number([0.0, 0.499, 0.5, 0.999, 1.0, 1.4, 99.0])
     assert height(rings, r, 0 * r).tolist() == [5, 5, 6, 6, 7, 7, 7]
@@ -245,7 +245,7 @@ PROFILES = {
 
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("wrap", [False, True])
-def test_gradcheck_of_what_is_learned(name, wrap):
+def test_gradcheck_of_learned_heights(name, wrap):
     build, numbers = PROFILES[name]
     x, y = points(11, radius=2.3)
     # 7 µm is no wave of anything: heights of these profiles stay away from its jumps by more than the step.

@@ -25,7 +25,7 @@ def thick() -> Element:
     return rings(-(r**2) / 2 / 19.0 / 0.46)
 
 
-def test_what_a_process_can_make_is_matched_exactly():
+def test_feasible_depths_are_matched_exactly():
     """Depths within the relief, on its levels, come back as they are, but for a step common to all; agreement 1."""
     process = Process(waves=2, levels=8)
     step = float(process.period(thick())) / 8

@@ -116,7 +116,7 @@ def test_fabricated_is_the_same_element_with_its_heights_written_out():
 
 @pytest.mark.parametrize("levels", [0, 16])
 @pytest.mark.parametrize("suffix", [".npy", ".csv", ".tif"])
-def test_files_hold_what_was_simulated(tmp_path, suffix, levels):
+def test_files_hold_the_simulated_kernels(tmp_path, suffix, levels):
     """Heights wrapped and in steps, of rings and of pixels made of them: the file alone is the element, no period."""
     rings = rt.as_rings(lens(), 0.02)
     rt.write_element(rings, tmp_path / f"whole{suffix}", design_wavelength=0.55)

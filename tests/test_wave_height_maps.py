@@ -48,7 +48,7 @@ def there_and_back(profile, path, **known):
 
 @pytest.mark.parametrize("suffix", [*EXACT, *GRIDS])
 @pytest.mark.parametrize("pitch", [0.002, 0.00369, 1 / 3e3])
-def test_pixels_come_back_bit_for_bit(suffix, pitch, tmp_path):
+def test_pixels_round_trip_bit_identically(suffix, pitch, tmp_path):
     written = pixels(pitch=pitch)
     result = there_and_back(written, tmp_path / f"map{suffix}")
     assert torch.equal(result.heights, written.heights)
@@ -56,7 +56,7 @@ def test_pixels_come_back_bit_for_bit(suffix, pitch, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", EXACT)
-def test_rings_come_back_bit_for_bit(suffix, tmp_path):
+def test_rings_round_trip_bit_identically(suffix, tmp_path):
     written = rings()
     result = there_and_back(written, tmp_path / f"map{suffix}")
     assert torch.equal(result.heights, written.heights)
@@ -67,7 +67,7 @@ def test_rings_come_back_bit_for_bit(suffix, tmp_path):
 @pytest.mark.parametrize(
     "make", [lambda: Pixels(drawn(40, 30), number(0.00369)), lambda: Rings(drawn(1250), number(0.002))]
 )
-def test_pictures_come_back_to_half_a_grey_value(suffix, make, tmp_path):
+def test_pictures_round_trip_to_half_a_grey_value(suffix, make, tmp_path):
     written = make()
     result = there_and_back(written, tmp_path / f"map{suffix}")
     span = written.heights.max() - written.heights.min()
@@ -78,7 +78,7 @@ def test_pictures_come_back_to_half_a_grey_value(suffix, make, tmp_path):
 
 @pytest.mark.parametrize("suffix", [*EXACT, *PICTURES, *GRIDS])
 @pytest.mark.parametrize("levels", [[*range(16)], [0, 1, 2, 3, 5, 8, 13], [7]])
-def test_steps_come_back_exactly(suffix, levels, tmp_path):
+def test_steps_round_trip_exactly(suffix, levels, tmp_path):
     """Also where not all sixteen are there, so that a grey value is no whole share of a step."""
     steps = torch.tensor(levels)[torch.arange(64).reshape(8, 8) % len(levels)] * (number(WAVE) / 16)
     result = there_and_back(Pixels(steps, number(0.002)), tmp_path / f"map{suffix}")
@@ -224,7 +224,7 @@ def test_npy_of_another_program_needs_a_pitch(tmp_path):
     assert read_heights(tmp_path / "map.npy", pitch=0.5).heights.dtype == torch.float64
 
 
-def test_what_the_file_says_counts_more_than_what_the_caller_knows(tmp_path):
+def test_metadata_of_the_file_override_arguments(tmp_path):
     for suffix in (".npy", ".png", ".tif"):
         result = there_and_back(pixels(), tmp_path / f"map{suffix}", pitch=9.0, span=(0.0, 9.0))
         assert float(result.pitch) == 0.00369
@@ -259,7 +259,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_what_is_no_height_map_is_refused(name, tmp_path):
+def test_files_without_a_height_map_are_refused(name, tmp_path):
     suffix, text, message = TEXTS[name]
     path = tmp_path / f"map{suffix}"
     path.write_text(text)
@@ -304,7 +304,7 @@ def test_text_and_objects_in_npy_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_what_cannot_be_written_is_refused_and_the_old_file_stays(suffix, tmp_path):
+def test_unwritable_height_maps_are_refused_and_the_old_file_stays(suffix, tmp_path):
     path = tmp_path / f"map{suffix}"
     write_heights(pixels(), path)
     before = path.read_bytes()
@@ -333,7 +333,7 @@ def test_a_file_that_is_not_there_and_a_folder_that_is_not_there(tmp_path):
 
 
 def test_a_changed_picture_does_not_get_another_ones_heights(tmp_path):
-    """A description that lists two heights beside a picture of three grey values."""
+    """A description that lists two heights for a picture of three grey values."""
     steps = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64)
     write_heights(Pixels(steps, number(0.1)), tmp_path / "map.tif")
     with Image.open(tmp_path / "map.tif") as picture:

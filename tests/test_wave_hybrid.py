@@ -72,7 +72,7 @@ def test_the_back_surface_is_the_height_and_its_vertex_lies_on_it(profile):
         (noll(0.0, 0.1), "substrate"),
     ],
 )
-def test_what_rays_cannot_see_is_refused(element, message):
+def test_elements_without_a_ray_model_are_refused(element, message):
     with pytest.raises(ValueError, match=message):
         bridge.surfaces_of(element)
 

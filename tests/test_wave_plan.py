@@ -99,7 +99,7 @@ def test_predicted_errors_hold_for_any_shape(strength):
     assert 0.01 * result.error < error < result.error <= 1e-3
 
 
-def test_cost_grows_with_what_is_asked_for():
+def test_cost_grows_with_the_requested_samples():
     s = scene(lens(), TILTED, size=64)
     cheap, dear = plan(s, tol=1e-2), plan(s, tol=1e-5)
     assert cheap.samples < dear.samples

@@ -179,7 +179,7 @@ def test_gradients_with_a_vignetted_ray():
     assert gradcheck(statistics, start, eps=1e-6, atol=1e-7)
 
 
-def test_light_through_a_small_part_of_the_pupil_tells_no_coefficients():
+def test_a_small_part_of_the_pupil_gives_no_coefficients():
     """Not numbers of 1e14 waves; the RMS, which needs no polynomials, stays."""
     lens = problems.double_gauss(aperture=("image_f_number", 0.5))
     fast, slow = (

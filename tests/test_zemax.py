@@ -188,7 +188,7 @@ def _glass(line: str):
     return read(file().replace("GLAS N-BK7 0 0 1.5 40", line))[0].surfaces[1].glass
 
 
-def test_glass_columns_are_placeholders_unless_the_flag_says_model():
+def test_glass_columns_are_placeholders_unless_flagged_as_a_model():
     listed = find_glass("SF5", catalogs=("SCHOTT",))
     for flag in (0, 2, 3):
         assert _glass(f"GLAS SF5 {flag} 0 1.5 40 0").coefficients.equal(listed.coefficients)
@@ -333,7 +333,7 @@ def test_encodings():
 
 
 @pytest.mark.parametrize("content", [b"", b"  \n", b"\x00\x01\x02\x03" * 99, b"PK\x03\x04\x07", b"\xff\xfeV\x00E"])
-def test_what_is_not_text_is_refused(content):
+def test_binary_files_are_refused(content):
     with pytest.raises(LensFileError):
         decode(content, Place("lens.zmx"))
 
@@ -384,7 +384,7 @@ def test_operands_that_change_nothing_are_not_reported():
         assert any("PRES 0 atm (pressure of configuration 2)" in warning for warning in warnings) == (active == 2)
 
 
-def test_multi_configuration_file_says_which_configuration_is_read():
+def test_the_configuration_read_from_a_file_is_reported():
     tail = "MNUM 2{}\nTHIC 1 1 {} 1 0\nTHIC 1 2 {} 1 0"
     first = read(file(tail=tail.format(" 1", 4, 5)))[1]
     assert "configuration 1 of 2" in first.notes[0]

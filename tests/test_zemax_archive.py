@@ -1,4 +1,4 @@
-"""Archives of OpticStudio (.zar), and glass catalogs that come with a lens: packed with it, or beside it."""
+"""Archives of OpticStudio (.zar), and glass catalogs of a lens: in its archive, or in its folder."""
 
 import json
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_the_codes_of_the_literature_are_unpacked():
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 255, 3_000, 200_000])
-def test_bytes_come_back(size):
+def test_bytes_round_trip(size):
     """Beyond 512, 1024, … words, where codes grow by a bit."""
     for content in (
         bytes(torch.randint(0, 256, (size,), generator=torch.Generator().manual_seed(1)).tolist()),
@@ -100,7 +100,7 @@ def test_bytes_come_back(size):
 
 @pytest.mark.parametrize("version", [0xEA, 0xEC])
 @pytest.mark.parametrize("packed", [True, False])
-def test_members_stand_in_their_order_with_their_names(version, packed):
+def test_members_are_in_order_with_their_names(version, packed):
     files = {"LENS.ZMX": b"one", "Prüf glas.agf": b"two two two", "empty.cfg": b""}
     found = members(archive(files, version, packed), PLACE)
     assert [member.name for member in found] == list(files)
@@ -180,7 +180,7 @@ def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
 # -- damaged and hostile ----------------------------------------------------------------------------------------------
 
 
-def test_an_archive_without_a_lens_says_what_it_holds(tmp_path):
+def test_an_archive_without_a_lens_lists_its_members(tmp_path):
     with pytest.raises(LensFileError, match=r"no lens \(\.zmx\) among its 2 members \(A\.CFG, B\.AGF\)"):
         read_lens(written(tmp_path, {"A.CFG": b"", "B.AGF": SMALL}))
     with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\), none with its own name"):
@@ -243,7 +243,7 @@ def first(lens) -> object:
 
 @pytest.mark.parametrize("name", ["ACME.AGF", "acme.agf", "Acme.Agf"])
 @pytest.mark.parametrize("suffix", [".zmx", ".csv"])
-def test_a_catalog_beside_the_lens_is_found_by_itself(suffix, name, tmp_path):
+def test_a_catalog_in_the_folder_of_the_lens_is_found(suffix, name, tmp_path):
     path = lens_file(tmp_path, suffix)
     with pytest.raises(UnknownGlass, match="ACME-1"):
         read_lens(path)
@@ -259,7 +259,7 @@ def test_a_catalog_of_the_archive_is_found_by_itself(tmp_path):
     lens, report = read_lens_with_report(written(tmp_path, {"ACME.AGF": ACME, "LENS.ZMX": text}))
     assert first(lens).catalog == "ACME"
     assert "catalog ACME: ACME.AGF of the archive" in report.notes
-    (tmp_path / "ACME.AGF").write_text(ACME)  # what lies beside an archive is not what it was made with
+    (tmp_path / "ACME.AGF").write_text(ACME)  # a catalog in the folder of an archive is not that of the archive
     with pytest.raises(UnknownGlass):
         read_lens(written(tmp_path, {"LENS.ZMX": text}))
 
@@ -271,7 +271,7 @@ def test_a_catalog_that_the_lens_does_not_name_is_not_used(suffix, tmp_path):
         read_lens(lens_file(tmp_path, suffix, catalogs="SCHOTT"))
 
 
-def test_the_catalog_of_the_lens_goes_before_the_shipped_one_of_its_name_and_it_is_said(tmp_path):
+def test_the_catalog_of_the_lens_overrides_the_shipped_one_and_is_reported(tmp_path):
     path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
     (tmp_path / "schott.agf").write_text(OWN)
     lens, report = read_lens_with_report(path)
@@ -291,7 +291,7 @@ def test_the_order_of_the_lens_file_holds_for_catalogs_that_came_with_it(tmp_pat
     assert first(read_lens(lens_file(tmp_path, ".zmx", "N-BK7", "ACME SCHOTT"))).catalog == "ACME"
 
 
-def test_a_catalog_that_is_given_goes_before_the_one_beside_the_lens(tmp_path, monkeypatch):
+def test_a_given_catalog_overrides_that_in_the_folder_of_the_lens(tmp_path, monkeypatch):
     given = tmp_path / "given"
     given.mkdir()
     (given / "ACME.AGF").write_text(ACME.replace("CD 1.03961212", "CD 1.05961212"))
@@ -305,7 +305,7 @@ def test_a_catalog_that_is_given_goes_before_the_one_beside_the_lens(tmp_path, m
     assert float(index(first(read_lens(path)), 0.55)) == stated
 
 
-def test_a_damaged_catalog_beside_the_lens_is_said(tmp_path):
+def test_a_damaged_catalog_in_the_folder_of_the_lens_is_reported(tmp_path):
     (tmp_path / "SCHOTT.AGF").write_text("NM N-BK7 2\n")
     path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
     lens, report = read_lens_with_report(path)
@@ -324,7 +324,7 @@ def test_the_name_of_a_catalog_is_no_path(name, tmp_path):
         read_lens(lens_file(folder, ".zmx", catalogs=name))
 
 
-def test_a_lens_is_written_beside_its_catalog_and_read_again(tmp_path):
+def test_a_lens_is_written_with_its_catalog_and_read_again(tmp_path):
     (tmp_path / "SCHOTT.AGF").write_text(OWN)
     path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
     with pytest.warns(UserWarning, match="its index differs"):

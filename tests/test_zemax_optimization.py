@@ -1,4 +1,4 @@
-"""What a .zmx file says about how its lens is to be optimised: read, kept, written again; by real files and by hand."""
+"""Optimisation data of .zmx files (variables, merit function, solves): read, kept and written."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ def again(found: rt.Lens, folder: Path) -> rt.Lens:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_the_intent_of_every_real_file_comes_back(path, tmp_path):
+def test_optimisation_data_of_every_real_file_round_trip(path, tmp_path):
     try:
         original = read_lens_with_report(path)[0]
     except (LensFileError, UnknownGlass):
@@ -112,7 +112,7 @@ MNUM 1 1"""
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_lengths_of_rules_are_in_mm_and_rows_stay_as_written_and_come_back(unit, tmp_path):
+def test_lengths_of_solves_are_in_mm_and_rows_round_trip_as_written(unit, tmp_path):
     mm = UNITS[unit]
     rules = {"surface": RULES, "stop": "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1", "tail": MERIT_LINES}
     original = lens(UNIT=f"UNIT {unit} X W X CM MR CPMM\nSDMA 5 1 0.25", **rules)
@@ -150,7 +150,7 @@ def test_lengths_of_rules_are_in_mm_and_rows_stay_as_written_and_come_back(unit,
 
 @pytest.mark.parametrize("unit", [10.0, 25.4, 1e3])
 @pytest.mark.parametrize("power", [1, -1, -3, -15])
-def test_a_number_of_a_file_is_written_in_its_unit_such_that_it_comes_back(unit, power):
+def test_a_number_of_a_file_round_trips_in_its_unit(unit, power):
     random = torch.Generator().manual_seed(3)
     for one in torch.randn(500, dtype=torch.float64, generator=random).tolist():
         in_mm = one * unit**power if power >= 0 else one / unit**-power
@@ -160,7 +160,7 @@ def test_a_number_of_a_file_is_written_in_its_unit_such_that_it_comes_back(unit,
         assert (other * unit**power if power >= 0 else other / unit**-power) == pytest.approx(one, rel=5e-16, abs=0)
 
 
-def test_a_focal_length_comes_back_in_every_unit(tmp_path):
+def test_a_focal_length_round_trips_in_every_unit(tmp_path):
     ideal = "TYPE PARAXIAL\nCURV 0\nPARM 1 37.723137702602429\nVPAR 1\nPARM 2 1\nGLAS AIR"
     for unit in UNITS:
         original = lens(UNIT=f"UNIT {unit} X", surface=ideal, tail="EFFL 0 2 0 0 0 0 50 1 0 0")
@@ -174,7 +174,7 @@ def test_a_unit_that_no_file_has_is_refused_by_name(tmp_path):
         write_lens(other, tmp_path / "lens.zmx")
 
 
-def test_what_varies_is_modelled_and_a_row_is_not_traced():
+def test_variables_are_modelled_and_a_row_is_not_traced():
     found = lens(surface=RULES)
     first = found.surfaces[1]
     assert float(first.conic) == 0
@@ -183,7 +183,7 @@ def test_what_varies_is_modelled_and_a_row_is_not_traced():
     assert len(torch.utils._pytree.tree_leaves(found)) == len(torch.utils._pytree.tree_leaves(plain))
 
 
-def test_a_lens_without_an_intent_is_written_as_before(tmp_path):
+def test_a_lens_without_optimisation_data_is_written_as_before(tmp_path):
     given = lens(object_="DIAM 9 1 0 0 1").replace(1, thickness=4.5)
     given = dataclasses.replace(given, optimization_data=None)
     write_lens(given, tmp_path / "lens.zmx")
@@ -218,7 +218,7 @@ def test_a_wrong_word_in_a_rule_or_a_row_is_one_error_with_file_and_line(changes
     assert caught.value.surface == (1 if "surface" in changes else None)
 
 
-def test_rules_that_are_not_followed_are_kept_named_and_come_back(tmp_path):
+def test_unsupported_solves_are_kept_reported_and_round_trip(tmp_path):
     rules = {
         "surface": 'CURV 0.02 8 0.01 0 0 ""\nTOLE 3 51.5\nGLAS N-BK7 3 0 1.5 40\nPPAR 2 -1 1 0\nDIAM 6 3 0 0 1',
         "stop": "EDGE 0.5 3\nDIAM 5.5 2 1 0 1\nCURV -0.02 99 1 2 3",
@@ -265,7 +265,7 @@ def test_numbers_of_configurations_vary_one_by_one_and_void_the_variable_of_the_
     assert [one.values() for one in found.operands] == [one.values() for one in original.operands]
 
 
-def test_the_intent_stays_with_the_lens_under_other_conditions():
+def test_optimisation_data_stay_with_the_lens_under_other_conditions():
     original = lens(surface=RULES, tail=f"{MERIT_LINES.rpartition('MNUM')[0]}{CONFIGURED}")
     for other in (original.at(f_number=8), original.replace(1, thickness=3), original.configuration(2)):
         assert other.optimization_data is original.optimization_data
@@ -286,7 +286,7 @@ def test_bounds_of_a_thickness_are_kept_and_those_of_the_program_are_none(tmp_pa
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_bounds_on_one_side_are_kept_and_those_of_other_numbers_are_said_to_be_lost(unit, tmp_path):
+def test_bounds_on_one_side_are_kept_and_lost_bounds_reported(unit, tmp_path):
     original = lens(surface=RULES, stop="VDSZ 0 0", UNIT=f"UNIT {unit} X", tail="EFFL 0 2 0 0 0 0 50 1 0 0")
     curvature, thickness, *others, last = original.optimization_data.variables
     inf = float("inf")
@@ -311,7 +311,7 @@ def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
         read_merit(tmp_path / "other.MF")
 
 
-def test_an_intent_says_what_it_holds():
+def test_optimisation_data_describe_themselves():
     shown = str(lens(surface=RULES, stop="PZUP 1 -1 0.5 0", tail=MERIT_LINES).optimization_data)
     assert "varies: a4 of surface 1" in shown
     assert "follows: thickness of surface 2 = -1 × thickness of surface 1 + 0.5" in shown
@@ -320,7 +320,7 @@ def test_an_intent_says_what_it_holds():
     assert {"TRAC", "MTFT", "CONF"} <= DIMENSION.keys()
 
 
-def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
+def test_check_lists_variables_and_evaluated_operands(tmp_path):
     path = tmp_path / "lens.zmx"
     path.write_text(file(surface=RULES, stop=STOP_RULES, tail=MERIT_LINES))
     found = rt.check(path)
@@ -343,7 +343,7 @@ def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
     assert not {"variables", "solves", "kept", "operands", "tolerances"} & plain.keys()
 
 
-def test_a_table_says_that_it_does_not_hold_what_is_to_be_optimised(tmp_path):
+def test_a_table_reports_that_it_holds_no_optimisation_data(tmp_path):
     with pytest.warns(LensFileWarning, match=r"the optimisation data \('12 rows of a merit function'\)"):
         write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")
 
@@ -365,7 +365,7 @@ def edge(surfaces, k: int, height: float) -> float:
     return float(surfaces[k].thickness) + sags[1] - sags[0]
 
 
-def test_rules_give_back_what_the_program_stored():
+def test_solves_reproduce_the_stored_numbers():
     met = Counter()
     for path in FILES:
         try:
@@ -393,7 +393,7 @@ def test_rules_give_back_what_the_program_stored():
         assert met["edge_thickness"]
 
 
-def test_offsets_of_rules_that_are_kept_come_back_in_every_unit(tmp_path):
+def test_offsets_of_kept_solves_round_trip_in_every_unit(tmp_path):
     for unit in UNITS:
         original = lens(
             UNIT=f"UNIT {unit} X", surface=f"{RULES}\nPPAR 2 -1 1 0.3", stop="PZUP 2 1 0.7 0", tail="EFFL 0 2"

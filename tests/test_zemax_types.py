@@ -107,7 +107,7 @@ def test_every_type_has_a_case():
 
 
 def rays(seed: int) -> list[tuple[list[float], list[float]]]:
-    """Some at the stop, one of them along the axis but beside the vertex."""
+    """Some at the stop, one of them parallel to the axis but off the vertex."""
     source = random.Random(seed)
     found = [([0.1, 0.2, 0.0], [0.0, 0.0, 1.0])]
     for _ in range(6):
@@ -134,7 +134,7 @@ def test_rays_go_as_the_definitions_say(name, unit):
 
 @pytest.mark.parametrize("unit", MILLIMETRES)
 @pytest.mark.parametrize("name", CASES)
-def test_every_type_comes_back_bit_for_bit(name, unit):
+def test_every_type_round_trip_bit_identically(name, unit):
     lens, report = read(text(name, unit, "CLAP 0 6"))
     if CASES[name][0] != "COORDBRK":
         assert lens.surfaces[2].apertures
@@ -182,7 +182,7 @@ def seconds(draw) -> str:
 
 @settings(max_examples=400, deadline=None)
 @given(second=seconds(), unit=st.sampled_from(["MM", "CM", "IN", "METER"]))
-def test_any_lens_comes_back_bit_for_bit(second, unit):
+def test_any_lens_round_trip_bit_identically(second, unit):
     lens = read(file(second, unit))[0]
     found = again(lens)[0]
     assert leaves(found) == leaves(lens)
@@ -225,7 +225,7 @@ def test_damaged_files_of_every_type_give_a_lens_or_a_clear_error(seed, name):
         ({"before": rt.Pose(tilt_x=number(math.nan))}, "tilt or decentre is nan"),
     ],
 )
-def test_what_a_file_cannot_hold_is_refused(changes, message):
+def test_lenses_that_a_file_cannot_hold_are_refused(changes, message):
     lens = read(text("standard"))[0]
     bare = dataclasses.replace(lens.surfaces[2], curvature=None, conic=None, glass=rt.AIR)
     surface = dataclasses.replace(bare, **changes)
@@ -254,7 +254,7 @@ def test_what_a_file_cannot_hold_is_refused(changes, message):
         ("TYPE HOLOGRM2\nCURV 0.1\nPARM 3 9\nPARM 6 9\nPARM 7 0.5", "on a curved surface"),
     ],
 )
-def test_what_is_not_modelled_is_refused_by_name_surface_and_line(second, message):
+def test_unmodelled_features_are_refused_by_name_surface_and_line(second, message):
     with pytest.raises(UnsupportedSurface, match=message) as caught:
         read(file(second))
     assert (caught.value.surface, caught.value.file) == (2, "lens.zmx")
@@ -269,7 +269,7 @@ def test_object_and_image_are_no_breaks_and_bend_no_light(kind, surface):
         read(content)
 
 
-def test_an_object_stands_straight():
+def test_an_object_is_perpendicular_to_the_axis():
     with pytest.raises(UnsupportedSurface, match="surface 0: type STANDARD of the object with a tilt"):
         read(text("standard").replace("SURF 0\n", "SURF 0\n  SCBD 2 0 0 0 0 5 0 0\n"))
 
@@ -312,7 +312,7 @@ def test_numbers_out_of_range_are_one_clear_error(second, message):
         ("TYPE COORDBRK\nSCBD 3 3 1", "notes", "coordinate return; its solved values"),
     ],
 )
-def test_what_is_not_used_is_said(second, where, said):
+def test_unused_data_are_reported(second, where, said):
     report = read(file(second))[1]
     assert [one for one in getattr(report, where) if re.search(said, one)]
     assert all(keyword.status != "unknown" for keyword in report.keywords)

@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 
 from raytrace.bench.command import installed, measured
 from raytrace.bench.report import Measured, Request
-from raytrace.cli.options import count, json
+from raytrace.cli.options import json
 from raytrace.cli.run import present, printed_on_failure
 from raytrace.cli.settings import documents
+from raytrace.cli.types import count
 
 Options = Callable[[argparse.ArgumentParser], object]
 

@@ -34,10 +34,10 @@ from optiland.optimization.operand.operand import operand_registry
 from optiland.samples.objectives import CookeTriplet, DoubleGauss
 from torch import Tensor
 
-from raytrace.bench.report import digits, table
 from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.optimize import optimize
+from raytrace.pages import digits, listing
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.surface import Surface
@@ -348,7 +348,7 @@ def report(runs: Sequence[Run]) -> list[str]:
         "this package reaches it in, s": lambda run: digits(run.reached, ".3g", "–"),
         "ratio": lambda run: digits(run.seconds / run.reached, ".0f", "–") if run.reached else "–",
     }
-    return table(columns, runs)
+    return listing(columns, runs)
 
 
 def options(parser: argparse.ArgumentParser) -> None:

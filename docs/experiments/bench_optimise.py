@@ -21,13 +21,14 @@ import bench_kit as kit
 import numpy as np
 from matplotlib.figure import Figure
 
-from raytrace.bench.report import Measured, Request, digits, in_words, table
+from raytrace.bench.report import Measured, Request, in_words
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
 from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.pages import digits, listing
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
@@ -157,7 +158,7 @@ def _of_files(files: Sequence[FileRow]) -> list[str]:
         "## Files with a merit function", "",
         f"As stored, and from a start where every variable is moved by up to {FRACTION:.0%}; at most {MOST:g} s each. "
         "Best: the minimum that an independent least squares found from either start in minutes.", "",
-        *table(columns, files), "",
+        *listing(columns, files), "",
     ]  # fmt: skip
 
 

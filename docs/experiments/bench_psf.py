@@ -16,26 +16,15 @@ from collections.abc import Sequence
 import bench_kit as kit
 import torch
 
-from raytrace.bench.figures import psf_figure
-from raytrace.bench.huygens import Sampling, direct_sum
+from raytrace.bench import psf
 from raytrace.bench.measure import clock
-from raytrace.bench.psf import (
-    PsfRow,
-    Truth,
-    bounds,
-    bounds_closely,
-    errors_of,
-    measured_rows,
-    relative_l1,
-    report,
-    row_of,
-    scaled,
-)
-from raytrace.bench.psf_cases import Method
-from raytrace.bench.report import Measured, Request, milliseconds, table, yes
+from raytrace.bench.psf import Method, PsfRow, Truth, bounds, bounds_closely, errors_of, relative_l1, row_of
+from raytrace.bench.report import Measured, Request
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid, random
+from raytrace.pages import listing, milliseconds, yes
 from raytrace.psf_models import drt
+from raytrace.psf_models.direct_sum import Sampling, direct_sum
 from raytrace.psf_models.result import Kernels
 from raytrace.tracing.scene import Scene
 
@@ -108,11 +97,11 @@ def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
         return row_of(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)
 
     for part, more in LADDER:
-        nodes = max(2, truth.nodes + more)
-        rows.append(run(Sampling(*scaled(truth.rings, truth.arms, part), nodes)))
+        sampling = truth.sampling.scaled(part, more)
+        rows.append(run(sampling))
         if rows[-1].l1_error <= WAVE_ERROR:
             break
-    coarse, fine = square = [run(Sampling(across, 0, nodes)) for across in SQUARE]
+    coarse, fine = square = [run(Sampling(across, 0, sampling.nodes)) for across in SQUARE]
     rows += square
     if fine.l1_error > WAVE_ERROR and fine.l1_error < coarse.l1_error:
         power = math.log(coarse.l1_error / fine.l1_error) / math.log(fine.rays / coarse.rays)
@@ -203,13 +192,11 @@ def judged(rows: Sequence[PsfRow]) -> list[PsfRow]:
 
 def bench(request: Request) -> Measured:
     """Every method on every case, random rays, direct sums and targets."""
-    rows, titles, about = measured_rows(request, more)
-    goals, names = targets(rows), ("target", "case", "measured", "met")
+    names = ("target", "case", "measured", "met")
     columns = {name: (lambda goal, k=k: goal[k]) for k, name in enumerate(names)} | {"met": lambda goal: yes(goal[3])}
-    head = ["## Targets", "", *table(columns, goals), ""]
-    lines = report(rows, titles=titles, about=about["machine"], repeats=about["repeats"], head=head)
-    about["targets"] = [dict(zip(names, goal, strict=True)) for goal in goals]
-    return Measured(rows, lines, about, functools.partial(psf_figure, titles=titles), ("tables.md", "speed_vs_error"))
+    result = psf.bench(request, more, lambda rows: ["## Targets", "", *listing(columns, targets(rows)), ""])
+    about = result.about | {"targets": [dict(zip(names, goal, strict=True)) for goal in targets(result.rows)]}
+    return dataclasses.replace(result, about=about, place=("tables.md", "speed_vs_error"))
 
 
 def options(parser: argparse.ArgumentParser) -> None:

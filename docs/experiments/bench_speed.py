@@ -26,12 +26,13 @@ from torch import Tensor
 
 from raytrace.bench import speed
 from raytrace.bench.figures import speed_figure
-from raytrace.bench.measure import Own, field_rays, name_of, nothing, shape_of, some, surfaces_of
-from raytrace.bench.report import Measured, Request, significant, table, yes
+from raytrace.bench.measure import Own, Row, Tracer, field_rays, name_of, shape_of, some, surfaces_of
+from raytrace.bench.report import Measured, Request
 from raytrace.cli.progress import progress
 from raytrace.cli.run import say
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
+from raytrace.pages import listing, significant, yes
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_even
@@ -106,19 +107,18 @@ def with_limits(bench: speed.Bench, built: "Built | None") -> tuple[speed.Bench,
     return dataclasses.replace(bench, **peers), steps
 
 
-def of_limits(rows: Sequence[speed.Row], dtype: str, sizes: speed.Sizes) -> dict[str, float | None]:
+def of_limits(rows: Sequence[Row], dtype: str, sizes: speed.Sizes) -> dict[str, float | None]:
     """Speeds of this package relative to the limits."""
 
     def over(what: str, name: str) -> float | None:
-        chosen = (row for row in rows if (row.dtype, row.what, row.rays) == (dtype, what, sizes.rays))
-        return speed.over({row.tracer: row.seconds for row in chosen}, name)
+        return speed.over([row for row in rows if (row.dtype, row.what, row.rays) == (dtype, what, sizes.rays)], name)
 
     keys = {"forward_over_limit": ("forward", "safe"), "forward_over_plain_limit": ("forward", "plain")}
     return {key: over(*which) for key, which in (keys | {"asphere_over_limit": ("asphere", "safe")}).items()}
 
 
 def lines(
-    rows: Sequence[speed.Row], ratios: Mapping, *, sizes: speed.Sizes, about: Mapping, compiled: str, repeats: int
+    rows: Sequence[Row], ratios: Mapping, *, sizes: speed.Sizes, about: Mapping, compiled: str, repeats: int
 ) -> list[str]:
     """The page. compiled: compiler and flags of the limits, or why there are none."""
     numbers = speed.sizes_in_words(sizes)
@@ -138,7 +138,7 @@ def lines(
     return [
         *("# Speed: this package, its limits and its peers", ""),
         *(f"    python docs/experiments/bench_speed.py --threads {about['torch threads']} --docs docs", ""),
-        *table(columns, TARGETS),
+        *listing(columns, TARGETS),
         "",
         f"Limits: `docs/experiments/bench_limit.cpp`, {compiled}; steps of Newton's method on the aspheres: "
         f"{each('asphere_newton_steps')}. Peak memory: of {each('bytes_per_ray_rays', ' rays')}. Gain of a sensor step "
@@ -215,14 +215,14 @@ def _compiled(program: Sequence[str], flags: Sequence[str], folder: Path) -> cty
         return str(error)
 
 
-class Limit:
+class Limit(Tracer):
     """A lens in the limits. safe: with the arithmetic of the trace, else the plain one (see `bench_limit.cpp`).
 
     steps: of Newton's method on aspheres. Raises ValueError for mirrors, apertures, added sag, conics without aspheric
     terms, and aspheres in the plain one.
     """
 
-    with_path, has_gradient, most = False, False, None
+    with_path, has_gradient = False, False
 
     def __init__(self, built: Built, lens: Lens, dtype: torch.dtype, *, safe: bool, steps: int = 0, threads: int = 1):
         if not 0 <= steps <= MOST_STEPS:
@@ -234,8 +234,6 @@ class Limit:
         self._call = getattr(built.library, f"trace_{name_of(dtype)}")
         self._call.restype = None
         self._out: Rays | None = None
-
-    prepare = nothing
 
     def forward(self, rays: Rays) -> tuple[Tensor, None]:
         return self.trace(rays).position[:2], None

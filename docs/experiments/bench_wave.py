@@ -22,13 +22,13 @@ from torch import Tensor
 
 from raytrace.bench.figures import dtype_keys, framed, look
 from raytrace.bench.measure import clock, name_of, nothing
-from raytrace.bench.report import Measured, Request, digits, table, yes
+from raytrace.bench.report import Measured, Request
 from raytrace.cli.progress import progress
 from raytrace.materials.glass import index
 from raytrace.maths.numerics import to
 from raytrace.maths.result import number
 from raytrace.maths.sampling import grid
-from raytrace.pages import measured
+from raytrace.pages import digits, listing, measured, yes
 from raytrace.plotting import style
 from raytrace.psf_models.dft import Aliased, phasor
 from raytrace.tracing.scene import Memo
@@ -329,9 +329,9 @@ def lines(rows: Sequence[WaveRow], *, agreement: float, about: Mapping[str, str 
         f"Target: {TARGET:g} × less time than their method at an error of at most {ERROR:g}. The fastest sampling "
         "of each engine that comes so close, compared with the fastest run of their method:",
         "",
-        *table(_GOALS, target(rows)),
+        *listing(_GOALS, target(rows)),
         "",
-        *table(columns, rows),
+        *listing(columns, rows),
         "",
         "Rows in italics are refused by `plan` (`AliasedSampling`) and forced here. *Predicted*: by `plan`.",
         "",

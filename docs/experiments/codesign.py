@@ -40,9 +40,9 @@ from raytrace.cli.codesign_run import (
     settings_of,
     train_run,
 )
-from raytrace.cli.options import file_name, seed_number
 from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import documents, words
+from raytrace.cli.types import file_name, seed_number
 from raytrace.experiments import publish
 from raytrace.files import table
 from raytrace.imaging.closed_form import even_distances, scan

@@ -23,10 +23,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
-from raytrace.cli.options import count, json, output_file, plot
+from raytrace.cli.options import json, plot
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, present, refuse_suffix
 from raytrace.cli.settings import SEED, add_options
+from raytrace.cli.types import count, output_file
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.imaging.image import blur, visible
 from raytrace.imaging.pictures import Pictures, crop, dead_leaves
@@ -393,10 +394,13 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--collimator", action="store_true", help="the other way round: a point at the front focus, a plane wave out"
     )
-    camera(parser, exact=False, across=1.0, sensor=25.0)
-    light(parser, depths=(), wavelengths=(0.55,))
-    pixels(parser, across=65, pitch=0.004)
-    feature(parser, "the aperture over --samples")
+    for add in (
+        camera(exact=False, aperture=1.0, sensor=25.0),
+        light(depths=(), wavelengths=(0.55,)),
+        pixels(size=65, pixel=0.004),
+        feature("the aperture over --samples"),
+    ):
+        add(parser)
     parser.add_argument("--method", choices=("sgd", "adam"), default="sgd", help="SGD with momentum (default), or Adam")
     parser.add_argument("--steps", metavar="N", type=count, default=300, help="at most (default 300)")
     parser.add_argument(
@@ -406,7 +410,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     json(parser)
     what = "height map to write: .npy, .csv, .dat, .grd, or as the grey of a picture: .png, .tif"
     parser.add_argument("-o", "--output", metavar="FILE", type=output_file, help=what)
-    plot(parser, "height map, PSF and image over the steps")
+    plot("height map, PSF and image over the steps")(parser)
 
 
 def focus(arguments: argparse.Namespace) -> Learned:

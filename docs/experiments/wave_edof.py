@@ -574,7 +574,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     defaults = defaults_of(DesignSettings)
     add_options(parser, defaults, wave_design.ROWS, "steps", "starts")
     add_options(picture_options(parser, PICTURES, limit=LIMIT), defaults, wave_design.ROWS, "seed")
-    output_folder(parser, "folder of designed elements")
+    output_folder("folder of designed elements")(parser)
     documents(parser, "wave_edof.md and wave/")
     json(parser)
 

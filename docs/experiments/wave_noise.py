@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from wave_edof import ROWS, STRENGTHS, contents_of, heights_of, look, title_of
 
-from raytrace.cli.options import file_name, json, output_folder
+from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, present
 from raytrace.cli.settings import (
@@ -41,6 +41,7 @@ from raytrace.cli.settings import (
     picture_words,
     words,
 )
+from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import learn
 from raytrace.experiments import Store, cases, publish, published
@@ -723,7 +724,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     defaults = defaults_of(Settings)
     add_options(parser, defaults, ROWS_OF_SETTINGS, "noise", "starts", "steps")
     add_options(picture_options(parser, PICTURES, limit=LIMIT), defaults, ROWS_OF_SETTINGS, "seed")
-    output_folder(parser, "folder of designed elements and their errors")
+    output_folder("folder of designed elements and their errors")(parser)
     documents(parser, "wave_noise.md and wave/")
     json(parser)
 

@@ -96,7 +96,7 @@ class FieldCurvature(OverField):
         return {**self.heads(wavelength=self.wavelengths), "tangential": tangential, "sagittal": sagittal}
 
     def at(self, fields: Tensor) -> "FieldCurvature":
-        return _field_curvature(self.lens, fields)
+        return field_curvature_of(self.lens, fields)
 
     @styled
     def draw(self):
@@ -183,10 +183,11 @@ def field_curvature(
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     if not asked:
         refuse_axis(fields)
-    return shown(_field_curvature(lens, fields))
+    return shown(field_curvature_of(lens, fields))
 
 
-def _field_curvature(lens: Lens, fields: Tensor) -> FieldCurvature:
+def field_curvature_of(lens: Lens, fields: Tensor) -> FieldCurvature:
+    """The field curvature of fields (2, F), which need not be in reach."""
     bare = unvignetted(lens)
     along = torch.where((fields == 0).all(0), fields.new_tensor([[0.0], [1.0]]), _meridian(fields))
     alike = bool((along == along[:, :1]).all())

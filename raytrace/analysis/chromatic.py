@@ -54,7 +54,8 @@ class ChromaticFocalShift(Analysis):
 def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: int = 101) -> ChromaticFocalShift:
     """The paraxial focus over wavelength, as -n y/ω of the axial marginal ray, along the light.
 
-    wavelengths: µm, of which the first is primary; `samples` go over their range, by default that of the lens's own.
+    wavelengths: µm, of which the first is primary; samples: wavelengths of the curve, over their range, by default that
+    of the lens's own.
     Raises NothingToShow for a lens of a single
     wavelength, and for one without an image.
     """

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -202,14 +203,15 @@ def compare(
     object_distances: Tensor | Sequence[float] = DISTANCES,
     focus_distance: float = 25e3,
     wavelengths: Sequence[float] = (0.53,),
-    start: str = "paraxial",
+    start: Literal["paraxial", "rms"] = "paraxial",
     pixel: float = PIXEL,
     size: int = SIZE,
 ) -> Comparison:
     """The PSF models on the axis over object distances (D,) mm, and the properties that each can represent.
 
-    focus_distance, start: of the one sensor, see `common_focus`; wavelengths: µm, of which the first is taken; pixel:
-    mm, size: of the window. Raises NoImage for a distance of which the lens forms no real image.
+    start: sensor position, the "paraxial" image or the minimum "rms" spot radius on the axis; focus_distance: object in
+    focus, mm; wavelengths: µm, of which the first is taken; pixel: pitch, mm; size: pixels across the windows. Raises
+    NoImage for a distance of which the lens forms no real image.
     """
     need_axis(lens, "the comparison of PSF models on the axis", "ask for kernels of one model by `psf`")
     distances = torch.as_tensor(object_distances, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)

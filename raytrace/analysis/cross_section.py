@@ -16,7 +16,7 @@ from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens, media
-from raytrace.system.surface import Surface, sag_at
+from raytrace.system.surface import Surface, is_posed, sag_at
 from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps
@@ -117,6 +117,8 @@ def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
 
 def is_bent(lens: Lens) -> bool:
     """Whether a surface is tilted or off the z axis."""
+    if not any(map(is_posed, lens.surfaces)):
+        return False
     for frame in frames(lens):
         axes, origin = array(frame.axes), array(frame.origin)
         if not np.allclose(axes, np.eye(3), atol=1e-12) or np.abs(origin[:2]).max() > 1e-12:
@@ -270,10 +272,13 @@ def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_st
         if lens.surfaces[k].is_break:
             corners.append(corners[-1])
             continue
-        arrival = frame.inside(position), torch.tensordot(frame.axes.T, direction, dims=1)
-        hit, _ = intersect(lens.surfaces[k], *arrival)
-        at_plane = arrival[0] - arrival[1] * (arrival[0][2] / arrival[1][2])
-        here = array(frame.outside(torch.where(crossing.missed, at_plane, hit)))[:, :, 0, :]
+        here = crossing.rays.position
+        if bool((crossing.missed | crossing.totally_reflected).any()):  # these have no point behind the surface
+            arrival = frame.inside(position), torch.tensordot(frame.axes.T, direction, dims=1)
+            hit, _ = intersect(lens.surfaces[k], *arrival)
+            at_plane = arrival[0] - arrival[1] * (arrival[0][2] / arrival[1][2])
+            here = torch.where(crossing.missed, at_plane, hit)
+        here = array(frame.outside(here))[:, :, 0, :]
         for status, lost in (
             ("miss", crossing.missed),
             ("tir", crossing.totally_reflected),

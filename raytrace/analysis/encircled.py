@@ -83,7 +83,9 @@ def encircled_energy(
         E(r) = ∬ OTF(ν) r J₁(2πrν)/ν d²ν        of diffraction
         E(r) = Σ_j w_j [|x_j - x̄| < r]           geometric, linear between one ray and the next
 
-    fields: y or (x, y); wavelengths: µm. Differentiable in the lens. Raises ValueError where too few rays arrive.
+    radii: about the centroid of the rays, mm, by default from 0 to almost all of the light; geometric: of rays alone,
+    without diffraction; fields: y or (x, y); wavelengths: µm. Differentiable in the lens. Raises ValueError where too
+    few rays arrive.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     return _encircled(lens, fields, None if radii is None else vector(radii, like=lens), geometric)

@@ -1,5 +1,7 @@
 """Fans: transverse ray aberration and OPD along the two principal sections of the pupil."""
 
+from typing import Literal
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -7,11 +9,12 @@ from torch import Tensor
 from raytrace.analysis.panels import by_wavelength, drawn_at_least, field_labels, finished, ruled, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, masked
 from raytrace.maths.sampling import fan as pupil_fan
 from raytrace.plotting.style import GREY, array, new_figure, styled
 from raytrace.system.lens import Lens
+from raytrace.tracing.spot import chief_arrives, image_rays
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 #: Whose sphere an OPD is measured on.
@@ -79,8 +82,22 @@ def ray_fan(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, p
     pupil, odd to have the chief ray among them.
     """
     lens, fields = setting(lens, fields, wavelengths)
-    front = _front(lens, fields, points, "primary")
-    return _fan(lens, fields, front, front.landing[1], front.landing[0], "ray")
+    return ray_fan_of(lens, fields, points)
+
+
+def ray_fan_of(lens: Lens, fields: Tensor, points: int) -> Fan:
+    """The ray fan of fields (2, F), which need not be in reach. Where no chief ray arrives, the mean of the rays of the
+    primary wavelength takes its place."""
+    pupil = _pupil(lens, points)
+    rays = image_rays(lens, torch.cat([torch.zeros_like(pupil[:, :1]), pupil], 1), fields=fields)
+    at, valid = rays.position[:2], rays.valid
+    primary = slice(lens.primary_wavelength - 1, lens.primary_wavelength)
+    lit = valid[:, primary]
+    total = torch.where(lit, at[:, :, primary], 0.0).sum(-1)
+    arrives = chief_arrives(lens, rays, fields, lens.wavelengths)[:, primary]
+    centre = torch.where(arrives, at[:, :, primary, 0], safe_divide(total, lit.sum(-1).to(total.dtype)))
+    x, y = (at - centre[..., None])[..., 1:]
+    return _fan(lens, fields, pupil, valid[..., 1:], y, x, "ray")
 
 
 def opd_fan(
@@ -89,36 +106,42 @@ def opd_fan(
     fields: Points = None,
     wavelengths: Numbers = None,
     points: int = 41,
-    reference: str = "primary",
+    reference: Literal["primary", "own"] = "primary",
 ) -> Fan:
     """OPD in waves against the chief ray of each wavelength; arguments as for `ray_fan`.
 
-    reference: the sphere, "primary": about the point of the primary wavelength for all, so that lateral colour shows as
-    tilt and axial colour as defocus; "own": about each wavelength's own point, which takes lateral colour out.
+    points: rays across the pupil; reference: the sphere, "primary": about the point of the primary wavelength for all,
+    so that lateral colour shows as tilt and axial colour as defocus; "own": about each wavelength's own point, which
+    takes lateral colour out.
     """
     lens, fields = setting(lens, fields, wavelengths)
     front = _front(lens, fields, points, reference)
     waves = front.opd / (1e-3 * front.wavelength[:, None])
-    return _fan(lens, fields, front, waves, waves, "opd")
+    return _fan(lens, fields, front.pupil, front.valid[0], waves[0], waves[0], "opd")
 
 
 def _front(lens: Lens, fields: Tensor, size: int, reference: str) -> Wavefront:
-    """The wavefront of both fans, the one along y first."""
+    """The wavefront of both fans."""
     if reference not in REFERENCES:
         raise ValueError(f"reference {reference!r}: expected one of {', '.join(REFERENCES)}")
-    points = torch.cat([pupil_fan(size, along, **like(lens))[0] for along in "yx"], 1)
     primary = primary_wavelength(lens) if reference == "primary" else None
-    return wavefront_of(scene_of(lens, fields), points, reference=primary)
+    return wavefront_of(scene_of(lens, fields), _pupil(lens, size), reference=primary)
 
 
-def _fan(lens: Lens, fields: Tensor, front: Wavefront, along_y: Tensor, along_x: Tensor, quantity: str) -> Fan:
-    size = front.pupil.shape[1] // 2
-    valid = front.valid[0]
-    along_y, along_x = (torch.where(valid, part[0], 0.0) for part in (along_y, along_x))
+def _pupil(lens: Lens, size: int) -> Tensor:
+    """Points (2, 2 size) of both fans, the one along y first."""
+    return torch.cat([pupil_fan(size, along, **like(lens))[0] for along in "yx"], 1)
+
+
+def _fan(
+    lens: Lens, fields: Tensor, pupil: Tensor, valid: Tensor, along_y: Tensor, along_x: Tensor, quantity: str
+) -> Fan:
+    size = pupil.shape[1] // 2
+    along_y, along_x = (torch.where(valid, part, 0.0) for part in (along_y, along_x))
     return Fan(
         lens=lens,
         fields=fields,
-        pupil=front.pupil[1, :size],
+        pupil=pupil[1, :size],
         tangential=along_y[..., :size],
         sagittal=along_x[..., size:],
         tangential_valid=valid[..., :size],

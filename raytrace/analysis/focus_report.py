@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from os import PathLike
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -220,19 +220,19 @@ def focus(
     field_weights: Sequence[float] | Tensor | None = None,
     wavelengths: Tensor | Sequence[float] | None = None,
     wavelength_weights: Sequence[float] | Tensor | None = None,
-    criterion: str = "rms",
-    sampling: str = "gauss",
+    criterion: Literal["rms", "paraxial", "mean"] = "rms",
+    sampling: Literal["gauss", "hexapolar", "square", "sobol", "random"] = "gauss",
     rings: int | None = None,
     points: int | None = None,
     seed: int = 0,
 ) -> Focus:
     """The lens with its sensor at the best distance for weighted objects, fields and wavelengths.
 
-    criterion: "rms", least RMS spot radius, in closed form and differentiable; "paraxial", the paraxial image, or the
-    weighted mean of those of several objects; "mean", least mean distance from the centroid.
-    object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
-    wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
-    as for `sampling.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
+    criterion: "rms" (minimum RMS spot radius, in closed form and differentiable), "paraxial" (image, or the weighted
+    mean of those of several objects) or "mean" (minimum mean distance from the centroid). object_distances: mm, inf
+    allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis; wavelengths: µm, by default the
+    primary one; weights: one for each, by default equal. sampling, rings, points, seed: as for `sampling.sampled`.
+    Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
     """
     if criterion not in ("rms", "paraxial", "mean"):
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")

@@ -84,9 +84,8 @@ def incidence(
 ) -> Incidence:
     """Angles of incidence at every surface; fields: y or (x, y), by default `samples` from the axis to the largest.
 
-    wavelengths: µm, by default the lens's primary one; surfaces: whether the text lists every surface, not the sensor
-    alone. The rim is that of each field's beam, vignetting factors and ray aiming applied. A coordinate break has no
-    angles.
+    wavelengths: µm, by default the lens's primary one; surfaces: list every surface in the text, not only the sensor.
+    The rim is that of each field's beam, vignetting factors and ray aiming applied. A coordinate break has no angles.
     """
     lens, fields = setting(
         lens, fields, primary_wavelength(lens) if wavelengths is None else wavelengths, samples=samples

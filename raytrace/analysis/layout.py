@@ -4,7 +4,7 @@ import html
 import io
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -105,17 +105,17 @@ def layout(
     *,
     fields: Tensor | Sequence | None = None,
     rays: int = 7,
-    view: str = "yz",
+    view: Literal["yz", "xz", "3d"] = "yz",
     wavelengths: Tensor | Sequence[float] | None = None,
     configuration: int | str | None = None,
 ) -> Layout:
     """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
 
-    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
-    in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
-    coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
-    configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made. Raises ValueError for a view or a
-    configuration that there is not.
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: of each fan, in the plane
+    that is shown; view: "yz" (from the side), "xz" (from above) or "3d" (in space); wavelengths: µm, by default the
+    primary one; rays of several are coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all":
+    superimposed, rays coloured by configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made.
+    Raises ValueError for a view or a configuration that there is not.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")

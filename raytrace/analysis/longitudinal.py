@@ -53,8 +53,8 @@ class LongitudinalAberration(Analysis):
 def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: int = 41) -> LongitudinalAberration:
     """Spherical aberration of every wavelength as -y N/M of rays (0, M, N) through points of the pupil's y axis.
 
-    wavelengths: µm; points: of the axis, from the middle to the rim. A ray parallel to the axis behind the lens has no
-    crossing, nor has a lost one. Raises Bent for a lens whose axis bends.
+    wavelengths: µm; points: rays from the axis to the rim of the pupil. A ray parallel to the axis behind the lens has
+    no crossing, nor has a lost one. Raises Bent for a lens whose axis bends.
     """
     need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -29,12 +30,14 @@ from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
+from raytrace.system.rays import Rays
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
 
 _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
+_LEAST_PHASE = 70.0  # radians along a pupil radius that the former integrate, see `rings_and_arms`
 _FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
 _NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
@@ -159,12 +162,13 @@ def mtf(
         OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              diffraction
         OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      geometric
 
-    geometric: True or False; by default diffraction, except for a field that would need more than 1280 points across
-    the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted to change by at most 1e-3
-    at every frequency: that field is geometric, as `by_rays` reports.
-    The wavelengths' OTFs add by weight and transmitted light, each at its own place on the sensor: lateral colour
-    counts. through_focus: mm by which the sensor moves to either side, of one frequency. fields: y or (x, y);
-    wavelengths: µm. Raises ValueError where too few rays arrive or the blur is too large.
+    geometric: of rays alone, or always of diffraction; by default of diffraction, except for a field that would need
+    more than 1280 points across the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted
+    to change by at most 1e-3 at every frequency: that field is geometric, as `by_rays` reports. The wavelengths' OTFs
+    add by weight and transmitted light, each at its own place on the sensor: lateral colour counts. frequencies:
+    cycles/mm, by default 41 from 0 to the resolution of the sharpest field, at most half of the diffraction cutoff;
+    through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
+    ValueError where too few rays arrive or the blur is too large.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
@@ -181,17 +185,21 @@ def mtf(
 def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, choice: Tensor | None, *, marked: bool = False) -> Mtf:
     """choice: (F,) bool, fields by rays; None: as `mtf` decides for each."""
     if choice is not None and bool(choice.all()):
-        tangential, sagittal = _geometric(lens, fields, frequencies)
-        by_rays = choice
-    else:
-        wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
-        rows = [_of_field(lens, *each, frequencies) for each in zip(fields.split(1, 1), wanted, strict=True)]
-        tangential, sagittal = (torch.cat(parts) for parts in list(zip(*rows, strict=True))[:2])
-        by_rays = torch.tensor([row[2] for row in rows], device=fields.device)
+        return geometric_mtf(lens, fields, frequencies, marked=marked)
+    wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
+    rows = [_of_field(lens, *each, frequencies) for each in zip(fields.split(1, 1), wanted, strict=True)]
+    tangential, sagittal = (torch.cat(parts) for parts in list(zip(*rows, strict=True))[:2])
+    by_rays = torch.tensor([row[2] for row in rows], device=fields.device)
     perfect = clear_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
     whole = bool(by_rays.all())
     limit = None if whole else perfect
     return Mtf(lens, fields, frequencies, tangential, sagittal, limit, whole, by_rays, marked)
+
+
+def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bool = False) -> Mtf:
+    """The MTF of rays of fields (2, F), which have to reach the sensor. Raises EmptySpot, TooManyPoints."""
+    by_rays = torch.ones_like(fields[0], dtype=torch.bool)
+    return Mtf(lens, fields, frequencies, *_geometric(lens, fields, frequencies), None, True, by_rays, marked)
 
 
 def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor) -> tuple[Tensor, Tensor, bool]:
@@ -364,9 +372,15 @@ def clear_circle(s: Tensor) -> Tensor:
 
 
 def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangential and sagittal MTF (F, K) of rays, as many as the blur needs."""
+    pupil = gauss_rings(_LEAST_RINGS, 4 * _LEAST_RINGS, **like(lens))
+    if _together(lens, pupil) < fields.shape[1]:
+        with torch.no_grad():
+            rays = image_rays(lens, gauss_rings(6, **like(lens))[0], fields=fields)
+    else:
+        rays = image_rays(lens, pupil[0], fields=fields)
     with torch.no_grad():
-        probe = image_rays(lens, gauss_rings(6, **like(lens))[0], fields=fields)
-        reach = torch.where(probe.valid, probe.position[:2], torch.nan)
+        reach = torch.where(rays.valid, rays.position[:2], torch.nan)
         blur = (reach - reach.nanmean(-1, keepdim=True)).abs().nan_to_num(0.0).max()
         rings, arms = rings_and_arms(2 * math.pi * float(blur * frequencies.max()), 0)
     rings, arms = max(rings, _LEAST_RINGS), max(arms, 4 * _LEAST_RINGS)
@@ -374,16 +388,29 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
         raise TooManyPoints(
             f"the blur needs {rings * arms} rays at {float(frequencies.max()):g} cycles/mm: focus the lens"
         )
-    pupil = gauss_rings(rings, arms, **like(lens))
-    together = piece(2 * RAY_BYTES * len(lens.wavelengths) * rings * arms)
-    parts = [_of_spots(lens, some, frequencies, *pupil) for some in fields.split(together, 1)]
+    if rays.shape[-1] == rings * arms:
+        return _of_spots(lens, fields, frequencies, rays, pupil[1])
+    points, rule = gauss_rings(rings, arms, **like(lens))
+    parts = [
+        _of_spots(lens, some, frequencies, image_rays(lens, points, fields=some), rule)
+        for some in fields.split(_together(lens, (points, rule)), 1)
+    ]
     tangential, sagittal = (torch.cat(part) for part in zip(*parts, strict=True))
     return tangential, sagittal
 
 
-def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, points: Tensor, rule: Tensor) -> tuple:
-    """Tangential and sagittal MTF (F, K) of rays."""
-    rays = image_rays(lens, points, fields=fields)
+def least_reach(blur: float) -> float:
+    """The frequency in cycles/mm up to which the fewest rays give the MTF of spots of a radius `blur` mm."""
+    return _LEAST_PHASE / (2 * math.pi * blur) if blur > 0 else math.inf
+
+
+def _together(lens: Lens, pupil: tuple[Tensor, Tensor]) -> int:
+    """Number of fields that are traced together."""
+    return piece(2 * RAY_BYTES * len(lens.wavelengths) * len(pupil[1]))
+
+
+def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, rays: Rays, rule: Tensor) -> tuple:
+    """Tangential and sagittal MTF (F, K) of rays (3, F, W, P) of weights (P,)."""
     energy = torch.where(rays.valid, rule, 0.0)
     light = energy.sum(-1)
     refuse_dark(lens, fields, light > 0, "MTF")
@@ -393,9 +420,23 @@ def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, points: Tensor, r
     result = []
     for along in (1, 0):
         offset = torch.where(rays.valid, hits[along] - mean[along][..., None], 0.0)
-        otf = [(phasor(-frequency * offset) * energy).sum(-1) / light for frequency in frequencies]
+        otf = [(phase * energy).sum(-1) / light for phase in _phasors(frequencies, offset)]
         result.append(modulation(torch.stack(otf, -1), frequencies, shift[along], weights))
     return tuple(result)
+
+
+def _phasors(frequencies: Tensor, offset: Tensor) -> Iterator[Tensor]:
+    """e^{-2πi ν y} of offsets y for every frequency ν; of equally spaced ones from 0, each the one before times one."""
+    step = frequencies[-1] / max(len(frequencies) - 1, 1)
+    equal = step * torch.arange(len(frequencies), dtype=step.dtype, device=step.device)
+    if len(frequencies) < 3 or not torch.allclose(frequencies, equal, rtol=1e-13, atol=0.0):
+        yield from (phasor(-frequency * offset) for frequency in frequencies)
+        return
+    turn = phasor(-step * offset)
+    phase = torch.ones_like(turn)
+    for _ in frequencies:
+        yield phase
+        phase = phase * turn
 
 
 def _from_primary(lens: Lens, place: Tensor) -> Tensor:

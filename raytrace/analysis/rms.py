@@ -1,6 +1,7 @@
 """RMS over the field: of the wavefront, of each wavelength and of all together, or of the spot."""
 
 import math
+from typing import Literal
 
 import numpy as np
 import torch
@@ -103,16 +104,18 @@ def rms_over_field(
     wavelengths: Numbers = None,
     samples: int = 11,
     spot: bool = False,
-    reference: str = "primary",
+    reference: Literal["primary", "own"] = "primary",
     pupil: tuple[Tensor, Tensor] | None = None,
 ) -> RmsOverField:
     """RMS wavefront error, or with `spot` RMS spot radius, over the field.
 
     Each wavelength by itself is judged on the sphere about its own chief ray. Together they are √(Σ w σ²) on one
     sphere, that of the primary wavelength (reference "primary": lateral colour counts, as in OpticStudio's RMS vs.
-    field) or each on its own ("own"). Spots together are one spot about its own centroid.
-    fields: y or (x, y), by default `samples` from the axis to the lens's largest; wavelengths: µm; pupil: points (2, P)
-    and weights (P,), Gauss rings by default. Raises ValueError for another reference.
+    field) or each on its own ("own"). Spots together are one spot about its own centroid. fields: y or (x, y), by
+    default `samples` from the axis to the lens's largest; wavelengths: µm; spot: RMS spot radius about the centroid
+    instead; reference: centres of the reference spheres of the wavelengths together, the "primary" one's chief ray, so
+    that lateral colour counts, or each one's "own"; pupil: points (2, P) and weights (P,), Gauss rings by default.
+    Raises ValueError for another reference.
     """
     if reference not in REFERENCES:
         raise ValueError(f"reference {reference!r}: expected one of {', '.join(REFERENCES)}")

@@ -12,6 +12,7 @@ of OpticStudio, so that C1 of a single positive lens is negative; Welford's C ha
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Table
+from raytrace.maths.result import Column, Table, cell
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
@@ -94,7 +95,7 @@ class Seidel(Analysis):
             columns = {name: [*row, row.sum()] for name, row in zip(self.names, self.contributions[:, f], strict=True)}
             if self.kind == "coefficients":
                 columns |= {name: [*values[f], ""] for name, values in heights.items()}
-            invariant = f"optical invariant {abs(float(self.invariant[f])):.6g} mm"
+            invariant = f"optical invariant {cell(abs(float(self.invariant[f])), '.6g')} mm"
             title = f"field {field_words(self.lens, field)}, {invariant}"
             tables.append(Table({Column("surface"): surfaces, **columns}, [title]))
         return tables
@@ -129,12 +130,17 @@ class Seidel(Analysis):
         return finished(panels[0], self, f"Seidel {quantity} ({self.unit}), field {label}")
 
 
-def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> Seidel:
+def seidel(
+    lens: Lens,
+    *,
+    fields: Points = None,
+    kind: Literal["coefficients", "waves", "transverse", "longitudinal"] = "coefficients",
+) -> Seidel:
     """Third-order aberrations at the primary wavelength, colours between the shortest and the longest wavelength.
 
     kind: "coefficients": S1 … S5, C1, C2 in mm. "waves": W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P = S4/4,
     W311 = S5/2, W020 = C1/2, W111 = C2. "transverse": mm by which rays of the rim miss the paraxial image point, the
-    upper one where there is a choice, in the order of `_transverse`. "longitudinal": mm along z from the paraxial
+    upper one where there is a choice. "longitudinal": mm along z from the paraxial
     focus to theirs. The last two are nan where image space is afocal.
     fields: y or (x, y), of which the distance from the axis counts; the lens's largest by default. Image heights are
     those of the paraxial image. Raises ValueError for a kind not named here, and for a surface of other terms than even

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -168,13 +169,13 @@ def spot(
     *,
     fields: Tensor | Sequence | None = None,
     wavelengths: Tensor | Sequence[float] | None = None,
-    sampling: str = "gauss",
+    sampling: Literal["gauss", "hexapolar", "square", "sobol", "random"] = "gauss",
     rings: int | None = None,
     points: int | None = None,
     seed: int = 0,
     rays: int | None = None,
-    reference: str = "centroid",
-    weights: str = "area",
+    reference: Literal["centroid", "chief"] = "centroid",
+    weights: Literal["area", "equal"] = "area",
     ray_aiming: str | None = None,
     max_bytes: int | None = None,
     progress: Callable | None = None,
@@ -182,12 +183,13 @@ def spot(
     """The spot of every field and wavelength on the sensor, differentiable in every number of the lens.
 
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; wavelengths: µm, alike in weight,
-    the first one primary, by default the lens's. sampling, rings, points, seed: as for `sampled`; rays: instead,
-    so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
-    and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
-    weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
-    Warns LostRays for fields that lose all their rays, UnfilledStop. Raises ValueError for unknown options.
-    progress: called with (work, unit), returns the iterable, or a progress bar to update.
+    the first one primary, by default the lens's. sampling, rings, points, seed: as for `sampled`; rays: instead of
+    `points`, any number of sobol or random rays for each field and wavelength, traced in chunks of at most `max_bytes`,
+    none kept and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary
+    wavelength; weights: of rays, by their share of the pupil's "area", or all "equal"; OpticStudio's spots are
+    `sampling` hexapolar, `rings` 6, `weights` equal, `reference` chief. ray_aiming: a key of RAY_AIMING. Warns LostRays
+    for fields that lose all their rays, UnfilledStop. Raises ValueError for unknown options. progress: called with
+    (work, unit), returns the iterable, or a progress bar to update.
     """
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
         if word not in known:
@@ -262,18 +264,19 @@ def field_spots(
     wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
     about: Tensor | None = None,
+    rings: int = _DOT_RINGS,
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
     The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
     weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
     `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
-    from where radii count, the centroid by default.
+    from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
     points, weights = with_rim(points, weights)
-    dots = even_hexapolar(_DOT_RINGS, dtype=dtype, device=device)
+    dots = even_hexapolar(rings, dtype=dtype, device=device)
     shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Literal
 
 import numpy as np
 import torch
@@ -130,14 +131,14 @@ def wavefront(
     wavelengths: Numbers = None,
     size: int = _GRID,
     terms: int | None = None,
-    numbering: str | None = None,
+    numbering: Literal["noll", "fringe"] | None = None,
 ) -> WavefrontMap:
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
-    fields: y or (x, y); wavelengths: µm; terms: 37 by default; numbering: "noll" (default) or "fringe"; the text lists
-    the coefficients where one of them is given.
-    What a wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the
-    light fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
+    fields: y or (x, y); wavelengths: µm; size: pixels across a map; terms: number of Zernike terms, 37 by default;
+    numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. What a
+    wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the light
+    fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     F, W = fields.shape[1], len(lens.wavelengths)

@@ -10,11 +10,10 @@ import torch
 
 from raytrace.bench import psf, speed, trace
 from raytrace.bench.report import Measured, Request
-from raytrace.cli.run import CommandError, open_lens, printed_on_failure, say
-from raytrace.pages import machine
+from raytrace.cli.run import CommandError, printed_on_failure, say
 from raytrace.shards import torch_threads
 
-#: Of every subject: the function, and its options beside --json, --repeats, --threads and --no-peers.
+#: Of every subject: the function, and its options in addition to --json, --repeats, --threads and --no-peers.
 _SUBJECTS = {
     "trace": (trace.bench, ("lens", "rays", "output", "plot")),
     "psf": (psf.bench, ("lenses", "output", "csv", "plot")),
@@ -29,8 +28,8 @@ def run(arguments: argparse.Namespace) -> Measured:
         if getattr(arguments, name):
             raise CommandError(f"bench {arguments.what} takes no {'LENS' if name == 'lenses' else f'--{name}'}")
     all_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads = all_cores if arguments.what == "speed" else torch.get_num_threads()
-    result = measured(measure, arguments, arguments.threads or threads, None if arguments.no_peers else installed())
+    threads = arguments.threads or (all_cores if arguments.what == "speed" else torch.get_num_threads())
+    result = measured(measure, arguments, threads, None if arguments.no_peers else installed())
     with printed_on_failure(result, arguments):
         if arguments.csv:
             result.save_table(arguments.csv)
@@ -40,19 +39,11 @@ def run(arguments: argparse.Namespace) -> Measured:
 
 
 def measured(measure, arguments: argparse.Namespace, threads: int, peers: ModuleType | None) -> Measured:
-    """`measure` of a `Request` on so many threads of torch."""
+    """`measure` of a `Request` with so many threads of torch."""
     with torch_threads(threads):
         if peers:
             peers.set_threads(threads)
-
-        def about() -> dict[str, str | int]:
-            torch.set_num_threads(threads)  # peers may have changed them
-            return machine() | (peers.versions() if peers else {})
-
-        def opened(name: str):
-            return open_lens(argparse.Namespace(lens=name, catalog=[]))
-
-        return measure(Request(arguments, opened, peers, about, threads))
+        return measure(Request(arguments, peers, threads))
 
 
 def installed() -> ModuleType | None:

@@ -19,19 +19,19 @@ _TRACERS = {
     "Optiland, numpy": (2, (0, (4, 2)), "v"),
     "ray-optics": (4, "-", "D"),
 }
-#: Number of the colour, marker and order in the legend, by model of a PSF.
+#: Number of the colour, dashes, marker and order in the legend, by model of a PSF.
 _MODELS = {
-    "random rays": (7, "o"),
-    "Sobol rays": (5, "o"),
-    "drt": (0, "o"),
-    "gaussian": (1, "s"),
-    "fourier": (4, "D"),
-    "wave": (2, "^"),
-    "direct sum, rings": (6, "v"),
-    "direct sum, grid": (6, "P"),
-    "Optiland histogram": (3, "o"),
-    "Optiland FFT": (3, "D"),
-    "Optiland Huygens": (3, "v"),
+    "random rays": (7, "-", "o"),
+    "Sobol rays": (5, "-", "o"),
+    "drt": (0, "-", "o"),
+    "gaussian": (1, "-", "s"),
+    "fourier": (4, "-", "D"),
+    "wave": (2, "-", "^"),
+    "direct sum, rings": (6, "-", "v"),
+    "direct sum, grid": (6, "-", "P"),
+    "Optiland histogram": (3, "-", "o"),
+    "Optiland FFT": (3, "-", "D"),
+    "Optiland Huygens": (3, "-", "v"),
 }
 _TASKS = {"forward": "Forward", "forward+backward": "Forward and backward"}
 _LEAST = 1e-9  # errors below are rounding
@@ -46,41 +46,49 @@ def trace_figure(rows: Sequence[Mapping]) -> Figure:
     rows = [row for row in rows if row["path"]]
     colours = {tracer: (0, 2, 4)[k % 3] for k, tracer in enumerate(dict.fromkeys(row["tracer"] for row in rows))}
 
-    def style_of(tracer: str, dtype: str) -> dict:
+    def look_of(tracer: str, dtype: str) -> dict:
         return look(colours[tracer], "--" if dtype == "float32" else "-", "o", hollow=dtype == "float32")
 
-    return _speeds(rows, "what", _TASKS, lambda row: (row["tracer"], row["dtype"]), style_of, width=3.6, columns=3)
+    return _speeds(rows, "what", _TASKS, ("tracer", "dtype"), look_of)
 
 
 @style.styled
 def speed_figure(rows: Sequence[Mapping]) -> Figure:
     """Rows of `bench speed` as mappings; those forward count, a panel for each dtype."""
     rows = [row for row in rows if row["what"] == "forward"]
-    dtypes = {dtype: dtype for dtype in dict.fromkeys(row["dtype"] for row in rows)}
+    dtypes = {row["dtype"]: row["dtype"] for row in rows}
 
-    def style_of(tracer: str) -> dict:
+    def look_of(tracer: str) -> dict:
         colour, dashes, marker = _TRACERS.get(tracer, (6, "-", "*"))
         return look(colour, dashes, marker, hollow=dashes != "-")
 
-    return _speeds(rows, "dtype", dtypes, lambda row: (row["tracer"],), style_of, width=3.7, columns=4)
+    return _speeds(rows, "dtype", dtypes, ("tracer",), look_of)
 
 
-def _speeds(
-    rows: Sequence[Mapping], panel_by: str, titles: Mapping[str, str], name: Callable, look: Callable, *, width, columns
-) -> Figure:
-    """Speed over the number of rays: a panel for each value of a column, a line for each name."""
-    figure = style.new_figure(width * len(titles), width)
+def _speeds(rows: Sequence[Mapping], by: str, titles: Mapping[str, str], names: Sequence, look_of: Callable) -> Figure:
+    """Speed over the number of rays: a panel for each value of a column, a line for each value of other columns."""
+    figure = style.new_figure(3.7 * len(titles), 3.7)
     panels = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
+    labelled = {}
     for panel, (value, title) in zip(panels, titles.items(), strict=True):
-        chosen = [row for row in rows if row[panel_by] == value]
-        for labels in dict.fromkeys(map(name, chosen)):
-            points = sorted((row["rays"], row["speed"]) for row in chosen if name(row) == labels)
-            panel.plot(*zip(*points, strict=True), label=", ".join(labels), **look(*labels))
+        lines: dict[tuple, list] = {}
+        for row in rows:
+            if row[by] == value:
+                lines.setdefault(tuple(row[name] for name in names), []).append((row["rays"], row["speed"]))
+        for line, points in lines.items():
+            columns, label = zip(*sorted(points), strict=True), ", ".join(line)
+            labelled[label] = panel.plot(*columns, label=label, **look_of(*line))[0]
         framed(panel, title, "rays")
-    _ticks(panels[0], [row["speed"] for row in rows])
-    panels[0].set_ylabel("rays × surfaces per second, millions")
-    labelled = {label: line for panel in panels for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
-    figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=columns)
+    low, high = min(row["speed"] for row in rows) / 1.4, max(row["speed"] for row in rows) * 1.4
+    decades = [10.0**e for e in range(2, 12)]
+    ticks = [tick for tick in decades if low <= tick <= high]
+    if len(ticks) < 3:
+        ticks = [m * tick for tick in decades for m in (1, 2, 5) if low <= m * tick <= high]
+    panels[0].set(ylim=(low, high), ylabel="rays × surfaces per second, millions")
+    panels[0].yaxis.set_major_locator(FixedLocator(ticks))
+    panels[0].yaxis.set_minor_locator(NullLocator())
+    panels[0].yaxis.set_major_formatter(FuncFormatter(lambda speed, _: f"{speed / 1e6:g}"))
+    figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=5 - len(names))
     return figure
 
 
@@ -88,29 +96,27 @@ def _speeds(
 def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str]) -> Figure:
     """Rows of `bench psf` as mappings: time over error, a panel for each case, samplings from coarse to fine.
 
-    titles: of the panels, by lens and field. Rows driven by a tolerance are left out: they hold the same kernels.
+    titles: of the panels, by lens and field. Rows driven by a tolerance are left out: they have the same kernels.
     """
     rows = [row for row in rows if row["l1_error"] and row["l1_error"] > _LEAST and row["estimate"] is None]
     columns = 2 if len(titles) > 1 else 1
     lines = -(-len(titles) // columns)
     figure = style.new_figure(3.9 * columns, 3.1 * lines + 0.7)
     panels = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for panel, (case, title) in zip(panels, titles.items(), strict=False):
-        for model, (colour, marker) in _MODELS.items():
+    for number, (panel, (case, title)) in enumerate(zip(panels, titles.items(), strict=False)):
+        for model, of_model in _MODELS.items():
             chosen = [row for row in rows if (row["lens"], row["field"], row["model"]) == (*case, model)]
-            _samplings(panel, chosen, look(colour, "-", marker, hollow=False))
-        framed(panel, title, "")
+            _samplings(panel, chosen, look(*of_model, hollow=False))
+        framed(panel, title, "relative L1 error of the kernel" if number + columns >= len(titles) else "")
+        panel.set_ylabel("time of one kernel, s" if number % columns == 0 else "")
         for axis in (panel.xaxis, panel.yaxis):
             axis.set_major_locator(LogLocator(numticks=12))
             axis.set_minor_locator(NullLocator())
         panel.tick_params(labelbottom=True, labelleft=True)
     for panel in panels[len(titles) :]:
         panel.remove()
-    for number, panel in enumerate(figure.axes):
-        panel.set_xlabel("relative L1 error of the kernel" if number + columns >= len(titles) else "")
-        panel.set_ylabel("time of one kernel, s" if number % columns == 0 else "")
     shown = {row["model"] for row in rows}
-    handles = [_key(model, **look(c, "-", m, hollow=False)) for model, (c, m) in _MODELS.items() if model in shown]
+    handles = [_key(model, **look(*of_model, hollow=False)) for model, of_model in _MODELS.items() if model in shown]
     handles += [*dtype_keys(), _key("extrapolated", marker="x", color=style.INK, linestyle="none")]
     figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
     return figure
@@ -143,8 +149,8 @@ def look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
 
 def dtype_keys() -> list[Line2D]:
     """Legend of the marks by dtype."""
-    look = {"marker": "o", "color": style.INK, "linestyle": "none"}
-    return [_key("float64", **look), _key("float32", markerfacecolor="white", **look)]
+    marks = {"marker": "o", "color": style.INK, "linestyle": "none"}
+    return [_key("float64", **marks), _key("float32", markerfacecolor="white", **marks)]
 
 
 def _key(label: str, **look) -> Line2D:
@@ -155,16 +161,3 @@ def framed(panel: Axes, title: str, abscissa: str) -> None:
     panel.set(xscale="log", yscale="log", title=title, xlabel=abscissa)
     panel.grid(True, which="major", color=style.FAINT, linewidth=0.5)
     panel.set_axisbelow(True)
-
-
-def _ticks(panel: Axes, speeds: Sequence[float]) -> None:
-    """Round speeds, in millions: decades where there are three, else 1, 2, 5."""
-    low, high = min(speeds) / 1.4, max(speeds) * 1.4
-    decades = [10.0**e for e in range(2, 12)]
-    inside = [tick for tick in decades if low <= tick <= high]
-    if len(inside) < 3:
-        inside = [m * tick for tick in decades for m in (1, 2, 5) if low <= m * tick <= high]
-    panel.yaxis.set_major_locator(FixedLocator(inside))
-    panel.yaxis.set_minor_locator(NullLocator())
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda speed, _: f"{speed / 1e6:g}"))
-    panel.set_ylim(low, high)

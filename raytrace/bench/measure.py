@@ -5,9 +5,9 @@ A speed is rays × surfaces / s. Surfaces are all of the file but the object: st
 
 import dataclasses
 import math
+import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,18 +15,18 @@ from torch import Tensor
 from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import sobol
+from raytrace.pages import digits, significant, yes
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
-from raytrace.tracing.compiled import engine as engine_asked_for
+from raytrace.tracing.compiled import engine as current_engine
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference
-PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, and all at once
 SHORTEST = 0.02  # s: shorter calls are timed many at a time
 _MOST_CALLS = 200
 
@@ -42,41 +42,40 @@ def name_of(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-class Tracer(Protocol):
-    """A tracer of one lens.
+class Tracer:
+    """A tracer of one lens: its name and dtype; with_path: whether it computes the optical path.
 
-    prepare: called before every timed call. forward: positions (2, P) on the image and optical path (P,) or None,
-    without gradient. gradient: derivatives of the mean squared distance from `centroid` (2,) with respect to
-    `variables`, then to the indices of media if it takes those.
+    most: rays it traces in bearable time, None for any number.
     """
 
     name: str
     dtype: torch.dtype
-    with_path: bool
-    has_gradient: bool
-    most: int | None  # rays it traces in bearable time; None: any number
+    with_path: bool = True
+    has_gradient: bool = True
+    most: int | None = None
 
-    def prepare(self) -> None: ...
+    def prepare(self) -> None:
+        """Called before every timed call."""
 
-    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]: ...
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        """Positions (2, P) on the image and optical path (P,) or None, without gradient."""
+        raise NotImplementedError
 
-    def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]: ...
+    def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]:
+        """Derivatives of the mean squared distance from `centroid` (2,) with respect to `variables`, then indices."""
+        raise NotImplementedError
 
 
-class Own:
-    """This package's trace. engine: "auto" (the program's choice), "eager", or None for the engine that is set;
+class Own(Tracer):
+    """This package's trace. engine: "auto" (the program's choice), "eager", or None for the current engine;
     by_indices: gradients also with respect to the index of every medium.
     """
 
-    has_gradient, most = True, None
-
     def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False):
-        self.dtype, self.with_path, self.engine = dtype, with_path, engine or engine_asked_for()
+        self.dtype, self.with_path, self.engine = dtype, with_path, engine or current_engine()
         self.name = "raytrace" if engine in (None, "auto") else f"raytrace, {engine}"
         self.lens, self.wavelength = to(lens, dtype=dtype), lens.primary
         self.surfaces, self.indices, self.leaves = leaves_of(self.lens, by_indices=by_indices)
-
-    prepare = nothing
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
         with torch.no_grad(), trace_engine(self.engine):
@@ -90,8 +89,7 @@ class Own:
             return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)
 
     def _with_path(self, rays: Rays) -> Rays:
-        path = torch.zeros_like(rays.direction[0]) if self.with_path else None
-        return dataclasses.replace(rays, opl=path)
+        return dataclasses.replace(rays, opl=torch.zeros_like(rays.direction[0]) if self.with_path else None)
 
 
 def squared_radius(x: Tensor, y: Tensor, centroid: Tensor) -> Tensor:
@@ -102,13 +100,6 @@ def squared_radius(x: Tensor, y: Tensor, centroid: Tensor) -> Tensor:
     return ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2).mean()
 
 
-def slope(rays: Rays, leaf: Tensor) -> Tensor:
-    """Derivative of the mean squared spot radius with respect to a number of the lens."""
-    x, y = rays.position[0], rays.position[1]
-    centroid = torch.stack([x.detach().mean(), y.detach().mean()])
-    return torch.autograd.grad(squared_radius(x, y, centroid), leaf)[0]
-
-
 def variables(lens: Lens) -> list[tuple[int, str]]:
     """Variables of gradients: every modelled curvature and every thickness, as (surface number, name)."""
     last = len(lens.surfaces) - 1
@@ -116,18 +107,12 @@ def variables(lens: Lens) -> list[tuple[int, str]]:
     return curved + [(i, "thickness") for i in range(1, last)]
 
 
-def with_leaf(lens: Lens, number: int, name: str) -> tuple[Lens, Tensor]:
-    """The lens with one number of a surface as a leaf, and the leaf."""
-    leaf = getattr(lens.surfaces[number], name).detach().clone().requires_grad_()
-    return lens.replace(number, **{name: leaf}), leaf
-
-
 def with_leaves(lens: Lens, chosen: Sequence[tuple[int, str]]) -> tuple[Lens, list[Tensor]]:
-    """The lens with a leaf for each of the chosen numbers, and the leaves."""
+    """The lens with a leaf for each of the chosen numbers of surfaces, and the leaves."""
     leaves = []
     for number, name in chosen:
-        lens, leaf = with_leaf(lens, number, name)
-        leaves.append(leaf)
+        leaves.append(getattr(lens.surfaces[number], name).detach().clone().requires_grad_())
+        lens = lens.replace(number, **{name: leaves[-1]})
     return lens, leaves
 
 
@@ -177,9 +162,9 @@ class Errors:
     with respect to curvatures and to thicknesses, |g - g_ref|/|g_ref| of the largest component, the larger of both.
     """
 
-    position: float | None
-    path: float | None
-    gradient: float | None
+    position: float | None = None
+    path: float | None = None
+    gradient: float | None = None
 
 
 def shape_of(surface: Surface, number: int) -> tuple[float, float, list[float]]:
@@ -274,24 +259,82 @@ def in_turns(
     return seconds
 
 
-def in_best_pieces(
-    function: Callable[[Rays], object], rays: Rays, prepare: Callable, *, sizes: Sequence[int], threads: int,
-    most: int | None = None,
-) -> tuple[Job, int]:  # fmt: skip
-    """A call on all rays in pieces, and their size: the fastest of `sizes` and all at once, ≤ most."""
-    count = rays.direction.shape[1]
-    whole = min(count, most or count)
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A measurement of a tracer.
 
-    def by_pieces(size: int) -> Callable[[], object]:
+    what: the task; path: whether it computes the optical path; piece: rays at a time; seconds: median; speed: rays ×
+    surfaces / s; position, path_error, gradient: see `Errors`; ratio: speed relative to Optiland's torch back end.
+    """
+
+    tracer: str
+    dtype: str
+    what: str
+    path: bool
+    rays: int
+    piece: int
+    seconds: float
+    fastest: float
+    speed: float
+    position: float | None = None
+    path_error: float | None = None
+    gradient: float | None = None
+    ratio: float | None = None
+
+
+def measured_rows(
+    tasks: Sequence[tuple[Tracer, str, Errors]], lens: Lens, count: int, *, sizes: Sequence[int],
+    graphs: Callable[[Tracer], int | None], repeats: int, threads: int, progress: Callable[[int], object] = nothing,
+) -> list[Row]:  # fmt: skip
+    """A row of each task: a tracer, its work, which starts with "forward" where it has no gradient, and its errors.
+
+    sizes: numbers of rays at a time, of which the fastest is chosen, or all at once; graphs: largest number of rays of
+    a graph of a tracer, None for any. Tasks are timed in turns.
+    """
+    rays = field_rays(lens, count)
+    of_dtype = {dtype: to(rays, dtype=dtype) for dtype in {tracer.dtype for tracer, *_ in tasks}}
+
+    def job(tracer: Tracer, work: str, size: int) -> Job:
+        batch, centroid = of_dtype[tracer.dtype], torch.zeros(2, dtype=tracer.dtype)
+        call = tracer.forward if work == "forward" else lambda part: tracer.gradient(part, centroid)
         if size >= count:
-            return lambda: function(rays)
-        pieces = [some(rays, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
-        return lambda: [function(piece) for piece in pieces]
+            return lambda: call(batch), tracer.prepare
+        parts = [some(batch, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
+        return lambda: [call(part) for part in parts], tracer.prepare
 
-    jobs = {size: (by_pieces(size), prepare) for size in {*(min(size, whole) for size in sizes), whole}}
-    if len(jobs) == 1:
-        return jobs[whole], whole
-    for job in jobs.values():
-        seconds_of(job, 1, threads)
-    best = min(jobs, key=lambda size: min(seconds_of(jobs[size], 1, threads) for _ in range(2)))
-    return jobs[best], best
+    jobs, pieces = {}, []
+    for k, (tracer, work, _) in enumerate(tasks):
+        whole = min(count, (work != "forward" and graphs(tracer)) or count)
+        choices = {size: job(tracer, work, size) for size in {*(min(size, whole) for size in sizes), whole}}
+        piece = whole
+        if len(choices) > 1:
+            for choice in choices.values():
+                seconds_of(choice, 1, threads)  # warm up
+            trials = {size: min(seconds_of(choice, 1, threads) for _ in range(2)) for size, choice in choices.items()}
+            piece = min(trials, key=trials.get)
+        jobs[k] = choices[piece]
+        pieces.append(piece)
+    turns = in_turns(jobs, repeats=repeats, threads=threads, progress=progress)
+    rows = []
+    for (tracer, work, errors), piece, seconds in zip(tasks, pieces, turns.values(), strict=True):
+        median = statistics.median(seconds)
+        task = (tracer.name, name_of(tracer.dtype), work, tracer.with_path, count, piece)
+        speed = count * surfaces_of(lens) / max(median, 1e-9)
+        rows.append(Row(*task, median, min(seconds), speed, *dataclasses.astuple(errors)))
+    return rows
+
+
+#: Columns of the tables of rows.
+COLUMNS = {
+    "rays": lambda row: f"{row.rays:,}",
+    "what": lambda row: row.what,
+    "dtype": lambda row: row.dtype,
+    "tracer": lambda row: row.tracer,
+    "path": lambda row: yes(row.path),
+    "at a time": lambda row: f"{row.piece:,}",
+    "M/s": lambda row: significant(row.speed / 1e6),
+    "× Optiland": lambda row: digits(row.ratio, ".2f"),
+    "position error, nm": lambda row: digits(row.position, ".2g"),
+    "path error, waves": lambda row: digits(row.path_error, ".2g"),
+    "gradient error": lambda row: digits(row.gradient, ".2g") if row.what != "forward" else "",
+}

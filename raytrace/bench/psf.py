@@ -17,24 +17,128 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.figures import psf_figure
-from raytrace.bench.huygens import Sampling, direct_sum, moments
 from raytrace.bench.measure import clock, name_of, nothing, with_leaves
-from raytrace.bench.psf_cases import PIXELS, USUAL, Case, Method, cases, methods
-from raytrace.bench.report import Measured, Request, clock_of, in_words, milliseconds, table, yes
+from raytrace.bench.report import Measured, Request, clock_of, in_words
 from raytrace.cli.progress import progress
 from raytrace.maths.numerics import to
-from raytrace.maths.sampling import Grid, gauss_rings
-from raytrace.psf_models import MODELS, NotConverged, Psf, drt, paraxial, wave
-from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.maths.sampling import Grid, grid
+from raytrace.pages import listing, milliseconds, yes
+from raytrace.psf_models import MODELS, NotConverged, Psf, direct_sum, drt, paraxial, psf
+from raytrace.psf_models.direct_sum import Sampling, moments, sampling_of
+from raytrace.psf_models.gaussian import gaussian_pixels
+from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.psf_models.result import Kernels
-from raytrace.system.lens import Lens
-from raytrace.tracing.scene import Scene
-from raytrace.tracing.wavefront import wavefront_of
+from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.scene import Scene, scene
 
 _LIMIT = 0.4  # s for the repeats of a measurement
-_REFERENCE = 0.75  # of the rings and arms of the wave model's order 0, and some more, for the reference
 _FINEST_WAVE = 3  # order of the wave model that its estimates are compared with
+PIXELS = 21  # across every window
+#: Field angles in degrees, object distance in mm (None: that of the lens) and pixel pitch in mm of the default cases.
+USUAL = {
+    "double_gauss": ((0.0, 14.0), 1e4, 0.005),
+    "phone": ((0.0,), None, 0.001),
+    "hubble": ((0.0,), None, 0.005),
+}
+_ORDERS = {
+    "gaussian": (2, 3, 4, 5, 6, 8, 12),
+    "drt": (0, 1, 2, 3, 4, 6),
+    "fourier": tuple(MODELS["fourier"].orders[:3]),
+    "wave": tuple(MODELS["wave"].orders[:3]),
+}
+_TOLERANCES = {"gaussian": (1e-2, 1e-4, 1e-6), "drt": (1e-1, 1e-2, 1e-3), "fourier": (1e-2, 1e-4), "wave": (1e-2, 1e-3)}
+_SOBOL = (256, 4096)
+
+
+# -- cases and methods ------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A lens, field, object distance (mm) and pixel pitch (mm): a panel of the figure."""
+
+    lens: Lens
+    name: str
+    field: float
+    distance: float
+    pitch: float
+
+    @property
+    def title(self) -> str:
+        return f"{self.name}, {self.field:g}{'°' if self.lens.fields.kind == 'angle' else ' mm'}"
+
+    @property
+    def scene(self) -> Scene:
+        """The primary wavelength alone, float64."""
+        wavelength = self.lens.primary[None]
+        field = wavelength.new_tensor([[0.0], [self.field]])
+        return scene(self.lens, field, wavelength.new_tensor([self.distance]), wavelength)
+
+    def window(self, centre: Tensor) -> Grid:
+        return grid(centre.new_tensor(self.pitch), PIXELS, centre)
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A way to compute a kernel. run: (scene, grid) -> kernel, centroid, covariance and rays.
+
+    against: the limit of its error: "rays", "wave", or its own: "gaussian", "paraxial", "fourier".
+    """
+
+    model: str
+    sampling: str
+    run: Callable[[Scene, Grid], Kernels | Psf]
+    against: str
+    has_gradient: bool = True
+
+
+def cases(lenses: Sequence[tuple[str, Lens]]) -> list[Case]:
+    """The default conditions of the lenses of USUAL; others at their own distance, on the axis and at the largest
+    field, with a window of at least 7 σ and 8 λN."""
+    chosen = []
+    for name, lens in lenses:
+        fields, distance, pitch = USUAL.get(name, (dict.fromkeys((0.0, float(largest_field(lens)[1]))), None, None))
+        distance = float(lens.surfaces[0].thickness) if distance is None else distance
+        chosen += [Case(lens, name, field, distance, pitch or _pitch(lens, field, distance)) for field in fields]
+    return chosen
+
+
+def methods() -> list[Method]:
+    """Every model at several orders, Sobol rays, and `psf(…, tol=…)` with the estimate of its error."""
+
+    def to_tolerance(model: str, tol: float, scene: Scene, grid: Grid) -> Psf:
+        conditions = {"fields": scene.fields, "wavelengths": scene.wavelengths}
+        distances = scene.lens.surfaces[0].thickness.flatten()
+        return psf(scene.lens, model, object_distances=distances, grid=grid, tol=tol, **conditions)
+
+    limits = {model: "rays" if model == "drt" else model for model in _ORDERS}
+    chosen = [Method("paraxial", "closed form", paraxial.kernels, "paraxial")]
+    for model, orders in _ORDERS.items():
+        for order in orders:
+            sampling = f"{order} rings" if model == "gaussian" else f"order {order}"
+            run = functools.partial(MODELS[model].kernels, order=order)
+            chosen.append(Method(model, sampling, run, limits[model]))
+    for rays in _SOBOL:
+        run = functools.partial(drt.kernels_of_rays, rays=rays)
+        chosen.append(Method("Sobol rays", f"{rays} rays", run, "rays"))
+    for model, tolerances in _TOLERANCES.items():
+        for tol in tolerances:
+            run = functools.partial(to_tolerance, model, tol)
+            chosen.append(Method(model, f"tol {tol:.0e}".replace("e-0", "e-"), run, limits[model]))
+    return chosen
+
+
+def _pitch(lens: Lens, field: float, distance: float) -> float:
+    """A round pixel pitch whose window of PIXELS holds 7 σ of the rays and 8 λN."""
+    with torch.no_grad():
+        light = gaussian_kernels(Case(lens, "", field, distance, 1.0).scene, grid(1.0, 1), order=8)
+        width = 7 * float(light.covariance[::2].max().sqrt())
+        number = float(first_order(with_object_distance(lens, distance)).paraxial_working_f_number)
+        airy = 8e-3 * float(lens.primary) * number
+    pitch = max(width, airy if math.isfinite(airy) else 0.0, 1e-6) / PIXELS
+    decade = 10.0 ** math.floor(math.log10(pitch))
+    return next(step for step in (decade, 2 * decade, 5 * decade, 10 * decade) if step >= pitch * (1 - 1e-9))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +175,7 @@ class PsfRow:
 @dataclasses.dataclass(frozen=True)
 class Truth:
     """Limits of a case. kernels: (rows, columns) by name; windows: their grids; centroid, sigma: (2,) mm of the rays;
-    rings, arms, nodes: sampling of the wave model at order 0.
+    sampling: of the wave model at order 0.
     """
 
     case: Case
@@ -79,9 +183,7 @@ class Truth:
     windows: dict[str, Grid]
     centroid: Tensor
     sigma: Tensor
-    rings: int = 0
-    arms: int = 0
-    nodes: int = 0
+    sampling: Sampling | None = None
 
 
 @torch.no_grad()
@@ -98,64 +200,40 @@ def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
         "paraxial": paraxial.kernels(scene, about_chief).kernel[0, 0, 0],
     }
     windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), about_chief)
-    sampling = 0, 0, 0
+    sampling = None
     try:
         fourier = MODELS["fourier"]
         kernels["fourier"] = fourier.kernels(scene, about_chief, order=fourier.orders[-1]).kernel[0, 0, 0]
     except ValueError as refusal:
         say(f"{case.title}: {refusal}")
     try:
-        rings, arms, nodes = sampling = wave_sampling(scene, window)
-        waves, _ = direct_sum(scene, window, Sampling(*scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2))
+        sampling, waves = sampling_of(scene, window), direct_sum.reference(scene, window)
         kernels["finest wave"] = MODELS["wave"].kernels(scene, window, order=_FINEST_WAVE).kernel[0, 0, 0]
         kernels["wave"] = waves
     except ValueError as refusal:
         say(f"{case.title}: {refusal}")
-    return Truth(case, kernels, windows, centroid, torch.sqrt(variance), *sampling)
-
-
-def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
-    """Rings, arms and nodes across a pixel of the wave model at order 0, from the phase over the pupil."""
-    front = wavefront_of(scene, *gauss_rings(8, 32))
-    offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
-    reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
-    L, M = front.direction[:2, 0, 0, 0]
-    spread = torch.hypot(L - L.mean(), M - M.mean()).max()
-    cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
-    return (
-        *rings_and_arms(wave.phase_along_radius(front, reach), 0),
-        nodes_per_pixel(float(grid.pitch), cutoff, 0),
-    )
-
-
-def scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
-    """A part of rings and arms, at least 4 and 8."""
-    return max(4, round(part * rings)), max(8, 4 * round(part * arms / 4))
+    return Truth(case, kernels, windows, centroid, torch.sqrt(variance), sampling)
 
 
 # -- measurement -------------------------------------------------------------------------------------------------------
 
 
-def bench(request: Request) -> Measured:
-    """Every method on every case."""
-    rows, titles, about = measured_rows(request)
-    lines = report(rows, titles=titles, about=about["machine"], repeats=about["repeats"])
-    return Measured(rows, lines, about, functools.partial(psf_figure, titles=titles))
-
-
-def measured_rows(
-    request: Request, more: Callable[[Truth, int], Sequence[PsfRow]] = lambda truth, threads: ()
-) -> tuple[list[PsfRow], dict, dict]:
-    """Rows, titles of the cases by lens and field, repeats and machine. more: further rows of a case and threads."""
+def bench(
+    request: Request,
+    more: Callable[[Truth, int], Sequence[PsfRow]] = lambda truth, threads: (),
+    head: Callable[[Sequence[PsfRow]], Sequence[str]] = lambda rows: (),
+) -> Measured:
+    """Every method on every case. more: further rows of a case and threads; head: lines above the tables."""
     names = dict.fromkeys(request.arguments.lenses or USUAL)
     chosen = cases([(Path(name).stem, request.open_lens(name)) for name in names])
-    repeats, rows = request.arguments.repeats, []
+    repeats, peer_methods = request.arguments.repeats, request.peers.psf_methods if request.peers else lambda truth: ()
     with progress(steps(chosen), what="measuring") as bar:
         how = {"repeats": repeats, "threads": request.threads, "progress": bar.update, "say": bar.write}
-        peer_methods = request.peers.psf_methods if request.peers else lambda truth: ()
         rows = measure(chosen, peer_methods=peer_methods, more=more, **how)
+    about = {"repeats": repeats, "machine": request.about()}
     titles = {(case.name, case.field): case.title for case in chosen}
-    return rows, titles, {"repeats": repeats, "machine": request.about()}
+    lines = report(rows, titles=titles, about=about["machine"], repeats=repeats, head=head(rows))
+    return Measured(rows, lines, about, functools.partial(psf_figure, titles=titles))
 
 
 def steps(cases: Sequence[Case]) -> int:
@@ -243,24 +321,20 @@ def errors_of(truth: Truth, against: str, result: Kernels | Psf) -> dict[str, fl
     errors = {"l1_error": relative_l1(kernel, truth.kernels[against])}
     if "wave" in truth.kernels:
         errors["model_error"] = relative_l1(kernel, truth.kernels["wave"])
-    if isinstance(result, Psf):
-        errors["estimate"], errors["own_error"] = float(result.error), own_error(truth, against, result)
+    if isinstance(result, Psf):  # with an estimate: of the kernel, or of the variances and the energy of a Gaussian
+        errors["estimate"] = float(result.error)
+        errors["own_error"] = relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
+        if against == "gaussian":
+            variance, energy = truth.sigma**2, float(truth.kernels["gaussian"].sum())
+            excess = result.covariance.detach().double().reshape(3)[::2] - variance
+            width = float(0.5 * excess.abs().sum() / variance.sum())
+            errors["own_error"] = max(width, abs(float(kernel.sum()) / energy - 1))
     if result.covariance is not None and float(truth.sigma.min()) > 0:
         parts = result.ray_moments if isinstance(result, Kernels) else (result.ray_centroid, result.ray_covariance)
         centroid, covariance = (moment.detach().double().flatten() for moment in parts)
         errors["sigma_error"] = float((torch.sqrt(covariance[::2]) / truth.sigma - 1).abs().max())
         errors["centroid_error"] = float((centroid - truth.centroid).norm() / truth.sigma.norm())
     return errors
-
-
-def own_error(truth: Truth, against: str, result: Psf) -> float:
-    """The error that `psf` estimates: of the kernel, or of the variances and the energy of a Gaussian."""
-    kernel = result.kernel.detach().double().reshape(result.kernel.shape[-2:])
-    if against != "gaussian":
-        return relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
-    variance = truth.sigma**2
-    width = 0.5 * (result.covariance.detach().double().reshape(3)[::2] - variance).abs().sum() / variance.sum()
-    return max(float(width), abs(float(kernel.sum()) / float(truth.kernels["gaussian"].sum()) - 1))
 
 
 def relative_l1(kernel: Tensor, reference: Tensor) -> float:
@@ -287,10 +361,10 @@ def report(
             if (row.lens, row.field) == case and row.estimate is None:
                 pairs.setdefault((row.model, row.sampling), []).append(row)
         order = dict.fromkeys((row.model, row.sampling) for row in rows)
-        lines += [f"## {title}", "", *table(_CASE, [pairs[key] for key in order if key in pairs]), ""]
+        lines += [f"## {title}", "", *listing(_CASE, [pairs[key] for key in order if key in pairs]), ""]
     estimated = [row for row in rows if row.estimate is not None]
     columns = {"case": lambda row: titles[row.lens, row.field]} | _ESTIMATES
-    return [*lines, "## Driven by a tolerance", "", *table(columns, estimated)]
+    return [*lines, "## Driven by a tolerance", "", *listing(columns, estimated)]
 
 
 def bounds(row: PsfRow) -> bool:

@@ -13,28 +13,28 @@ from torch import Tensor
 
 from raytrace.bench.figures import speed_figure
 from raytrace.bench.measure import (
+    COLUMNS,
     DTYPES,
     SAMPLE,
-    Errors,
-    Job,
     Own,
+    Row,
     Tracer,
     clock,
     errors_of,
     field_rays,
-    in_best_pieces,
-    in_turns,
+    measured_rows,
     name_of,
     nothing,
-    slope,
-    surfaces_of,
-    with_leaf,
+    squared_radius,
+    with_leaves,
 )
-from raytrace.bench.report import Measured, Request, clock_of, finite, in_words, significant, table
+from raytrace.bench.report import Measured, Request, clock_of, in_words
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
+from raytrace.maths.result import plain
 from raytrace.maths.sampling import sobol
+from raytrace.pages import listing, significant
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.prescription import lens as lens_of
@@ -66,22 +66,6 @@ QUICK = Sizes(2**16, (2**8, 2**12, 2**16), sensor=2**14, distances=5)
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
-    """A measurement. what: "forward", "backward" (forward + backward) or "asphere"; seconds: median; speed: rays ×
-    surfaces / s; position: largest error on the image, nm; gradient: see `measure.Errors`.
-    """
-
-    tracer: str
-    dtype: str
-    what: str
-    rays: int
-    seconds: float
-    speed: float
-    position: float | None
-    gradient: float | None
-
-
-@dataclasses.dataclass(frozen=True)
 class Bench:
     """Measurements of one dtype. peers: of the double Gauss and of the aspheres."""
 
@@ -92,10 +76,23 @@ class Bench:
     peers: Sequence[Tracer] = ()
     asphere_peers: Sequence[Tracer] = ()
 
-    def medians(self, jobs: Mapping[str, Job]) -> dict[str, float]:
-        """Median seconds of each job, in turns."""
-        seconds = in_turns(jobs, repeats=self.repeats, threads=self.threads)
-        return {name: statistics.median(turns) for name, turns in seconds.items()}
+    def rows(
+        self, what: str, lens: Lens, count: int, tasks: Sequence[tuple[Tracer, str]], *, gradient: bool = False
+    ) -> list[Row]:
+        """Rows of tasks, a tracer and "forward" or "backward" each, with errors of `SAMPLE` rays.
+
+        Those of this package in a batch as large as the timed one (with a graph, at most 2¹⁶). gradient: whether
+        gradients are compared.
+        """
+        copies, sample = max(1, min(count, _PIECE) // SAMPLE), field_rays(lens, SAMPLE)
+        errors = {
+            tracer: errors_of(tracer, lens, sample, copies=copies if isinstance(tracer, Own) else 1, gradient=gradient)
+            for tracer, _ in tasks
+        }
+        graphs = lambda tracer: _LARGEST_GRAPH.get(prepare() if isinstance(tracer, Own) else "Optiland")  # noqa: E731
+        how = {"sizes": _PIECES, "graphs": graphs, "repeats": self.repeats, "threads": self.threads}
+        rows = measured_rows([(tracer, work, errors[tracer]) for tracer, work in tasks], lens, count, **how)
+        return [dataclasses.replace(row, dtype=name_of(self.dtype), what=what) for row in rows]
 
 
 def benches_of(request: Request, sizes: Sizes) -> list[Bench]:
@@ -115,7 +112,7 @@ def bench(request: Request) -> Measured:
     names = {dtype: (lambda key, values=values: significant(values[key])) for dtype, values in ratios.items()}
     lines = [
         *("# Speed: this package and its peers", "", "    raytrace bench speed --docs docs", ""),
-        *table({"ratio": lambda key: WORDS[key].format(**sizes_in_words(sizes))} | names, [*WORDS]),
+        *listing({"ratio": lambda key: WORDS[key].format(**sizes_in_words(sizes))} | names, [*WORDS]),
         *("", *speeds(rows, sizes, about["machine"], about["repeats"])),
     ]
     return Measured(rows, lines, document(rows, ratios) | about, speed_figure, ("speed.md", "speed"))
@@ -134,66 +131,44 @@ def measure(benches: Sequence[Bench], *, progress: Callable[[int], object] = not
     return rows, ratios
 
 
-# -- measurements: rows and ratios -------------------------------------------------------------------------------------
+# -- stages: rows and ratios -------------------------------------------------------------------------------------------
 
 
 def _forward(bench: Bench) -> tuple[list[Row], dict]:
     """Without the optical path, which Optiland always computes."""
-    lens = double_gauss()
+    lens, sizes, rows = double_gauss(), bench.sizes, []
     tracers = [*_own(lens, bench.dtype), *bench.peers]
-    errors = {tracer.name: _errors(tracer, lens, bench.sizes.rays) for tracer in tracers}
-    rows = []
-    for count in sorted({*bench.sizes.counts, bench.sizes.rays}):
+    for count in sorted({*sizes.counts, sizes.rays}):
         chosen = [tracer for tracer in tracers if tracer.most is None or count <= tracer.most]
-        seconds = bench.medians(_forward_jobs(chosen, field_rays(lens, count), bench))
-        rows += _rows("forward", lens, count, seconds, errors, bench)
-    last = {row.tracer: row.seconds for row in rows if row.rays == bench.sizes.rays}
-    return rows, {"forward_over_optiland": over(last, "Optiland"), "forward_s": last["raytrace"]}
+        rows += bench.rows("forward", lens, count, [(tracer, "forward") for tracer in chosen])
+    last = [row for row in rows if row.rays == sizes.rays]
+    return rows, {"forward_over_optiland": over(last, "Optiland"), "forward_s": last[0].seconds}
 
 
 def _backward(bench: Bench) -> tuple[list[Row], dict]:
     """Forward + backward to every curvature, thickness and index; in turns with the forward trace of this package."""
-    lens, count = double_gauss(), bench.sizes.rays
-    rays, centroid = to(field_rays(lens, count), dtype=bench.dtype), torch.zeros(2, dtype=bench.dtype)
-    own = Own(lens, bench.dtype, engine="auto", by_indices=True)
-    tracers = [own, *(peer for peer in bench.peers if peer.has_gradient)]
-    errors = {tracer.name: _errors(tracer, lens, count, gradient=True) for tracer in tracers}
-    jobs = {"forward": _forward_jobs([own], rays, bench)[own.name]}
-    for tracer in tracers:
-        most = _LARGEST_GRAPH["Optiland"] if tracer is not own else _LARGEST_GRAPH.get(prepare())
-        gradient = lambda part, tracer=tracer: tracer.gradient(part, centroid)  # noqa: E731
-        jobs[tracer.name], _ = in_best_pieces(
-            gradient, rays, tracer.prepare, sizes=_PIECES, threads=bench.threads, most=most
-        )
-    seconds = bench.medians(jobs)
-    forward = seconds.pop("forward")
-    return _rows("backward", lens, count, seconds, errors, bench), {
-        "backward_over_forward": seconds[own.name] / forward,
-        "backward_over_optiland": over(seconds, "Optiland"),
-    }
+    lens = double_gauss()
+    tracers = [_own(lens, bench.dtype)[0], *(peer for peer in bench.peers if peer.has_gradient)]
+    tasks = [(tracers[0], "forward"), *((tracer, "backward") for tracer in tracers)]
+    forward, *rows = bench.rows("backward", lens, bench.sizes.rays, tasks, gradient=True)
+    ratio = rows[0].seconds / forward.seconds
+    return rows, {"backward_over_forward": ratio, "backward_over_optiland": over(rows, "Optiland")}
 
 
 def _small(bench: Bench) -> tuple[list[Row], dict]:
     """A few hundred rays, forward + backward, as in co-design."""
-    lens, count = double_gauss(), bench.sizes.small
-    rays, centroid = to(field_rays(lens, count), dtype=bench.dtype), torch.zeros(2, dtype=bench.dtype)
+    lens = double_gauss()
     tracers = [*_own(lens, bench.dtype), *(peer for peer in bench.peers if peer.has_gradient)]
-    seconds = bench.medians(
-        {tracer.name: (lambda tracer=tracer: tracer.gradient(rays, centroid), tracer.prepare) for tracer in tracers}
-    )
-    return _rows("backward", lens, count, seconds, {}, bench), {
-        "small_batch_ms": 1e3 * seconds["raytrace"],
-        "small_batch_over_optiland": over(seconds, "Optiland"),
-    }
+    rows = bench.rows("backward", lens, bench.sizes.small, [(tracer, "backward") for tracer in tracers])
+    return rows, {"small_batch_ms": 1e3 * rows[0].seconds, "small_batch_over_optiland": over(rows, "Optiland")}
 
 
 def _asphere(bench: Bench) -> tuple[list[Row], dict]:
     """The three aspheres, forward."""
-    lens, count = three_aspheres(), bench.sizes.rays
+    lens = three_aspheres()
     tracers = [*_own(lens, bench.dtype), *bench.asphere_peers]
-    errors = {tracer.name: _errors(tracer, lens, count) for tracer in tracers}
-    seconds = bench.medians(_forward_jobs(tracers, field_rays(lens, count), bench))
-    return _rows("asphere", lens, count, seconds, errors, bench), {"asphere_over_optiland": over(seconds, "Optiland")}
+    rows = bench.rows("asphere", lens, bench.sizes.rays, [(tracer, "forward") for tracer in tracers])
+    return rows, {"asphere_over_optiland": over(rows, "Optiland")}
 
 
 def _sensor(bench: Bench) -> tuple[list[Row], dict]:
@@ -216,28 +191,29 @@ def _sensor(bench: Bench) -> tuple[list[Row], dict]:
     parabolas = torch.stack(parabolas, -1)
     with torch_threads(bench.threads):
         for _ in range(max(1, min(bench.repeats, 3))):
-            turns = (_sensor_turn(bundle, leaf, memo, now) for bundle in bundles)
-            turn = [sum(seconds) for seconds in zip(*turns, strict=True)]
+            seconds = [0.0, 0.0]
+            for bundle in bundles:
+                with torch.no_grad():
+                    rays = rays_of_field(bundle[0], field, pupil, wavelength=bundle[2])
+                start = now()
+                slope(trace_lens(bundle[0], rays, bundle[2]), leaf)
+                middle = now()
+                slope(trace_bundle(bundle, memo), leaf)
+                seconds = [seconds[0] + middle - start, seconds[1] + now() - middle]
             start = now()
             for _ in range(_MANY):
                 slope_of_parabolas(parabolas, leaf, float(leaf.detach()))
-            times.append([*turn, (now() - start) / _MANY])
+            times.append([*seconds, (now() - start) / _MANY])
     retraced, with_memo, summed = (statistics.median(column) for column in zip(*times, strict=True))
     gains = {"sensor_step_gain": retraced / summed, "sensor_step_gain_of_memo": retraced / with_memo}
     return [], gains | {"sensor_step_s": summed, "sensor_rays": bench.sizes.sensor, "sensor_distances": len(distances)}
 
 
-def _sensor_turn(bundle: tuple, leaf: Tensor, memo: Memo, now: Callable[[], float]) -> list[float]:
-    """Seconds of retracing and of the step with a memo."""
-    lens, field, wavelength, pupil = bundle
-    with torch.no_grad():
-        rays = rays_of_field(lens, field, pupil, wavelength=wavelength)
-    times = [now()]
-    slope(trace_lens(lens, rays, wavelength), leaf)
-    times.append(now())
-    slope(trace_bundle(bundle, memo), leaf)
-    times.append(now())
-    return [b - a for a, b in itertools.pairwise(times)]
+def slope(rays: Rays, leaf: Tensor) -> Tensor:
+    """Derivative of the mean squared spot radius with respect to a number of the lens."""
+    x, y = rays.position[0], rays.position[1]
+    centroid = torch.stack([x.detach().mean(), y.detach().mean()])
+    return torch.autograd.grad(squared_radius(x, y, centroid), leaf)[0]
 
 
 def slope_of_parabolas(parabolas: Tensor, leaf: Tensor, start: float) -> Tensor:
@@ -249,7 +225,8 @@ def slope_of_parabolas(parabolas: Tensor, leaf: Tensor, start: float) -> Tensor:
 
 def with_sensor_leaf(lens: Lens) -> tuple[Lens, Tensor]:
     """The lens with its sensor distance as a leaf, and the leaf."""
-    return with_leaf(lens, len(lens.surfaces) - 2, "thickness")
+    lens, leaves = with_leaves(lens, [(len(lens.surfaces) - 2, "thickness")])
+    return lens, leaves[0]
 
 
 def detached(rays: Rays) -> Rays:
@@ -285,33 +262,10 @@ def _own(lens: Lens, dtype: torch.dtype) -> list[Own]:
     return [Own(lens, dtype, engine=engine, by_indices=True) for engine in ("auto", "eager")]
 
 
-def _forward_jobs(tracers: Sequence[Tracer], rays: Rays, bench: Bench) -> dict[str, Job]:
-    jobs = {}
-    for tracer in tracers:
-        own_rays, how = to(rays, dtype=tracer.dtype), {"sizes": _PIECES, "threads": bench.threads}
-        jobs[tracer.name], _ = in_best_pieces(tracer.forward, own_rays, tracer.prepare, **how)
-    return jobs
-
-
-def _errors(tracer: Tracer, lens: Lens, count: int, *, gradient: bool = False) -> Errors:
-    """Of `SAMPLE` rays; those of this package in a batch as large as the timed one (with a graph, at most 2¹⁶)."""
-    copies = max(1, min(count, _PIECE) // SAMPLE) if isinstance(tracer, Own) else 1
-    return errors_of(tracer, lens, field_rays(lens, SAMPLE), copies=copies, gradient=gradient)
-
-
-def _rows(what: str, lens: Lens, count: int, seconds: Mapping[str, float], errors: Mapping, bench: Bench) -> list[Row]:
-    work, rows = count * surfaces_of(lens), []
-    for name, median in seconds.items():
-        error = errors.get(name, Errors(None, None, None))
-        position, gradient = error.position, error.gradient
-        rows.append(Row(name, name_of(bench.dtype), what, count, median, work / median, position, gradient))
-    return rows
-
-
-def over(seconds: Mapping[str, float], name: str) -> float | None:
+def over(rows: Sequence[Row], name: str) -> float | None:
     """Speed of this package relative to the fastest tracer whose name starts so; None if there is none."""
-    others = [median for tracer, median in seconds.items() if tracer.startswith(name)]
-    return min(others) / seconds["raytrace"] if others else None
+    others = [row.seconds for row in rows if row.tracer.startswith(name)]
+    return min(others) / next(row.seconds for row in rows if row.tracer == "raytrace") if others else None
 
 
 # -- report ------------------------------------------------------------------------------------------------------------
@@ -335,15 +289,12 @@ _TASKS = {
 
 
 def sizes_in_words(sizes: Sizes) -> dict[str, str]:
-    """Numbers of rays as powers of two, by the name of the field."""
-
-    def power(count: int) -> str:
-        exponent = str(count.bit_length() - 1).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
-        return f"2{exponent}" if count & (count - 1) == 0 else f"{count:,}"
-
-    return {name: power(getattr(sizes, name)) for name in ("rays", "sensor")} | {
-        name: str(getattr(sizes, name)) for name in ("small", "distances")
-    }
+    """Numbers of rays, powers of two as such, by the name of the field."""
+    words = {name: f"{count:,}" for name, count in dataclasses.asdict(sizes).items() if name != "counts"}
+    for name, count in {"rays": sizes.rays, "sensor": sizes.sensor}.items():
+        if count.bit_count() == 1:
+            words[name] = "2" + str(count.bit_length() - 1).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return words
 
 
 def document(rows: Sequence[Row], ratios: Mapping[str, Mapping[str, float | None]]) -> dict:
@@ -353,25 +304,18 @@ def document(rows: Sequence[Row], ratios: Mapping[str, Mapping[str, float | None
         speeds: dict[str, dict[str, dict[str, float]]] = {}
         for row in (row for row in rows if row.dtype == dtype):
             speeds.setdefault(row.what, {}).setdefault(row.tracer, {})[str(row.rays)] = row.speed / 1e6
-        documents[dtype] = finite({**values}) | {"millions_per_second": speeds}
+        documents[dtype] = plain({**values}) | {"millions_per_second": speeds}
     return documents
 
 
 def speeds(rows: Sequence[Row], sizes: Sizes, about: Mapping, repeats: int) -> list[str]:
     """Figure and table of a page."""
     most = {row.tracer: min(sizes.rays, max(r.rays for r in rows if r.tracer == row.tracer)) for row in rows}
-    columns = {
-        "what": lambda row: _TASKS[row.what],
-        "dtype": lambda row: row.dtype,
-        "rays": lambda row: f"{row.rays:,}",
-        "tracer": lambda row: row.tracer,
-        "M/s": lambda row: significant(row.speed / 1e6),
-        "position error, nm": lambda row: significant(row.position, 2),
-        "gradient error": lambda row: significant(row.gradient, 2) if row.what == "backward" else "",
-    }
+    names = ("what", "dtype", "rays", "tracer", "M/s", "position error, nm", "gradient error")
+    columns = {name: COLUMNS[name] for name in names} | {"what": lambda row: _TASKS[row.what]}
     return [
         *("![Speed over number of rays](speed.png)", ""),
-        *table(columns, [row for row in rows if row.rays in (sizes.small, most[row.tracer])]),
+        *listing(columns, [row for row in rows if row.rays in (sizes.small, most[row.tracer])]),
         "",
         f"Medians of {repeats} turns of all tracers, of {clock_of(about)}; {in_words(about, ' ', ', ')}. All figures: "
         "[speed.csv](speed.csv).",

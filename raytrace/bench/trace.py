@@ -1,57 +1,31 @@
 """Speed of the trace over the number of rays, forward and with gradient, against its error and Optiland."""
 
 import dataclasses
-import statistics
 from collections.abc import Callable, Sequence
-
-import torch
 
 from raytrace.bench.figures import trace_figure
 from raytrace.bench.measure import (
+    COLUMNS,
     DTYPES,
-    PIECES,
     SAMPLE,
-    Errors,
-    Job,
     Own,
+    Row,
     Tracer,
     errors_of,
     field_rays,
-    in_best_pieces,
-    in_turns,
-    name_of,
+    measured_rows,
     nothing,
     surfaces_of,
 )
-from raytrace.bench.report import Measured, Request, clock_of, digits, in_words, table
+from raytrace.bench.report import Measured, Request, clock_of, in_words
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError
-from raytrace.maths.numerics import to
+from raytrace.pages import listing
 from raytrace.system.lens import Lens
-from raytrace.system.rays import Rays
 
 LENS, COUNTS = "double_gauss", (10**3, 10**4, 10**5, 10**6)
+PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, and all at once
 LARGEST_GRAPH = 200_000  # rays whose graph is held at once
-WORK = ("forward", "forward+backward")
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """A measurement. piece: rays at a time; seconds: median; ratio: speed relative to Optiland's torch back end at the
-    same task, None for Optiland or without it.
-    """
-
-    tracer: str
-    dtype: str
-    what: str
-    path: bool
-    rays: int
-    piece: int
-    seconds: float
-    fastest: float
-    speed: float
-    errors: Errors
-    ratio: float | None = None
 
 
 def bench(request: Request) -> Measured:
@@ -76,49 +50,26 @@ def measure(
 ) -> list[Row]:  # fmt: skip
     """Time every tracer on every number of rays."""
     errors = [errors_of(tracer, lens, field_rays(lens, SAMPLE)) for tracer in tracers]
-    rows = []
-    for count in sorted(counts):
-        jobs, pieces = {}, {}
-        rays = {dtype: to(field_rays(lens, count), dtype=dtype) for dtype in DTYPES}
-        for number, tracer in enumerate(tracers):
-            for what in WORK[: 1 + tracer.has_gradient]:
-                jobs[number, what], pieces[number, what] = _job(tracer, what, rays[tracer.dtype], threads)
-        for (number, what), seconds in in_turns(jobs, repeats=repeats, threads=threads, progress=progress).items():
-            tracer, median = tracers[number], statistics.median(seconds)
-            speed = count * surfaces_of(lens) / max(median, 1e-9)
-            task = (tracer.name, name_of(tracer.dtype), what, tracer.with_path, count, pieces[number, what])
-            rows.append(Row(*task, median, min(seconds), speed, errors[number]))
-    peers = {(row.dtype, row.what, row.rays): row.speed for row in rows if row.tracer.endswith("torch")}
-    ratios = [
-        row.speed / peers[row.dtype, row.what, row.rays] if peers and row.tracer == "raytrace" else None for row in rows
+    tasks = [
+        (tracer, work, error)
+        for tracer, error in zip(tracers, errors, strict=True)
+        for work in ("forward", "forward+backward")[: 1 + tracer.has_gradient]
     ]
-    return [dataclasses.replace(row, ratio=ratio) for row, ratio in zip(rows, ratios, strict=True)]
-
-
-def _job(tracer: Tracer, what: str, rays: Rays, threads: int) -> tuple[Job, int]:
-    centroid, backward = torch.zeros(2, dtype=tracer.dtype), what != "forward"
-    work = (lambda rays: tracer.gradient(rays, centroid)) if backward else tracer.forward
-    most = LARGEST_GRAPH if backward else None
-    return in_best_pieces(work, rays, tracer.prepare, sizes=PIECES, threads=threads, most=most)
+    how = {"repeats": repeats, "threads": threads, "progress": progress}
+    how |= {"sizes": PIECES, "graphs": lambda tracer: LARGEST_GRAPH}
+    rows = [row for count in sorted(counts) for row in measured_rows(tasks, lens, count, **how)]
+    peers = {(row.dtype, row.what, row.rays): row.speed for row in rows if row.tracer.endswith("torch")}
+    return [
+        dataclasses.replace(row, ratio=row.speed / peers[row.dtype, row.what, row.rays])
+        if peers and row.tracer == "raytrace"
+        else row
+        for row in rows
+    ]
 
 
 def report(rows: Sequence[Row], *, lens: str, surfaces: int, machine: dict, repeats: int) -> list[str]:
     """The machine, the measurement, and a line for each row."""
-    columns = {
-        "rays": lambda row: f"{row.rays:,}",
-        "what": lambda row: row.what,
-        "dtype": lambda row: row.dtype,
-        "tracer": lambda row: row.tracer,
-        "path": lambda row: "yes" if row.path else "no",
-        "at a time": lambda row: f"{row.piece:,}",
-        "M/s": lambda row: f"{row.speed / 1e6:.2f}",
-        "× Optiland": lambda row: digits(row.ratio, ".2f"),
-        "position error, nm": lambda row: digits(row.errors.position, ".2g"),
-        "path error, waves": lambda row: digits(row.errors.path, ".2g"),
-        "gradient error": lambda row: digits(row.errors.gradient) if row.what != "forward" else "",
-    }
-    if all(row.ratio is None for row in rows):
-        del columns["× Optiland"]
+    is_alone = all(row.ratio is None for row in rows)
     return [
         f"Lens `{lens}`: {surfaces} surfaces (with stop and image, without the object). Speed in millions of rays × "
         f"surfaces per second, from the median {clock_of(machine)} of {repeats} runs; the tracers take turns.",
@@ -131,5 +82,5 @@ def report(rows: Sequence[Row], *, lens: str, surfaces: int, machine: dict, repe
         "tracer of 50 digits with the same rounded numbers: position on the image; optical path relative to the first "
         "ray; gradient relative to its largest component.",
         "",
-        *table(columns, rows),
+        *listing({name: form for name, form in COLUMNS.items() if not (is_alone and name == "× Optiland")}, rows),
     ]

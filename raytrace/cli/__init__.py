@@ -2,6 +2,16 @@
 
 `main(argv)` runs any command in-process and returns its exit code. A command's module, and torch with it, is imported
 only when the command runs, so that `raytrace --help` answers at once.
+
+- `commands`: the table of commands: summary, examples and exceptions from the rule that an option is a parameter of the
+  public function of that name; `parameters` reads those from signature and docstring, without importing the function.
+- `options`: options that several commands share, and `ROWS`, what signatures do not say; `types`: their values.
+- `run`: the runner: opens the lens, calls the function, prints, saves; `progress`: bars.
+- `codesign`, `wave_…`, `settings`: co-design and phase elements, whose options are fields of settings.
+
+To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function with its
+entry in the docstring; a row where its type or spelling is not that of its annotation. Tests: `test_cli`,
+`test_cli_options`, `test_public`, `test_wave_cli`, `test_codesign_cli`.
 """
 
 import argparse
@@ -70,8 +80,8 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}{meant} (choose from {listed})")
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of the whole command line; imports no torch."""
+def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+    """The parser of the whole command line, or with the options of `only` one command; imports no torch."""
     from raytrace.cli.commands import COMMANDS
 
     parser = _Parser(
@@ -80,7 +90,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS:
-        command.add_to(commands)
+        command.add_to(commands, with_options=only in (None, command.name))
     return parser
 
 
@@ -90,7 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Results go to stdout; progress, warnings and errors to stderr, one line each.
     """
     try:
-        arguments = build_parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else argv
+        arguments = build_parser(next((word for word in words if not word.startswith("-")), "")).parse_args(words)
     except SystemExit as stop:  # argparse printed its help or its usage error
         return stop.code if isinstance(stop.code, int) else 2
     with warnings.catch_warnings():

@@ -2,21 +2,10 @@
 
 import argparse
 
-from raytrace.cli.options import (
-    RAY_AIMING,
-    catalog,
-    count,
-    field_point,
-    file_name,
-    folder_or_lens,
-    json,
-    output_folder,
-    plot,
-    positive,
-    positive_finite,
-    substitute,
-)
+from raytrace.cli.options import ROWS as OPTIONS
+from raytrace.cli.options import catalog, json, output_folder, plot, substitute
 from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
+from raytrace.cli.types import count, field_point, file_name, folder_or_lens, positive, positive_finite
 from raytrace.settings import MODELS, CodesignSettings
 
 SUMMARY = "optimise a lens together with a restoration network"
@@ -96,7 +85,7 @@ ROWS = {
         "rays beyond the semi-diameters of the file: traced (none, default), or vignetted (semi-diameters)",
         choices=("none", "semi-diameters"),
     ),
-    "ray_aiming": option(**RAY_AIMING),
+    "ray_aiming": option(**OPTIONS["ray_aiming"]),
     "depth": option("layers, an even number, instead of the preset's (default 10 or 30)"),
     "width": option("maps of a layer, instead of the preset's (default 32 or 64)"),
     "epochs": option("of each step"),
@@ -131,7 +120,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="image: L1 of restored images, by training (default); spectral: the closed form, without a network, "
         "in seconds",
     )
-    plot(parser, "the loss over the steps of training, or over the evaluations of the closed form")
+    plot("the loss over the steps of training, or over the evaluations of the closed form")(parser)
 
 
 def experiment_options(parser: argparse.ArgumentParser) -> None:
@@ -141,11 +130,10 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     substitute(parser)
     json(parser)
     output_folder(
-        parser,
         "folder of the run; the optimised lens is lens.zmx there. A lens file (.zmx, .csv) is written in addition to a "
         "folder of the same name without suffix",
         type=folder_or_lens,
-    )
+    )(parser)
     parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
     defaults = defaults_of(CodesignSettings)
     group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")

@@ -7,59 +7,46 @@ parameter. A new command is a new row. Commands that do more than call the funct
 import argparse
 import importlib
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 
+from raytrace import PUBLIC
 from raytrace.cli import codesign, wave_design, wave_restore
 from raytrace.cli.options import (
+    FREEDOM,
     LENS_SUFFIXES,
-    MODELS,
+    MERIT,
+    PUPIL,
     Adder,
-    analysis,
     aperture,
     catalog,
     conditions,
-    configuration,
-    count,
-    data_file,
-    environment,
-    fields,
-    file_name,
-    file_of,
-    folder_name,
-    freedom,
-    geometric,
+    exclusive,
     group,
     json,
     lens,
     log,
-    many,
     max_bytes,
-    memory,
-    merit,
     object_distance,
     option,
     output,
-    output_file,
     output_folder,
-    output_lens,
-    picture_file,
+    parameters,
     plot,
-    points,
-    positive,
+    row,
+)
+from raytrace.cli.types import (
+    count,
+    data_file,
+    file_name,
+    file_of,
+    folder_name,
+    many,
+    output_file,
     positive_finite,
-    ray_aiming,
-    reference,
-    samples,
-    sampling,
-    seed_number,
-    size,
-    substitute,
-    wavelength,
-    window,
 )
 from raytrace.cli.wave_options import camera, element, engine, light, pixels
 
@@ -68,8 +55,9 @@ from raytrace.cli.wave_options import camera, element, engine, light, pixels
 class Command:
     """One command.
 
-    examples: the last part of its help page; options: functions that add options to a parser; run: returns the result,
-    where it is more than a call of the public function `verb` with a lens.
+    examples: the last part of its help page; options: functions that add options to a parser; rows: settings of
+    `add_argument` of the remaining options, the parameters of the public function `verb`; run: returns the result,
+    where it is more than a call of that function with a lens.
     """
 
     name: str
@@ -78,6 +66,7 @@ class Command:
     examples: str
     options: tuple[Adder, ...]
     run: Callable[[argparse.Namespace], object] | None = None
+    rows: Mapping[str, Mapping] = field(default_factory=dict)
 
     @property
     def verb(self) -> str:
@@ -87,8 +76,10 @@ class Command:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         for add in self.options:
             add(parser)
+        if self.verb in PUBLIC:
+            parameters(self.verb, **self.rows)(parser)
 
-    def add_to(self, commands, name: str = "") -> None:
+    def add_to(self, commands, name: str = "", *, with_options: bool = True) -> None:
         """Add the parser of this command to a group of parsers, under its own name or another."""
         parser = commands.add_parser(
             name or self.name,
@@ -97,17 +88,20 @@ class Command:
             epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        if not with_options:
+            return
         self.add_arguments(parser)
         max_bytes(parser)
         spelled = {action.dest: action.option_strings[-1] for action in parser._actions if action.option_strings}
         parser.set_defaults(run=self, spelled=spelled)
 
 
-def _command(name: str, summary: str, description: str, examples: str, *options: Adder, run=None) -> Command:
-    """A row; examples: one a line, without `raytrace NAME`."""
+def _command(name: str, summary: str, description: str, examples: str, /, *options: Adder, run=None, **rows) -> Command:
+    """A row; examples: one a line, without `raytrace NAME`; rows: as for `Command`, or the help text alone."""
     start = f"  raytrace {name.replace('wave-', 'wave ')} "
     text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
-    return Command(name, summary, description, text, options, run)
+    rows = {name: {"help": row} if isinstance(row, str) else row for name, row in rows.items()}
+    return Command(name, summary, description, text, options, run, rows)
 
 
 def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
@@ -117,39 +111,25 @@ def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
 # -- commands that do more than call their function once
 
 
-def _reading(arguments: argparse.Namespace) -> dict:
-    """Keywords of the functions that read a lens file."""
-    from raytrace.cli.run import catalogs
+def _with_catalogs(arguments: argparse.Namespace, **paths: Path):
+    """The result of a function that takes catalogs, and no lens."""
+    import raytrace
+    from raytrace.cli.run import catalogs, options_of
 
-    names = ("strict", "configuration", "substitute")
-    return {"catalogs": catalogs(arguments), **{name: getattr(arguments, name) for name in names}}
+    options = options_of(arguments) | paths | {"catalogs": catalogs(arguments)}
+    return getattr(raytrace, arguments.run.verb)(**options)
 
 
 def _check(arguments: argparse.Namespace):
-    import raytrace
     from raytrace.cli.run import find_lens
 
-    return raytrace.check(find_lens(arguments.lens), **_reading(arguments))
+    return _with_catalogs(arguments, path=find_lens(arguments.lens))
 
 
 def _convert(arguments: argparse.Namespace):
-    import raytrace
     from raytrace.cli.run import find_lens
 
-    return raytrace.convert(find_lens(arguments.source), arguments.target, **_reading(arguments))
-
-
-def _glass(arguments: argparse.Namespace):
-    import raytrace
-    from raytrace.cli.run import catalogs
-
-    return raytrace.glass(
-        arguments.name,
-        catalogs=catalogs(arguments),
-        wavelengths=arguments.wavelengths,
-        temperature=arguments.temperature,
-        pressure=arguments.pressure,
-    )
+    return _with_catalogs(arguments, source=find_lens(arguments.source))
 
 
 def _bench(arguments: argparse.Namespace):
@@ -227,6 +207,21 @@ _WAVE_FIGURES = {
 }
 
 
+def _view(arguments: argparse.Namespace) -> None:
+    """The viewer until Ctrl-C."""
+    from raytrace.cli.progress import silence
+    from raytrace.cli.run import CommandError, find_lens, open_lens
+    from raytrace.viewer.server import MissingExtra, serve
+
+    path = find_lens(arguments.lens)
+    silence()
+    file = path if Path(arguments.lens).exists() else Path(path.name)
+    try:
+        serve(open_lens(arguments), file=file, port=arguments.port, browser=arguments.browser, as_json=arguments.json)
+    except MissingExtra as error:
+        raise CommandError(str(error)) from error
+
+
 def _wave_psf(arguments: argparse.Namespace):
     import raytrace
     from raytrace.cli.run import catalogs, options_of, printed_on_failure, say
@@ -259,40 +254,9 @@ def _wave_restore(arguments: argparse.Namespace):
     return restore_files(arguments)
 
 
-# -- options of one command
-
-_SEVERAL_WEIGHTS = [
-    option(f"--{name}-weights", metavar="W", type=positive_finite, nargs="+", help=f"one for each {name}")
-    for name in ("distance", "field", "wavelength")
-]
-_STRICT = option("--strict", action="store_true", help="fail on anything unknown or assumed")
-_POINTS_OF_FAN = partial(points, what="rays across the pupil (default 41)")
-_CURVES = partial(analysis, figure="the curves")
-
-
-def _tolerance_or_rays(parser: argparse.ArgumentParser) -> None:
-    choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("--tol", metavar="T", type=positive_finite, help="bound on the estimated error (default 0.01)")
-    choice.add_argument(
-        "--rays",
-        metavar="N",
-        type=many,
-        help="rays per kernel instead of a tolerance; with --model drt and --max-bytes any number of them",
-    )
-
-
-_FREQUENCY = option(
-    "--frequency",
-    dest="frequencies",
-    metavar="F",
-    type=positive_finite,
-    nargs="+",
-    help="spatial frequencies, cycles/mm (default: 41 from 0 to the resolution of the sharpest field, at most half of "
-    "the diffraction cutoff)",
-)
-_SECONDS = option("--seconds", metavar="S", type=positive_finite, help="time limit")
-
 # -- the table
+
+_FILE = {"metavar": "FILE", "type": data_file}
 
 #: Subcommands of `raytrace wave`.
 WAVE_COMMANDS = (
@@ -313,37 +277,20 @@ The engine depends on the scene, its sampling on --tol; a sampling that would al
         --element cubic --focus 1000 --pixel 0.00369 --size 128 --exact -o cubic.npz
         --element heights.npy --glass F_SILICA --design-wavelength 0.55 --levels 16 --plot made.png
         --element ideal --depth 500 --engine fresnel --samples 2500 --json""",
-        element,
-        camera,
-        light,
-        pixels,
-        engine,
-        json,
-        partial(
-            output,
-            what="arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, "
-            "engine, error",
-            suffixes=(".npz",),
+        element, camera(), light(), pixels(), engine, json,
+        output(
+            "arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, engine, "
+            "error", (".npz",),
         ),
-        partial(plot, what="the kernels"),
-        group(
-            "more figures",
-            *(
-                option(
-                    f"--{name}",
-                    dest=f"plot_{name}",
-                    metavar="FILE",
-                    type=picture_file,
-                    help=f"save {what} as .png, .pdf or .svg",
-                )
-                for name, what in _WAVE_FIGURES.items()
-            ),
-        ),
+        plot("the kernels"),
+        group("more figures", *(
+            plot(what, flag=f"--{name}", dest=f"plot_{name}") for name, what in _WAVE_FIGURES.items()
+        )),
         run=_wave_psf,
     ),
     _of_module("wave-design", wave_design, _wave_design),
     _of_module("wave-restore", wave_restore, _wave_restore),
-)
+)  # fmt: skip
 
 
 def _subcommands(parser: argparse.ArgumentParser) -> None:
@@ -362,8 +309,7 @@ COMMANDS = (
         double_gauss
         lenses/double_gauss.zmx --object-distance 25000 --f-number 4
         lens.zmx --json | python3 -m json.tool""",
-        lens,
-        conditions,
+        lens, conditions,
     ),
     _command(
         "check",
@@ -373,9 +319,7 @@ COMMANDS = (
         """
         lens.zmx
         lens.zmx --strict --json""",
-        lens,
-        _STRICT,
-        run=_check,
+        lens, run=_check,
     ),
     _command(
         "convert",
@@ -385,19 +329,16 @@ COMMANDS = (
         lenses/double_gauss.zmx double_gauss.csv
         table.txt lens.zmx
         lens.zmx lens.seq""",
-        option("source", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens"),
-        option(
-            "target",
-            metavar="OUT",
-            type=file_of(LENS_SUFFIXES),
-            help="lens file to write: .zmx, .seq, .csv, .tsv, .txt",
-        ),
-        configuration,
-        catalog,
-        substitute,
-        json,
-        option("--strict", action="store_true", help="fail on anything unknown or assumed in IN"),
-        run=_convert,
+        catalog, json, run=_convert,
+        source={
+            "flags": ("source",), "metavar": "IN", "type": file_name,
+            "help": "lens file, or the name of a shipped lens",
+        },
+        target={
+            "flags": ("target",), "metavar": "OUT", "type": file_of(LENS_SUFFIXES),
+            "help": "lens file to write: .zmx, .seq, .csv, .tsv, .txt",
+        },
+        strict="fail on anything unknown or assumed in IN",
     ),
     _command(
         "layout",
@@ -409,15 +350,8 @@ COMMANDS = (
         folded_relay --view 3d --plot relay.png
         spectrometer --wavelength 0.45 0.55 0.65
         scanner.zmx --configuration all --plot scan.png""",
-        partial(lens, all_configurations="in one figure, superimposed"),
-        conditions,
-        fields,
-        option(
-            "--view", default="yz", choices=("yz", "xz", "3d"), help="from the side (default), from above, or in space"
-        ),
-        option("--rays", metavar="N", type=count, default=7, help="rays of each fan (default 7)"),
-        partial(plot, what="the cross section (default LENS_layout.png in this folder)"),
-        run=_layout,
+        partial(lens, all_configurations="in one figure, superimposed"), conditions,
+        plot("the cross section (default LENS_layout.png in this folder)"), run=_layout,
     ),
     _command(
         "spot",
@@ -430,43 +364,11 @@ COMMANDS = (
         lens.zmx --object-distance 25000 --field 0 10 14 --json
         double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
         double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
-        lens,
-        conditions,
-        fields,
-        partial(sampling, rings=12),
-        option(
-            "--rays",
-            metavar="N",
-            type=many,
-            help="instead of --points, any number of sobol or random rays for each field and wavelength, as 1e9: "
-            "traced in chunks, none kept",
-        ),
-        option(
-            "--max-bytes",
-            metavar="BYTES",
-            type=memory,
-            help="memory limit, as 200MB (default with --rays 256MB, else half of the free memory)",
-        ),
-        option(
-            "--reference",
-            choices=("centroid", "chief"),
-            default="centroid",
-            help="radii about the centroid (default), or about the chief ray of the primary wavelength",
-        ),
-        option(
-            "--weights",
-            choices=("area", "equal"),
-            default="area",
-            help="rays are weighted by pupil area (default) or equally; OpticStudio's spots are "
-            "--sampling hexapolar --rings 6 --weights equal --reference chief",
-        ),
-        partial(
-            output,
-            what="table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status",
-            suffixes=(".csv", ""),
-        ),
-        partial(plot, what="the spot diagram"),
-        run=_spot,
+        lens, conditions, plot("the spot diagram"),
+        output("table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status", (".csv", "")),
+        run=_spot, rays={"type": many},
+        max_bytes="memory limit, as 200MB (default with --rays 256MB, else half of the free memory)",
+        **PUPIL,
     ),
     _command(
         "focus",
@@ -476,26 +378,13 @@ COMMANDS = (
         """
         lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
         lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
-        lens,
-        partial(conditions, several="several are focused together"),
-        fields,
+        lens, partial(conditions, several="several are focused together"),
+        plot("the through-focus curve, the spots before and after, and the layout"),
         option(
-            "--criterion",
-            choices=("rms", "paraxial", "mean"),
-            default="rms",
-            help="minimum RMS spot radius (default), paraxial image, or minimum mean distance from the centroid",
-        ),
-        *_SEVERAL_WEIGHTS,
-        partial(sampling, rings=12),
-        partial(plot, what="the through-focus curve, the spots before and after, and the layout"),
-        option(
-            "--by",
-            dest="plot_by",
-            choices=("field", "wavelength"),
+            "--by", dest="plot_by", choices=("field", "wavelength"),
             help="draw only the through-focus curves, one for each field, or for each wavelength of the first field",
         ),
-        partial(output_lens, what="lens file to write with the new sensor distance"),
-        run=_focus,
+        output("lens file to write with the new sensor distance"), run=_focus, **PUPIL,
     ),
     _command(
         "optimize",
@@ -510,29 +399,22 @@ COMMANDS = (
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        lens,
-        ray_aiming,
-        merit,
-        freedom,
-        group(
-            "stopping",
-            option("--cycles", metavar="N", type=count, help="maximum, including those before --resume (default 500)"),
-            _SECONDS,
-            option("--paths", metavar="N", type=count, help="damping strategies to try (default 1)"),
-        ),
-        group(
-            "files",
-            option("--log", metavar="FILE", type=data_file, help="write a line for every cycle (.csv)"),
-            option("--checkpoint", metavar="FILE", type=data_file, help="store the state of the search there (.json)"),
-            option(
-                "--resume",
-                metavar="FILE",
-                type=file_name,
-                help="resume from a checkpoint of the same lens, variables and merit function",
-            ),
-        ),
-        partial(plot, what="the lens, its spots and its merit function, before and after"),
-        partial(output_lens, what="lens file to write"),
+        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        group("stopping", parameters(
+            "optimize", "cycles", "seconds", "paths",
+            cycles={"help": "maximum, including those before --resume (default 500)"},
+            paths={"help": "damping strategies to try"},
+        )),
+        group("files", parameters(
+            "optimize", "log", "checkpoint", "resume",
+            log={**_FILE, "help": "write a line for every cycle (.csv)"},
+            checkpoint={**_FILE, "help": "store the state of the search there (.json)"},
+            resume={
+                "metavar": "FILE", "type": file_name,
+                "help": "resume from a checkpoint of the same lens, variables and merit function",
+            },
+        )),
+        plot("the lens, its spots and its merit function, before and after"), output("lens file to write"),
     ),
     _command(
         "search",
@@ -549,25 +431,18 @@ COMMANDS = (
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
         triplet.zmx --insert 2 4 -o four_elements
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
-        lens,
-        ray_aiming,
-        merit,
-        freedom,
-        group(
-            "extent",
-            option("--starts", metavar="N", type=count, help="initial designs (default 64)"),
-            option(
-                "--insert",
-                metavar="SURFACE",
-                type=count,
-                nargs="*",
-                help="instead of starts: insert a thin meniscus at every surface, or at these",
-            ),
-            _SECONDS,
-            option("--seed", metavar="N", type=seed_number, default=0, help="of starts and hops (default 0)"),
-        ),
-        partial(plot, what="the best lenses side by side"),
-        partial(output_folder, what="folder for lens files and their table; a search stored there resumes"),
+        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        group("extent", parameters(
+            "search", "starts", "insert", "seconds", "seed",
+            starts={"help": "initial designs (default 64)"},
+            insert={
+                "metavar": "SURFACE", "type": count, "nargs": "*", "action": None,
+                "help": "instead of starts: insert a thin meniscus at every surface, or at these",
+            },
+            seed={"help": "of starts and hops"},
+        )),
+        plot("the best lenses side by side"),
+        output_folder("folder for lens files and their table; a search stored there resumes"),
     ),
     _command(
         "evaluate",
@@ -580,11 +455,24 @@ COMMANDS = (
         double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
         tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
         zoom.zmx --configuration 2 --skip-unknown""",
+        lens, conditions, *MERIT, plot("the contributions to the merit, by operand and field"),
+        each="list every row, also the rays of one field",
+    ),
+    _command(
+        "view",
+        "turn the numbers of a lens in a browser",
+        "Serve the viewer of a lens on 127.0.0.1: its prescription as a table with a slider on every number, layout, "
+        "spots, ray fans, MTF and field curves, redrawn while a slider is dragged; undo, optimise, compare, save. The "
+        "address has a random token; nothing is written except by save. Ctrl-C ends it. Needs the extra: pip install "
+        "'raytrace[view]'.",
+        """
+        cooke_triplet
+        lens.zmx --port 8765 --no-browser""",
         lens,
         conditions,
-        merit,
-        option("--each", action="store_true", help="list every row, also the rays of one field"),
-        partial(plot, what="the contributions to the merit, by operand and field"),
+        option("--port", metavar="N", type=count, default=0, help="port of the server (default: a free one)"),
+        option("--no-browser", dest="browser", action="store_false", help="print the address, open no browser"),
+        run=_view,
     ),
     _command(
         "trace",
@@ -598,18 +486,13 @@ COMMANDS = (
         """
         double_gauss --field 0 14 0,-7
         lens.zmx --rays rays.csv -o traced.csv""",
-        lens,
-        option(
-            "--rays",
-            metavar="CSV",
-            type=file_name,
-            help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
-            "by default the chief and marginal rays of every field",
-        ),
-        partial(output, what="table to write (.csv); default: standard output", suffixes=(".csv", ".txt", "")),
-        partial(conditions, several="rays from each"),
-        fields,
-        run=_trace,
+        lens, output("table to write (.csv); default: standard output", (".csv", ".txt", "")),
+        partial(conditions, several="rays from each"), run=_trace,
+        rays={
+            "metavar": "CSV", "type": file_name,
+            "help": "rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; by default the "
+            "chief and marginal rays of every field",
+        },
     ),
     _command(
         "psf",
@@ -623,35 +506,29 @@ COMMANDS = (
         double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
         double_gauss --model drt --rays 256 --json
         double_gauss --model drt --rays 1e8 --max-bytes 200MB -o psf.npz""",
-        lens,
+        lens, partial(conditions, several="one row of kernels each"),
         option(
-            "--model",
-            metavar="MODEL",
-            choices=MODELS,
-            help="paraxial, fourier, gaussian, drt or wave, in order of fidelity; auto (default) takes the first that "
-            "agrees with the next",
+            "--rho", metavar="R", type=positive_finite,
+            help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform "
+            "disc)",
         ),
-        partial(conditions, several="one row of kernels each"),
-        fields,
-        partial(window, normalise="energy"),
-        option(
-            "--center",
-            choices=("axis", "chief", "centroid"),
-            help="centre of the window: the optical axis (default with --field), the chief ray (default of the "
-            "lens's fields) or the centroid of the rays",
+        exclusive(
+            parameters("psf", "tol", tol={"help": "bound on the estimated error (default 0.01)"}),
+            option(
+                "--rays", metavar="N", type=many,
+                help="rays per kernel instead of a tolerance; with --model drt and --max-bytes any number of them",
+            ),
         ),
-        option(
-            "--per-wavelength", action="store_true", help="a kernel for each wavelength instead of their weighted sum"
+        output(
+            "arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], pixel_pitch, "
+            "energy, error, wavelengths, model", (".npz",),
         ),
-        _tolerance_or_rays,
-        partial(
-            output,
-            what="arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], "
-            "pixel_pitch, energy, error, wavelengths, model",
-            suffixes=(".npz",),
-        ),
-        partial(plot, what="the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"),
-        log,
+        plot("the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"), log,
+        pixel="pixel pitch (default 0.005)",
+        size="pixels across the window of the PSF (default 21)",
+        center="centre of the window: the optical axis (default with --field), the chief ray (default of the lens's "
+        "fields) or the centroid of the rays",
+        per_wavelength="a kernel for each wavelength instead of their weighted sum",
     ),
     _command(
         "compare",
@@ -668,21 +545,12 @@ COMMANDS = (
         lens,
         group(
             "conditions other than the file's",
-            partial(object_distance, several="the columns (default 10000 20000 30000 40000 50000)"),
-            aperture,
-            wavelength,
-            ray_aiming,
+            object_distance("the columns (default 10000 20000 30000 40000 50000)"),
+            aperture, row("wavelengths"), row("ray_aiming"),
         ),
-        option(
-            "--start",
-            choices=("paraxial", "rms"),
-            help="sensor position: the paraxial image (default) or the minimum RMS spot radius on the axis",
-        ),
-        option("--focus-distance", metavar="MM", type=positive, help="object in focus (default 25000)"),
-        option("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)"),
-        partial(size, what="the windows (default 21)"),
-        partial(plot, what="the grid of kernels"),
-        log,
+        plot("the grid of kernels"), log,
+        focus_distance="object in focus", pixel="pixel pitch (default 0.005)",
+        size="pixels across the windows (default 21)",
     ),
     _command(
         "glass",
@@ -695,19 +563,12 @@ COMMANDS = (
         SK16 --wavelength 0.53 --json
         N-BK7 --temperature 40 --pressure 0
         MYGLASS --catalog my_glasses.agf""",
-        option("name", metavar="NAME", help="name of a glass, as in a lens file, or a six-digit MIL code"),
-        catalog,
-        json,
-        option(
-            "--wavelength",
-            dest="wavelengths",
-            metavar="UM",
-            type=positive_finite,
-            nargs="+",
-            help="wavelengths in µm (default: F d C)",
-        ),
-        environment,
-        run=_glass,
+        catalog, json, run=_with_catalogs,
+        name={
+            "flags": ("name",), "metavar": "NAME",
+            "help": "name of a glass, as in a lens file, or a six-digit MIL code",
+        },
+        wavelengths="wavelengths in µm (default: F d C)",
     ),
     _command(
         "bench",
@@ -742,7 +603,7 @@ COMMANDS = (
         option("--repeats", metavar="N", type=count, default=5, help="runs, whose median is reported"),
         option("--threads", metavar="N", type=count, help="threads of torch"),
         option("--no-peers", action="store_true", help="leave out Optiland even if it is installed"),
-        partial(output, what="report to write (.md)", suffixes=(".md",)),
+        output("report to write (.md)", (".md",)),
         option("--csv", metavar="FILE", type=output_file, help="psf: table to write, one line for each measurement"),
         option(
             "--docs",
@@ -751,7 +612,7 @@ COMMANDS = (
             help="speed: folder for speed.md, speed.csv and speed.png",
         ),
         option("--quick", action="store_true", help="speed: few rays, as a trial; the ratios are not meaningful"),
-        partial(plot, what="speed over number of rays, or time over error,"),
+        plot("speed over number of rays, or time over error,"),
         run=_bench,
     ),
     _command(
@@ -763,20 +624,7 @@ COMMANDS = (
         double_gauss --object-distance 25000 --plot mtf.png
         tessar --frequency 10 20 40 --geometric --json
         tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
-        _CURVES,
-        option(
-            "--geometric",
-            action=argparse.BooleanOptionalAction,
-            help="geometric MTF, or always the diffraction MTF (default: diffraction, but geometric for fields whose "
-            "blur is so large that diffraction takes long and changes the modulation by less than 0.001)",
-        ),
-        _FREQUENCY,
-        option(
-            "--through-focus",
-            metavar="MM",
-            type=positive_finite,
-            help="move the sensor by ±MM, at the one frequency of --frequency",
-        ),
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "ray-fan",
@@ -785,8 +633,7 @@ COMMANDS = (
         """
         tessar --plot fan.png
         double_gauss --field 0 14 -10,5 --points 21 --json""",
-        partial(analysis, figure="the fans"),
-        _POINTS_OF_FAN,
+        lens, conditions, plot("the fans"),
     ),
     _command(
         "opd-fan",
@@ -796,13 +643,7 @@ COMMANDS = (
         """
         tessar --plot opd.png
         double_gauss --object-distance 25000 --reference own --json""",
-        partial(analysis, figure="the fans"),
-        _POINTS_OF_FAN,
-        partial(
-            reference,
-            what="centre of the reference sphere: the image point of the primary wavelength's chief ray (default), or "
-            "of each wavelength's own",
-        ),
+        lens, conditions, plot("the fans"),
     ),
     _command(
         "wavefront",
@@ -814,10 +655,7 @@ COMMANDS = (
         tessar --plot wavefront.png
         double_gauss --field 0 14 --numbering fringe --terms 16
         double_gauss --field 0 --json""",
-        partial(analysis, figure="the maps"),
-        partial(size, what="a map (default 127)"),
-        option("--numbering", choices=("noll", "fringe"), help="print the coefficients in Noll's or fringe numbering"),
-        option("--terms", metavar="N", type=count, help="number of Zernike terms (default 37)"),
+        lens, conditions, plot("the maps"),
     ),
     _command(
         "distortion",
@@ -826,8 +664,7 @@ COMMANDS = (
         """
         phone --plot distortion.png
         double_gauss --field 5 10 14 --json""",
-        _CURVES,
-        samples,
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "field-curvature",
@@ -836,8 +673,7 @@ COMMANDS = (
         """
         tessar --plot curvature.png
         double_gauss --field 0 10 14 --json""",
-        _CURVES,
-        samples,
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "lateral-colour",
@@ -846,8 +682,7 @@ COMMANDS = (
         """
         tessar --plot lateral.png
         double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
-        _CURVES,
-        samples,
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "relative-illumination",
@@ -856,8 +691,7 @@ COMMANDS = (
         """
         phone --plot illumination.png
         double_gauss --field 0 10 14 --json""",
-        _CURVES,
-        samples,
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "seidel",
@@ -868,12 +702,7 @@ COMMANDS = (
         """
         tessar --plot seidel.png
         double_gauss --kind waves --field 10 14 --json""",
-        partial(analysis, figure="a bar for each surface"),
-        option(
-            "--kind",
-            choices=("coefficients", "waves", "transverse", "longitudinal"),
-            help="S1 to C2 in mm (default), wavefront coefficients in waves, or ray aberrations in mm",
-        ),
+        lens, conditions, plot("a bar for each surface"),
     ),
     _command(
         "longitudinal-aberration",
@@ -882,10 +711,7 @@ COMMANDS = (
         """
         tessar --plot longitudinal.png
         cooke_triplet --wavelength 0.55 --json""",
-        lens,
-        conditions,
-        partial(plot, what="the curves"),
-        partial(points, what="rays from the axis to the rim of the pupil (default 41)"),
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "chromatic-focal-shift",
@@ -894,10 +720,7 @@ COMMANDS = (
         """
         cemented_achromat --plot shift.png
         singlet --wavelength 0.45 0.65 --json""",
-        lens,
-        conditions,
-        partial(plot, what="the curve"),
-        option("--samples", metavar="N", type=count, default=101, help="wavelengths of the curve (default 101)"),
+        lens, conditions, plot("the curve"), samples="wavelengths of the curve",
     ),
     _command(
         "distortion-grid",
@@ -906,18 +729,12 @@ COMMANDS = (
         """
         phone --plot grid.png --exaggerate 10
         retrofocus --points 5 --json""",
-        lens,
-        conditions,
-        partial(plot, what="the ideal and the real grid"),
-        partial(points, what="points across the grid (default 11)"),
+        lens, conditions, plot("the ideal and the real grid"),
         option(
-            "--exaggerate",
-            dest="plot_exaggerate",
-            metavar="N",
-            type=positive_finite,
-            default=1.0,
+            "--exaggerate", dest="plot_exaggerate", metavar="N", type=positive_finite, default=1.0,
             help="draw the distortion N times as large",
         ),
+        points="points across the grid",
     ),
     _command(
         "incidence",
@@ -926,9 +743,7 @@ COMMANDS = (
         """
         phone --plot incidence.png
         double_gauss --field 0 14 --surfaces --json""",
-        _CURVES,
-        samples,
-        option("--surfaces", action="store_true", help="list every surface, not only the sensor"),
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "rms-over-field",
@@ -938,14 +753,7 @@ COMMANDS = (
         """
         tessar --plot rms.png
         double_gauss --spot --field 0 10 14 --json""",
-        _CURVES,
-        samples,
-        option("--spot", action="store_true", help="RMS spot radius about the centroid instead"),
-        partial(
-            reference,
-            what="centres of the reference spheres of the wavelengths together: the primary wavelength's chief ray "
-            "(default: lateral colour counts), or each one's own",
-        ),
+        lens, conditions, plot("the curves"),
     ),
     _command(
         "encircled-energy",
@@ -954,16 +762,7 @@ COMMANDS = (
         """
         tessar --plot encircled.png
         double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
-        _CURVES,
-        geometric,
-        option(
-            "--radius",
-            dest="radii",
-            metavar="MM",
-            type=positive_finite,
-            nargs="+",
-            help="radii about the centroid, mm (default: from 0 to almost all of the light)",
-        ),
+        lens, conditions, plot("the curves"),
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
@@ -979,4 +778,4 @@ COMMANDS = (
   raytrace wave restore scene.png --element run/heights.npy --simulate 500 -o simulated""",
         (_subcommands,),
     ),
-)
+)  # fmt: skip

@@ -57,6 +57,11 @@ def heartbeat(what: str) -> Iterator[None]:
         _open[:] = before  # also those that a failure left open
 
 
+def silence() -> None:
+    """The command computes only when it is asked: `heartbeat` writes no lines."""
+    _open.clear()
+
+
 class Bar(tqdm):
     """A bar, while which no lines are written."""
 

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 import raytrace
-from raytrace.cli.options import InputFile, OutputFile, OutputFolder
 from raytrace.cli.progress import progress
+from raytrace.cli.types import InputFile, OutputFile, OutputFolder
 from raytrace.files import check_output, check_output_folder, shipped
 from raytrace.io import FORMATS, LensFileError, read_lens, shipped_lens
 from raytrace.materials.catalogs import shipped_file

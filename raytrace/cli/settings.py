@@ -7,9 +7,8 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 
-from raytrace.cli.options import count, file_name, folder_name, positive_finite, seed_number
-
-_READERS = {int: {"type": count, "metavar": "N"}, float: {"type": positive_finite}}
+from raytrace.cli.parameters import Parameter, add_parameter
+from raytrace.cli.types import count, file_name, folder_name, seed_number
 
 
 def option(help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, **spelling) -> dict:
@@ -22,21 +21,13 @@ SEED = option("of random numbers", type=seed_number)
 
 
 def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: str) -> None:
-    """Add the options of these fields, of all rows if none are given. The parser stores None for a missing option.
-
-    defaults: of the fields; a help text that does not mention the default is completed by it.
-    """
+    """Add the options of these fields, of all rows if none are given. The parser stores None for a missing option."""
     for name in names or rows:
         row, default = dict(rows[name]), defaults[name]
-        is_tuple = isinstance(default, tuple)
-        kind = type(default[0] if is_tuple else default)
-        reader = {} if "choices" in row and not is_tuple else _READERS.get(kind, {})
-        usual = f"{default:g}" if isinstance(default, float) else default
-        if usual not in (None, "") and "default" not in row["help"]:
-            row["help"] += f" (default {usual})"
-        spelled, _ = _spelled(name, row), row.pop("unit")
-        del row["name"]
-        group.add_argument(f"--{spelled}", dest=name, **reader | ({"nargs": "+"} if is_tuple else {}) | row)
+        flags = (f"--{_spelled(name, row)}",)
+        del row["name"], row["unit"]
+        kind = "Sequence[float]" if isinstance(default, tuple) else type(default).__name__
+        add_parameter(group, name, Parameter(kind, default), {"flags": flags, **row}, keep_default=False)
 
 
 def words(settings, rows: Mapping[str, Mapping]) -> list[str]:

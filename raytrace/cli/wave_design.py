@@ -2,8 +2,10 @@
 
 import argparse
 
-from raytrace.cli.options import json, output_folder, plot, positive, positive_finite
+from raytrace.cli.options import group, json, output_folder, plot
+from raytrace.cli.options import option as option_of
 from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
+from raytrace.cli.types import positive, positive_finite
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.settings import DesignSettings
 
@@ -29,6 +31,7 @@ EXAMPLES = """examples:
 NANOMETRE = 1e-6  # mm
 PICTURES = "folder of pictures of 256 × 256 pixels or more; four fifths make the filters, the others are restored"
 LIMIT = 80  # of them
+NOISE = "standard deviation, for images from 0 to 1"
 _DEPTHS = (500.0, 2000 / 3, 1000.0, 2000.0, float("inf"))
 
 
@@ -67,24 +70,23 @@ ROWS = {
 def options(parser: argparse.ArgumentParser) -> None:
     defaults = defaults_of(DesignSettings)
     add_options(parser, defaults, ROWS, "kind", "glass", "terms", "levels", "tolerance")
-    camera(parser)
-    light(parser, depths=_DEPTHS)
-    pixels(parser, across=255)
-    group = parser.add_argument_group("element and noise")
-    feature(group, "0.002 for rings")
-    group.add_argument(
-        "--focus",
-        metavar="MM",
-        type=positive,
-        default=1000.0,
-        help="object distance whose PSF the Wiener filter is made for (default 1000)",
-    )
-    group.add_argument(
-        "--noise", metavar="S", type=positive_finite, help="standard deviation, for images from 0 to 1 (default 0.01)"
-    )
+    for add in (camera(), light(depths=_DEPTHS), pixels(size=255)):
+        add(parser)
+    group(
+        "element and noise",
+        feature("0.002 for rings"),
+        option_of(
+            "--focus",
+            metavar="MM",
+            type=positive,
+            default=1000.0,
+            help="object distance whose PSF the Wiener filter is made for (default 1000)",
+        ),
+        option_of("--noise", metavar="S", type=positive_finite, help=f"{NOISE} (default 0.01)"),
+    )(parser)
     learning = ("loss", "restoration", "optimizer", "schedule", "rate", "steps", "starts")
     add_options(parser.add_argument_group("optimisation"), defaults, ROWS, *learning)
     add_options(picture_options(parser, PICTURES, limit=LIMIT), defaults, ROWS, "seed")
-    output_folder(parser, "folder of the run", required=True)
-    json(parser)
-    plot(parser, "height map, PSFs over depth and wavelength, PSNR over depth")
+    figure = plot("height map, PSFs over depth and wavelength, PSNR over depth")
+    for add in (output_folder("folder of the run", required=True), json, figure):
+        add(parser)

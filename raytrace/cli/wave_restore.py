@@ -2,7 +2,9 @@
 
 import argparse
 
-from raytrace.cli.options import file_name, json, output_folder, positive, positive_finite, seed_number
+from raytrace.cli.options import group, json, option, output_folder, row
+from raytrace.cli.types import file_name, positive, positive_finite
+from raytrace.cli.wave_design import NOISE
 from raytrace.cli.wave_options import camera, element, light, pixels
 
 SUMMARY = "restore images of a camera with a phase element"
@@ -21,19 +23,21 @@ EXAMPLES = """examples:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("images", metavar="IMAGE", type=file_name, nargs="+", help="captured images, or scenes")
-    element(parser)
-    camera(parser)
-    light(parser, depths=(500.0, 2000 / 3, 1000.0, 2000.0, float("inf")))
-    pixels(parser, across=255)
-    group = parser.add_argument_group("restoration")
-    group.add_argument(
-        "--noise", metavar="S", type=positive_finite, default=0.01, help="standard deviation, for images from 0 to 1 "
-        "(default 0.01)"
-    )  # fmt: skip
-    group.add_argument(
-        "--simulate", metavar="MM", type=positive, help="object distance of the scenes in IMAGE; inf allowed"
-    )
-    group.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of the simulated noise (default 0)")
-    output_folder(parser, "folder of the restored images, as .png", required=True)
-    json(parser)
+    for add in (
+        option("images", metavar="IMAGE", type=file_name, nargs="+", help="captured images, or scenes"),
+        element,
+        camera(),
+        light(depths=(500.0, 2000 / 3, 1000.0, 2000.0, float("inf"))),
+        pixels(size=255),
+        group(
+            "restoration",
+            option("--noise", metavar="S", type=positive_finite, default=0.01, help=f"{NOISE} (default 0.01)"),
+            option(
+                "--simulate", metavar="MM", type=positive, help="object distance of the scenes in IMAGE; inf allowed"
+            ),
+            row("seed", default=0, help="of the simulated noise"),
+        ),
+        output_folder("folder of the restored images, as .png", required=True),
+        json,
+    ):
+        add(parser)

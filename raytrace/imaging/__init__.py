@@ -13,10 +13,12 @@
 | codesign        | lens and network trained together                                                       |
 | wave_camera     | camera with a phase element: kernels, errors, image quality; octant: of round elements  |
 | wave_design     | design of the phase element                                                             |
-| descent         | L-BFGS-B with exact gradients                                                           |
 
-The only `nn.Module`s are here. Tests: tests/test_MODULE.py, test_imaging_variables (thickness limits), test_restoration
-(restoration), test_wave_* (phase elements).
+The only `nn.Module`s are here. To add a restoration network: a module from images to images of the same size, passed
+as `rt.Camera(variables, network)`. To add a filter: a function of transfer functions in `restoration`.
+
+Tests: tests/test_MODULE.py; test_imaging_variables (thickness limits), test_wave_camera, test_wave_camera_noise,
+test_wave_design_cli (phase elements).
 """
 
 from raytrace.imaging.camera import Camera as Camera

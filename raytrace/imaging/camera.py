@@ -24,8 +24,9 @@ from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.variables import Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import Grid, grid
-from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, gaussian, model_of, psf
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, model_of, psf
+from raytrace.psf_models.gaussian import gaussian_pixels
+from raytrace.psf_models.result import moments_of_rays
 from raytrace.system.lens import Lens, field_points
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
@@ -137,14 +138,14 @@ class Camera(nn.Module):
             kernels = drt.kernels_of_points(light, window, points, weights, width=_RAY_WIDTH).kernel
         else:
             traced = trace_scene(light, points)
-            valid = traced.valid.expand(*light.shape, len(weights))
-            rays = gaussian.Light(traced.position[:2].expand(2, *valid.shape), valid, weights, len(weights))
-            centroid, covariance, arrived = gaussian.spot_moments(rays, "none")
+            arrives = torch.where(traced.valid, weights, 0.0).expand(*light.shape, -1)
+            centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
             mirrored = points * points.new_tensor([[-1.0], [1.0]])
             distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
             if symmetry(light) != "none" and bool((distance < 1e-12).all()):
                 covariance = covariance[[0, 2]]  # xy is 0 but for rounding, and costs a quadrature over every pixel
-            kernels = (arrived * beam_share(light))[..., None, None] * gaussian_pixels(window, centroid, covariance)
+            energy = arrives.sum(-1) * beam_share(light)
+            kernels = energy[..., None, None] * gaussian_pixels(window, centroid, covariance)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel

@@ -40,7 +40,7 @@ from raytrace.optimization.variables import (
     varied,
     with_modelled,
 )
-from raytrace.system.identity import digest, identity, other_lens
+from raytrace.system.identity import alike, digest, identity, other_lens
 from raytrace.system.lens import Lens, media
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
@@ -334,10 +334,10 @@ class Variables(Owned):
                 return words
             if set(before["variables"]) != set(now["variables"]):
                 return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
-            if not _alike(before["hold"], now["hold"]):
+            if not alike(before["hold"], now["hold"]):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
             for name, pair in before["variables"].items():
-                if not _alike(pair, now["variables"][name]):
+                if not alike(pair, now["variables"][name]):
                     return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
                         name, *pair, *now["variables"][name]
                     )
@@ -394,15 +394,6 @@ def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:
     surfaces = list(lens.surfaces)
     surfaces[variable.surface] = with_number(surfaces[variable.surface], variable.path, value)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
-
-
-def _alike(one: object, other: object) -> bool:
-    """Whether plain values are equal, numbers to the precision of float32."""
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_alike, one, other))
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=1e-6)
-    return one == other
 
 
 def _named(lens: Lens, vary: str) -> tuple[tuple[Vary, ...], tuple[str, ...]]:
@@ -505,11 +496,9 @@ class PhaseVariables(Owned):
         """The difference of a stored identity from this one, "" where there is none."""
         for name, value in self.identity().items():
             stored = before.get(name)
-            numbers = isinstance(stored, float) and isinstance(value, float)
-            if not (math.isclose(stored, value, rel_tol=1e-6) if numbers else stored == value):
+            if not alike(stored, value):
                 is_digest = name in ("start", "basis", "material", "others")
-                words = f"other {name}" if is_digest else f"{name} {stored}, not {value}"
-                return f"an element of {words}"
+                return "an element of " + (f"other {name}" if is_digest else f"{name} {stored}, not {value}")
         return ""
 
     def numbers(self) -> Tensor:

@@ -106,9 +106,7 @@ def start(
     glass = find_glass(settings.glass)
     goal = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
     path = converging(goal) / (index(glass, goal.wavelength) - 1)
-    if (
-        settings.kind == "zernike"
-    ):  # Noll's polynomials from piston to the last of `terms`, in contact with a fixed lens
+    if settings.kind == "zernike":  # Noll's polynomials up to `terms`, in contact with a fixed lens
         lens = Element(EvenPowers(path), goal.radius, glass)
         random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
         profile = Zernike(lens.radius.new_zeros(settings.terms))

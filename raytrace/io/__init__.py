@@ -1,12 +1,21 @@
 """Lens files: the suffix of a file selects its format; reading gives a Lens, writing brings every number back exactly.
 
-    io/source.py        text, numbers, records, errors with file, line and surface; the report of every keyword
-    io/assembly.py      glasses by name; a neutral draft of a lens, checked once for all readers
-    io/zemax, codev, oslo, ray_optics, table        a format each: keyword tables, reader, writer
-    io/frames.py, ray_tables.py, pictures.py        pandas tables, tables of rays, images
+source            text, numbers, records, errors with file, line and surface; the report of every keyword
+assembly          glasses by name; a neutral draft of a lens, checked once for all readers
+zemax/            .zmx and .zar of OpticStudio
+codev/            .seq of CODE V
+oslo              .len of OSLO, read
+ray_optics        .roa of ray-optics, read
+table/            prescription tables; `frames`: those of pandas
+ray_tables        rays of a CSV file
+pictures          image files
 
-A new format is a row of FORMATS and a module with a reader: text -> records with places -> LensDraft -> `assemble`.
-Tests: tests/test_formats.py for all formats, and a file for each format.
+To add a format: a row of `FORMATS` and a module with a reader: text -> records with places -> LensDraft -> `assemble`.
+To add a keyword or a surface type: a row of its format's tables, as the docstring of its folder says.
+
+Tests: `tests/test_formats.py` for all formats; `tests/test_zemax*.py`, `tests/test_codev.py`, `tests/test_oslo.py`,
+`tests/test_ray_optics.py`, `tests/test_table*.py`; `tests/test_input_limits.py` (rays), `tests/test_pictures.py`; real
+files in `tests/test_corpus*.py`.
 """
 
 import dataclasses

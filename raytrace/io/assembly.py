@@ -34,7 +34,7 @@ from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
-from raytrace.system.poses import Pose
+from raytrace.system.poses import Pose, undone
 from raytrace.system.surface import SHAPE, Surface
 
 #: More characters than the name of any glass has.
@@ -260,6 +260,21 @@ def pose_of(numbers: Mapping[str, float], *, tilts_first: bool = False) -> Pose 
     """The pose of decentres x, … in mm and tilts tilt_x, … in degrees; numbers that are 0 are not modelled."""
     modelled = {name: double(number) for name, number in numbers.items() if number}
     return Pose(**modelled, tilts_first=tilts_first) if modelled else None
+
+
+#: Axes behind a surface with decentres and tilts: its own; those before it; turned back without a pose of the surface
+#: itself; tilted again by the same angle, as the axis of light behind a mirror.
+ONWARD, RETURNED, REVERSED, BENT = "onward", "returned", "reversed", "bent"
+
+
+def poses_of(numbers: Mapping[str, float], axes: str, *, tilts_first: bool = False) -> tuple[Pose | None, Pose | None]:
+    """The pose before a surface and that behind it, of the numbers of `pose_of`, by the axes behind it."""
+    pose = pose_of(numbers, tilts_first=tilts_first)
+    if pose is None or axes == ONWARD:
+        return pose, None
+    if axes == BENT:
+        return pose, pose_of({name: number for name, number in numbers.items() if name.startswith("tilt")})
+    return None if axes == REVERSED else pose, undone(pose)
 
 
 def environment_at(numbers: Sequence[float], place: Place) -> Environment:

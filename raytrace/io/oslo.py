@@ -31,7 +31,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.io.assembly import LensDraft, assemble, listed_glass, pose_of
+from raytrace.io.assembly import BENT, ONWARD, RETURNED, LensDraft, assemble, listed_glass, poses_of
 from raytrace.io.source import (
     IGNORED,
     READ,
@@ -56,7 +56,7 @@ from raytrace.io.source import (
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
-from raytrace.system.poses import Pose, undone
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface, is_posed, medium_surfaces, power, signed, ynu
 
 # -- the commands -----------------------------------------------------------------------------------------------------
@@ -125,11 +125,6 @@ class _Commands(Block):
     def __init__(self, place: Place):
         super().__init__(place)
         self.wavelengths: tuple[float, ...] = ()
-
-    def number(self, word: str, quantity: str) -> float:
-        """The number of a command, 0 where there is none."""
-        record = self.last(word)
-        return record.number(0, quantity) if record else 0.0
 
 
 class _Sections(NamedTuple):
@@ -277,10 +272,9 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     """
     parts = _sections(text, file, report)
     _refuse_incomplete(parts)
-    record = parts.system.last("UNI")
-    unit = record.number(0, "mm in a lens unit") if record else 1.0
+    unit = parts.system.number("UNI", "mm in a lens unit", 1.0)
     if not _SMALLEST_UNIT <= unit <= _LARGEST_UNIT:
-        raise LensFileError(f"UNI is {shown(record.words[0])}, expected the millimetres in a lens unit", record.place)
+        raise LensFileError(f"UNI is {unit:g}, expected the millimetres in a lens unit", parts.system.last("UNI").place)
     surfaces: list[Surface] = []
     for commands in parts.surfaces:
         surfaces.append(_surface(commands, surfaces, parts.surfaces, unit, catalogs, report))
@@ -359,12 +353,7 @@ def _weights(parts: _Sections, count: int) -> list[float]:
 
 def _system_aperture(parts: _Sections, far: bool, unit: float, report: Draft) -> tuple[str, float, tuple[str, Place]]:
     """Kind and size of the system aperture, and its source; far: whether the object is at infinity."""
-    records = parts.system.all(*_APERTURES)
-    if not records:
-        raise LensFileError(f"no system aperture; expected one of {', '.join(_APERTURES)}", parts.head.place)
-    record = records[-1]
-    if len(records) > 1:
-        report.warn(f"several system apertures ({in_lines(records)}); the last is used", record.place)
+    record = parts.system.last_of_kind(_APERTURES, "system aperture", report)
     size = record.number(0, "size of the aperture")
     kind, is_of_far = _APERTURES[record.keyword]
     if is_of_far != far:
@@ -396,7 +385,7 @@ def _fields(parts: _Sections, far: bool, unit: float, report: Draft) -> tuple[st
             raise LensFileError(f"ANG is {shown(record.words[0])}, expected less than 90 degrees", record.place)
         tangent = math.tan(math.radians(most))
     else:
-        tangent = -most / parts.surfaces[0].last("TH").number(0, "thickness")
+        tangent = -most / parts.surfaces[0].number("TH", "thickness")
     angles = [math.degrees(math.atan(fraction * tangent)) for fraction in _FRACTIONS]
     angles[-1] = most if record.keyword == "ANG" else angles[-1]
     return "angle", angles if tangent else [0.0]
@@ -591,20 +580,19 @@ def _poses(commands: _Commands, unit: float) -> dict[str, Pose]:
         word = next(iter(moved))
         message = f"{word} (a tilted or decentred object) is not modelled"
         raise UnsupportedSurface(message, commands.last(word).place)
-    record = commands.last("DT")
-    order = record.integer(0, "order of tilts and decentres") if record else 1
+    order = commands.integer("DT", "order of tilts and decentres", 1)
     if order not in (1, -1):
-        raise LensFileError(f"DT is {record.words[0]}, expected 1 (decentre, then tilt) or -1", record.place)
+        message = f"DT is {order}, expected 1 (decentre, then tilt) or -1"
+        raise LensFileError(message, commands.last("DT").place)
     signs = {word: sign * (unit if word[0] == "D" else 1.0) for word, (_, sign) in _POSES.items()}
     numbers = {_POSES[word][0]: signs[word] * value for word, value in moved.items()}
-    before = pose_of(numbers, tilts_first=order == -1)
     if bend:
         mirror = commands.last("RFL", "RFH")
         if back or mirror is None or len(moved) != 1 or next(iter(moved)) not in ("TLA", "TLB"):
             message = "BEN is modelled on a mirror that is tilted by TLA or by TLB alone, and without RCO"
             raise UnsupportedSurface(message, bend.place)
-        return {"before": before, "after": Pose(tilt_x=before.tilt_x, tilt_y=before.tilt_y)}
-    return {"before": before, "after": undone(before)} if back else {"before": before}
+    axes = BENT if bend else RETURNED if back else ONWARD
+    return dict(zip(("before", "after"), poses_of(numbers, axes, tilts_first=order == -1), strict=True))
 
 
 #: Pickups: the sign of the number, and the commands of the same quantity.

@@ -26,7 +26,17 @@ from typing import NamedTuple
 
 import torch
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_aperture, listed_glass, pose_of
+from raytrace.io.assembly import (
+    BENT,
+    MOST_POINTS,
+    ONWARD,
+    RETURNED,
+    LensDraft,
+    assemble,
+    clear_aperture,
+    listed_glass,
+    poses_of,
+)
 from raytrace.io.source import (
     IGNORED,
     MAX_SURFACES,
@@ -43,7 +53,7 @@ from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, r
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
 from raytrace.system.phases import RadialPhase
-from raytrace.system.poses import Pose, undone
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
 
 # -- objects of the file ----------------------------------------------------------------------------------------------
@@ -253,13 +263,11 @@ def _poses(decentre: Part, unit: float) -> tuple[Pose | None, Pose | None]:
     numbers = dict(zip(("x", "y", "z"), (unit * value for value in dec), strict=True))
     numbers |= {"tilt_x": -euler[0], "tilt_y": -euler[1], "tilt_z": euler[2]}
     modelled = {name: number for name, number in numbers.items() if number}
-    pose, tilts = pose_of(modelled), {name: number for name, number in modelled.items() if name.startswith("tilt")}
-    if pose is None or kind == "decenter":
-        return pose, None
-    if kind == "dec and return" and (not tilts or len(tilts) == len(modelled)):
-        return pose, undone(pose)
-    if kind == "bend" and len(tilts) <= 1:
-        return pose, pose_of(tilts)
+    tilts = sum(name.startswith("tilt") for name in modelled)
+    axes = {"decenter": ONWARD, "dec and return": RETURNED, "bend": BENT}.get(kind)
+    is_known = {ONWARD: True, RETURNED: tilts in (0, len(modelled)), BENT: tilts <= 1}
+    if not modelled or is_known.get(axes):
+        return poses_of(modelled, axes or ONWARD)
     message = f"{shown(kind)} of {', '.join(modelled)} is not modelled; modelled are decenter, "
     raise decentre.unsupported(f"{message}dec and return of a decentre or of tilts, and bend about one axis")
 

@@ -185,6 +185,17 @@ def double(numbers: float | list) -> Tensor:
     return torch.as_tensor(numbers, dtype=torch.float64)
 
 
+def unit_of(
+    word: str, units: Mapping[str, float], quantity: str, expected: str, place: Place, report: "Draft"
+) -> float:
+    """Millimetres in a unit of length by its name, with a note of the conversion. Raises LensFileError."""
+    if word not in units:
+        raise LensFileError(f"{quantity} is {shown(word)}, expected {expected}", place)
+    if units[word] != 1:
+        report.note(f"lengths of the file are in {word}; converted to mm")
+    return units[word]
+
+
 def nonzero(number: float | None) -> Tensor | None:
     """A number of a shape; None where it is 0 and the surface has none of it."""
     return double(number) if number else None
@@ -328,10 +339,26 @@ class Block:
 
     def last(self, *keywords: str) -> Record | None:
         """The last record of the first of these keywords that is present."""
-        for keyword in keywords:
-            if keyword in self.records:
-                return self.records[keyword][-1]
-        return None
+        return next((self.records[keyword][-1] for keyword in keywords if keyword in self.records), None)
+
+    def number(self, keyword: str, quantity: str, default: float = 0.0) -> float:
+        """The first number of the last record of a keyword; `default` where the keyword is absent."""
+        record = self.last(keyword)
+        return record.number(0, quantity) if record else default
+
+    def integer(self, keyword: str, quantity: str, default: int, position: int = 0) -> int:
+        """The whole number at a position of the last record of a keyword; `default` where it is absent."""
+        record = self.last(keyword)
+        return record.integer(position, quantity, default) if record else default
+
+    def last_of_kind(self, keywords: Iterable[str], kind: str, report: "Draft") -> Record:
+        """The last record of keywords that exclude one another. Raises LensFileError where there is none."""
+        records = self.all(*keywords)
+        if not records:
+            raise LensFileError(f"no {kind}; expected one of {', '.join(keywords)}", self.place)
+        if len({record.keyword for record in records}) > 1:
+            report.warn(f"several {kind}s ({in_lines(records)}); the last is used", records[-1].place)
+        return records[-1]
 
 
 def by_word(rows: dict[str, str]) -> dict[str, str]:

@@ -17,6 +17,8 @@ from raytrace.words import calling_level
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
 _NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
+#: An unknown thermal coefficient is 0 in AGF, and its temperature 20 °C; any other unknown figure is -1.
+_UNKNOWN = {"TD": (*"000000", "20", "0")}
 _KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _LARGEST_FILE = 16 * 2**20
@@ -28,7 +30,7 @@ _NAMES = re.compile(r"^[ \t]*NM[ \t]+(\S+)", re.MULTILINE)
 
 
 class CatalogError(ValueError):
-    """A glass catalog cannot be read: says file and line, what was found, what was expected and the likely fix."""
+    """A malformed glass catalog; the message has file and line, the text found, the text expected and a likely fix."""
 
 
 class CatalogWarning(UserWarning):
@@ -73,11 +75,11 @@ def read_text(path: str | Path) -> str:
 
 def decode(content: bytes, path: str | Path) -> str:
     """The text of a catalog's bytes; `path` is its place in messages. Raises CatalogError."""
-    path, found = Path(path), encoding(content)
+    path, codec = Path(path), encoding(content)
     try:
-        text = content.decode(found).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
+        text = content.decode(codec).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
     except UnicodeDecodeError as error:
-        raise CatalogError(f"{path}: damaged {found.upper()} text at byte {error.start}; cut off?") from error
+        raise CatalogError(f"{path}: damaged {codec.upper()} text at byte {error.start}; cut off?") from error
     binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
     if binary:
         line = text.count("\n", 0, binary.start()) + 1
@@ -90,7 +92,7 @@ class _Listing(Mapping):
 
     def __init__(self, text: str, catalog: str, path: Path):
         self._text, self._catalog, self._path = text, catalog, path
-        starts = [(found[1], found.start()) for found in _NAMES.finditer(text)]
+        starts = [(match[1], match.start()) for match in _NAMES.finditer(text)]
         ends = [start for _, start in starts[1:]] + [len(text)]
         self._places: dict[str, tuple[int, int]] = {}
         for (name, start), end in zip(starts, ends, strict=True):
@@ -168,7 +170,7 @@ def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tup
     """(line, keyword, rest) of every record, its lines counted from `first`.
 
     A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
-    status; what is neither is noted in `unknown` as word -> line.
+    status; the first words of other lines are noted in `unknown`, with their lines.
     """
     line_of_record, keyword, parts = 0, "", []
     for line, content in enumerate(re.split(r"\r\n|\r|\n", text), first):
@@ -205,7 +207,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     if len(words) < 5:
         raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
     name = words[0]
-    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
+    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=("-1",))
     formula = BY_NUMBER.get(number)
     if formula is None:
         raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
@@ -214,15 +216,20 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     if len(coefficients) < count:
         found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
         raise _fault(path, line, found, expected, "is the line cut off?")
+    line_of_range, text = _only(block, "LD", name, path)
+    span = _numbers(text.split(), path, line_of_range)[:2]
+    if span != (0.0, 0.0) and (len(span) < 2 or not 0 < span[0] < span[1]):
+        expected = "the shortest and the longest wavelength in µm"
+        raise _fault(path, line_of_range, f"LD {text[:40]} for {name}", expected)
     comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
     listing = re.search(r"\balternatives: *([^;\n]+)", comment)
-    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
+    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # in catalogs, an unknown nd
     return Glass(
         name=name,
         formula=formula,
         coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
-        wavelength_range=_wavelength_range(block, name, path),
+        wavelength_range=None if span == (0.0, 0.0) else span,
         status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
@@ -230,21 +237,11 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         listed_name=name,
         comment=comment,
         records=tuple(
-            (keyword, _numbers(_told(keyword, text.split()), path, line, blanks=True))
+            (keyword, _numbers(text.split(), path, line, blanks=_UNKNOWN.get(keyword, ("-1",))))
             for line, keyword, text in block
             if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
     )
-
-
-def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
-    line, text = _only(block, "LD", name, path)
-    numbers = _numbers(text.split(), path, line)[:2]
-    if numbers == (0.0, 0.0):
-        return None
-    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
-        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
-    return numbers
 
 
 def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
@@ -252,28 +249,21 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
 
     A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
     """
-    found = [(line, text) for line, key, text in block if key == keyword]
-    if not found:
+    records = [(line, text) for line, key, text in block if key == keyword]
+    if not records:
         raise _fault(path, block[-1][0], f"{name} without a {keyword} record", "one", "is the file cut off?")
-    if len(found) > 1:
+    if len(records) > 1:
         fix = "is the NM line of the next glass missing or misspelt?"
-        raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
-    return found[0]
+        raise _fault(path, records[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
+    return records[0]
 
 
-def _told(keyword: str, words: list[str]) -> list[str]:
-    """The words of a record; a thermal coefficient that is not known is 0, as AGF has it, and its temperature 20 °C."""
-    if keyword != "TD":
-        return words
-    return [("20" if k == 6 else "0") if word in ("-", "_") else word for k, word in enumerate(words)]
-
-
-def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
-    """Numbers of a record; where `blanks`, "-" and "_" stand for a figure that is not known, which AGF writes as -1."""
+def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: Sequence[str] = ()) -> tuple[float, ...]:
+    """Numbers of a record; blanks: the figures in place of "-" and "_", the last for all further words."""
     numbers = []
-    for word in words:
+    for k, word in enumerate(words):
         if blanks and word in ("-", "_"):
-            word = "-1"
+            word = blanks[min(k, len(blanks) - 1)]
         try:
             number = float(word if "D" not in word else word.replace("D", "E"))  # Fortran writes 1.0D-03
         except ValueError:

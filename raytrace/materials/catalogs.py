@@ -17,7 +17,7 @@ import difflib
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -95,8 +95,8 @@ def find_glass(
     surface 2". Raises UnknownGlass, and CatalogError for a bad user catalog; warns AmbiguousGlass.
     """
     wanted = name.strip()
-    own = [load(path) for path in user_catalogs(user)]
-    for catalog in own:
+    of_user = [load(path) for path in user_catalogs(user)]
+    for catalog in of_user:
         glass = catalog.find(wanted)
         if glass:
             return replace(glass, name=name)
@@ -111,8 +111,8 @@ def find_glass(
     alias = aliases().get(wanted.upper())
     if alias:
         return replace(_shipped_glass(alias.glass, alias.catalog), name=name)
-    own += [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
-    raise UnknownGlass(name, where, _nearest(wanted, own), [*(catalog.name for catalog in own), *SHIPPED])
+    supplied = of_user + [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
+    raise UnknownGlass(name, where, _nearest(wanted, supplied), [*(catalog.name for catalog in supplied), *SHIPPED])
 
 
 def edition(glass: Glass) -> tuple[str, ...]:
@@ -125,8 +125,8 @@ def edition(glass: Glass) -> tuple[str, ...]:
     parts = [part.strip() for part in glass.comment.split(";")]
     sources = [part for part in parts if "sources agree" in part or "deviate by" in part]
     if not sources:
-        own = f": {glass.comment}" if glass.comment else " does not state its edition"
-        return (glass.catalog + own,)
+        edition = f": {glass.comment}" if glass.comment else " does not state its edition"
+        return (glass.catalog + edition,)
     newer = OLDER_EDITIONS.get((glass.catalog, glass.listed_name or glass.name))
     older = [f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}"] if newer else []
     return ("date not stated; " + "; ".join(sources), *older)
@@ -134,8 +134,8 @@ def edition(glass: Glass) -> tuple[str, ...]:
 
 def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()) -> tuple[str, ...]:
     """The catalog names of a lens file that are neither shipped nor the file name of a user catalog."""
-    own = {path.stem.upper() for path in user_catalogs(user)}
-    return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in own)
+    of_user = {path.stem.upper() for path in user_catalogs(user)}
+    return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in of_user)
 
 
 def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:
@@ -145,9 +145,7 @@ def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5)
 
 def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[str, str], ...]:
     spellings: dict[str, list[tuple[str, str]]] = {}
-    listed = [(glass, catalog.name) for catalog in own for glass in catalog.glasses]
-    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
-    for glass, catalog in listed + shipped:
+    for glass, catalog in _listed_names(own):
         spellings.setdefault(_bare(glass), []).append((glass, catalog))
     near = difflib.get_close_matches(_bare(name), spellings, n=count, cutoff=0.6)
     return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
@@ -160,11 +158,14 @@ def plain_names(
 
     came: catalogs that came with a lens; user: further AGF files.
     """
-    bare = _bare(name)
-    own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
-    own += [(glass, catalog.name) for catalog in came for glass in catalog.glasses]
-    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
-    return tuple((glass, catalog) for glass, catalog in own + shipped if _bare(glass) == bare)
+    listed = _listed_names([*(load(path) for path in user_catalogs(user)), *came])
+    return tuple((glass, catalog) for glass, catalog in listed if _bare(glass) == _bare(name))
+
+
+def _listed_names(first: Sequence[Catalog]) -> Iterator[tuple[str, str]]:
+    """(glass, catalog) of every glass of these catalogs, then of the shipped ones."""
+    yield from ((glass, catalog.name) for catalog in first for glass in catalog.glasses)
+    yield from ((glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values())
 
 
 def same_catalog(one: str, other: str) -> bool:

@@ -208,7 +208,7 @@ _RANGE_SLACK = 1e-6
 
 #: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
 _SHORTEST, _LONGEST = 3e-5, 100.0
-_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
+_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and likely wavelengths
 
 
 class ImplausibleWavelength(ValueError):
@@ -322,9 +322,9 @@ def check_unit(
     it refuses what is not above 0 and finite in any case.
     """
     spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
-    known = [] if believed is None else [one for one in believed.detach().flatten().tolist() if 0 < one < math.inf]
-    shortest = min([_SHORTEST, *(s[0] for s in spans), *(0.1 * one for one in known)])
-    longest = max([_LONGEST, *(s[1] for s in spans), *(10 * one for one in known)])
+    known = [] if believed is None else [wave for wave in believed.detach().flatten().tolist() if 0 < wave < math.inf]
+    shortest = min([_SHORTEST, *(s[0] for s in spans), *(0.1 * wave for wave in known)])
+    longest = max([_LONGEST, *(s[1] for s in spans), *(10 * wave for wave in known)])
     for wavelength in wavelengths.detach().flatten().tolist():
         if not (0 < wavelength < math.inf and shortest <= wavelength <= longest):
             guesses = (wavelength * factor for factor in _UNITS)
@@ -431,7 +431,7 @@ def mil_glass(code: str) -> Glass:
     return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
 
 
-#: Powers of λ in Schott's formula, the first m of which m measured indices decide, and where each stands in it.
+#: Powers of λ in Schott's formula, the first m of which m measured indices decide, and the place of each in it.
 _SCHOTT_POWERS, _SCHOTT_PLACES = (0, -2, 2, -4, -6, -8), (0, 2, 1, 3, 4, 5)
 
 
@@ -463,12 +463,12 @@ def from_table(
         y = torch.linalg.solve_triangular(r[:exact].T, (n * n)[:exact, None], upper=False)
         rest = basis[exact:] @ q
         left = (n * n)[exact:, None] - rest[:, :exact] @ y
-        found = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
-        missed = (n * n)[:exact, None] - basis[:exact] @ found[:, None]  # by rounding
-        found = found + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
+        a = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
+        missed = (n * n)[:exact, None] - basis[:exact] @ a[:, None]  # by rounding
+        a = a + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
     else:
-        found = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
-    coefficients = found.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), found)
+        a = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
+    coefficients = a.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), a)
     return Glass(name, "schott", coefficients, wavelength_range=(float(w.min()), float(w.max())))
 
 

@@ -1,1 +1,15 @@
-"""Mathematics that knows no optics: safe arithmetic, values, points on the disc, pixels, Zernike polynomials."""
+"""Mathematics without optics.
+
+| module    | contents                                                                                       |
+|-----------|------------------------------------------------------------------------------------------------|
+| numerics  | functions that stay finite with their gradients; dual numbers; values, dataclasses of tensors  |
+| sampling  | points and weights on the unit disc (Gauss, hexapolar, Sobol …): table SAMPLINGS; pixel grids   |
+| zernike   | Zernike polynomials: Noll, ANSI and fringe indices, values, gradients, fits                    |
+| bivariate | polynomials in x and y with derivatives                                                        |
+| arrays    | .npy and .npz files, read with care                                                            |
+| result    | results of public functions: columns, text, document, frame                                    |
+
+To add a sampling: a function of one size that returns points (2, P) and weights (P,), and a row of SAMPLINGS.
+
+Tests: tests/test_numerics, test_dual and test_value (numerics), test_pupil (sampling), test_zernike, test_result.
+"""

@@ -11,8 +11,8 @@ from torch import Tensor
 from raytrace.maths.zernike import fringe
 
 
-class Bivariate(NamedTuple):
-    """A function (...) of x and y with its slopes and second derivatives; those above the highest asked for are 0."""
+class Sag(NamedTuple):
+    """A function D (...) of x and y, its slopes and second derivatives; those above the highest requested are 0."""
 
     z: Tensor
     x: Tensor
@@ -33,31 +33,19 @@ def degree(count: int) -> int:
     return math.ceil((math.sqrt(9 + 8 * count) - 3) / 2)
 
 
-def polynomial_xy(coefficients: Tensor, x: Tensor, y: Tensor, highest: int = 2) -> Bivariate:
+def polynomial_xy(coefficients: Tensor, x: Tensor, y: Tensor, highest: int = 2) -> Sag:
     """Σ c_k x^i y^j and its derivatives at points (...); coefficients: (K, ...) in the order of `powers`."""
     x, y = torch.broadcast_tensors(x, y)
-    rows = _rows_by_power_of_y(coefficients)
-    flat = [_univariate(row, x, highest) for row in rows]  # of each power of y, its polynomial in x
-    zero = torch.zeros_like(x)
+    zero, n = torch.zeros_like(x), degree(len(coefficients))
+    rows = [[zero] * (n - j + 1) for j in range(n + 1)]  # c_ij by j, then i
+    for (i, j), c in zip(powers(len(coefficients)), coefficients.unbind(0), strict=True):
+        rows[j][i] = c + zero
+    flat = [_horner(row, x, highest) for row in rows]  # of each power of y, its polynomial in x
     z, zx, zxx = ([part[order] for part in flat] for order in range(3))
     value, slope, bend = _horner(z, y, highest)
     across = _horner(zx, y, highest - 1) if highest > 0 else (zero,) * 3
     along = _horner(zxx, y, highest - 2)[0] if highest > 1 else zero
-    return Bivariate(value, across[0], slope, along, across[1], bend)
-
-
-def _rows_by_power_of_y(coefficients: Tensor) -> list[list[Tensor | None]]:
-    """c_ij by j, then by i; None where there is no such term."""
-    n = degree(len(coefficients))
-    rows: list[list[Tensor | None]] = [[None] * (n - j + 1) for j in range(n + 1)]
-    for (i, j), c in zip(powers(len(coefficients)), coefficients.unbind(0), strict=True):
-        rows[j][i] = c
-    return rows
-
-
-def _univariate(row: list[Tensor | None], x: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
-    zero = torch.zeros_like(x)
-    return _horner([zero if c is None else c + zero for c in row], x, highest)
+    return Sag(value, across[0], slope, along, across[1], bend)
 
 
 def _horner(coefficients: list[Tensor], x: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -262,7 +262,7 @@ def _dim(one: Dual, other) -> int:
 
 
 def _under(slope: np.ndarray, dim: int) -> np.ndarray:
-    """Derivatives whose axis of variables stands before so many axes."""
+    """Derivatives with so many axes behind that of the variables."""
     missing = dim + 1 - slope.ndim
     return slope.reshape(len(slope), *(1,) * missing, *slope.shape[1:]) if missing > 0 else slope
 
@@ -361,8 +361,8 @@ def value(cls: type) -> type:
 
     Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
     that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. There is no generated `==` (it would raise on
-    tensors) and no validation on construction (it would break `vmap`): wrong input is refused at the doors.
-    A class that says itself how it is shown keeps its `__repr__`.
+    tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
+    A class with a `__repr__` keeps it.
     """
     shown = cls.__repr__ is object.__repr__
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
@@ -402,7 +402,7 @@ def check_precision(dtype: torch.dtype) -> None:
 def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Value:
     """The same value with every floating-point tensor in it converted to `dtype` and moved to `device`.
 
-    A tensor that stands in several places (the coefficients of air, say) stays one tensor. Raises ValueError for a
+    A tensor that occurs in several places (the coefficients of air, say) stays one tensor. Raises ValueError for a
     dtype too coarse for optics (`check_precision`).
     """
     if dtype is not None:

@@ -106,7 +106,7 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -> tuple[Tensor, Tensor]:
-    """`fit` of values (..., P) by weights that share it, and where (...) these tell the coefficients: elsewhere 0.
+    """`fit` of values (..., P) by weights that share it, and where (...) these determine the coefficients; elsewhere 0.
 
     Known are those of a `condition` below `worst`. No derivative is taken by the weights: on what all have in common,
     the light of a field, no fit depends. Raises ValueError for fewer points than coefficients.

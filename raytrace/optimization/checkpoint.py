@@ -128,87 +128,65 @@ class Checkpoint:
         self.last = time.monotonic()
 
 
-_VECTOR = listed(number())
-_POSITIVE = number(0)
-
-
-def _cycle(value: object) -> Cycle:
-    """A cycle of a history. Raises Unfit."""
-    first, *numbers, evaluations, seconds, words = listed(anything, len(_COLUMNS), len(_COLUMNS))(value)
-    return Cycle(whole()(first), *map(_POSITIVE, numbers), whole()(evaluations), number()(seconds), text(words))
-
-
-_DESCENT = record(
-    {
-        "path": whole(0, len(PATHS) - 1),
-        "start": _VECTOR,
-        "before": listed(whole(), 2, 2),
-        "best": either(exactly(None), listed(anything, 2, 2)),
-        "x": _VECTOR,
-        **dict.fromkeys(("damping", "factor", "share", "price"), _POSITIVE),
-        "scale": either(exactly(None), _VECTOR),
-        "evaluations": whole(),
-        "history": listed(_cycle),
-    }
-)
-_DOCUMENT = record(
-    {"variables": mapped(number()), "cycles": whole()},
-    {
-        "glasses": mapped(listed(text, 2, 2)),
-        "tested": listed(whole()),
-        "descent": _DESCENT,
-        "evaluated": listed(listed(either(exactly(None), number(infinite=True)), 1)),
-    },
-)
-
-
 def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> Stored:
     """The checkpoint of this optimisation. Raises BadCheckpoint and OSError."""
+    finite, entry = listed(number(), len(names), len(names)), either(exactly(None), number(infinite=True))
+    columns = (whole(), *(number(0),) * 4, whole(), number(), text)
+    document_of = record(
+        {"variables": mapped(number()), "cycles": whole()},
+        {
+            "glasses": mapped(listed(text, 2, 2)),
+            "tested": listed(whole()),
+            "evaluated": listed(listed(entry, 1 + 2 * len(names), 1 + 2 * len(names))),
+        },
+    )
+
+    def vector(value: object) -> np.ndarray:
+        return np.array(finite(value))
+
+    def best(value: object) -> tuple[np.ndarray, str]:
+        x, stopped = listed(anything, 2, 2)(value)
+        return vector(x), exactly(*STOPPED)(stopped)
+
+    def cycle(value: object) -> Cycle:
+        cells = listed(anything, len(columns), len(columns))(value)
+        return Cycle(*(column(cell) for column, cell in zip(columns, cells, strict=True)))
+
+    of_solver = {"x": vector, **dict.fromkeys(("damping", "factor", "share", "price"), number(0))}
+    of_solver |= {"scale": either(exactly(None), vector), "evaluations": whole()}
+    of_paths = {"path": whole(0, len(PATHS) - 1), "start": vector, "best": either(exactly(None), best)}
+    descent_of = record({**of_paths, **of_solver, "before": listed(whole(), 2, 2), "history": listed(cycle)})
+
+    def descent(value: object) -> PathState:
+        stored = descent_of(value)
+        (before, evaluations), history = stored["before"], stored["history"]
+        if before > len(history):
+            raise Unfit("history: expected the cycles of every path")
+        cycles = tuple(
+            dataclasses.replace(one, number=one.number - before, evaluations=one.evaluations - evaluations)
+            for one in history[before:]
+        )
+        solver = SolverState(cycles=cycles, **{name: stored[name] for name in of_solver})
+        paths = {name: stored[name] for name in of_paths}
+        return PathState(solver=solver, before=tuple(history[:before]), evaluations=evaluations, **paths)
 
     def check(value: object) -> Stored:
-        document = _DOCUMENT(value)
+        document = record({}, {"descent": descent})(document_of(value))
         if set(document["variables"]) != set(names):
             raise Unfit(f"variables: found {', '.join(document['variables'])}, expected {', '.join(names)}")
         glasses = document.get("glasses", {})
         for name in glasses:
             if not name.isascii() or not name.isdecimal() or len(name) > 6:
                 raise Unfit(f"glasses: found {name[:20]!r}, expected the number of a surface")
-        evaluated = document.get("evaluated", [])
-        if any(len(one) != 1 + 2 * len(names) for one in evaluated):
-            raise Unfit(f"evaluated: expected lists of {1 + 2 * len(names)}")
         return Stored(
             np.array([document["variables"][name] for name in names]),
             {int(k): (catalog, name) for k, (catalog, name) in glasses.items()},
             tuple(document.get("tested", ())),
-            _path_state(document["descent"], len(names)) if "descent" in document else None,
-            np.array(evaluated, dtype=float),
+            document.get("descent"),
+            np.array(document.get("evaluated", []), dtype=float),
         )
 
     return Document(path, of, _CHECKPOINT).read(check)
-
-
-def _path_state(stored: Mapping, count: int) -> PathState:
-    """State of the paths of so many variables. Raises Unfit."""
-    vectors = [stored["start"], stored["x"], *([] if stored["scale"] is None else [stored["scale"]])]
-    best = stored["best"]
-    if best is not None:
-        best = np.array(_VECTOR(best[0])), exactly(*STOPPED)(best[1])
-        vectors.append(best[0])
-    if any(len(one) != count for one in vectors):
-        raise Unfit(f"descent: expected lists of {count} variables")
-    history = stored["history"]
-    before, evaluations = stored["before"]
-    if before > len(history):
-        raise Unfit("descent: history: expected the cycles of every path")
-    cycles = tuple(
-        dataclasses.replace(one, number=one.number - before, evaluations=one.evaluations - evaluations)
-        for one in history[before:]
-    )
-    solver = SolverState(
-        np.array(stored["x"]), stored["damping"], stored["factor"], stored["share"], stored["price"],
-        None if stored["scale"] is None else np.array(stored["scale"]), stored["evaluations"], cycles,
-    )  # fmt: skip
-    return PathState(stored["path"], np.array(stored["start"]), solver, tuple(history[:before]), evaluations, best)
 
 
 class Log:

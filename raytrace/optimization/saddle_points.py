@@ -16,7 +16,6 @@ Source: Bociort & van Turnhout, Generating saddle points in the merit function l
 Opt. Express 17, 2009.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -42,12 +41,12 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import Freedom
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
-from raytrace.system.surface import Surface, is_posed
+from raytrace.system.surface import is_posed
 
-_SURFACES = ("surface", "place", "met surface", "contribution")  # of `arguments.ARGUMENTS`
-_NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, to tell second derivatives
+_SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
+_NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
@@ -55,7 +54,7 @@ _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
 def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
-    """The surfaces at which a meniscus can stand, or those that are named. Raises NoProblem."""
+    """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
         raise NoProblem("`insert`: the lens has several configurations; take one of them")
@@ -71,7 +70,7 @@ def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
 
 
 def _objection(free: Freedom, k: int) -> str:
-    """What keeps a meniscus from a surface; nothing where it can stand there."""
+    """Why a surface takes no meniscus, "" where it does."""
     lens = free.lens
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
@@ -99,8 +98,11 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
     variables = tuple(sorted(own, key=lambda one: (quantities.index(one.quantity), one.surface)))
     solves = tuple(_moved(one, k) for one in free.solves)
-    if lens.optimization_data is not None:
-        made = replace(made, optimization_data=_optimization_data(lens.optimization_data, k, variables, solves))
+    if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
+        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(one, k) for one in data.kept)
+        diameters = tuple(_behind(surface, k) for surface in data.semi_diameters)
+        data = replace(data, variables=variables, solves=solves, merit=merit, semi_diameters=diameters, kept=kept)
+        made = replace(made, optimization_data=replace(data, tolerances=()))
     return replace(
         task,
         free=Freedom(made, variables, solves),
@@ -108,11 +110,6 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
         conditions=tuple(replace(one, row=_row(one.row, k)) for one in task.conditions),
         bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
     )
-
-
-def new_gaps(task: SearchProblem, k: int) -> np.ndarray:
-    """(n,) which variables are the thicknesses of the meniscus and of the air beside it."""
-    return np.array([one.quantity == "thickness" and one.surface in (k, k + 1) for one in task.free.variables])
 
 
 def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
@@ -123,23 +120,17 @@ def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
 
 
 def with_meniscus(lens: Lens, k: int) -> Lens:
-    """The lens with a meniscus without thickness before surface k, of the glass beside it; no ray goes otherwise."""
+    """The lens with a meniscus without thickness before surface k, of the adjacent glass; no ray changes."""
     surface = lens.surfaces[k]
-    media = lens.surfaces[k], lens.surfaces[k - 1]  # behind the two new surfaces
-    new = tuple(_touching(surface, one) for one in media)
+    common = {"thickness": 0 * surface.thickness, "apertures": (), "comment": ""}
+    media = (surface, lens.surfaces[k - 1])  # behind the two new surfaces
+    new = [replace(surface, glass=medium.glass, environment=medium.environment, **common) for medium in media]
     stop = lens.stop + 2 if lens.stop >= k else lens.stop
     return replace(lens, surfaces=(*lens.surfaces[:k], *new, *lens.surfaces[k:]), stop=stop)
 
 
-def _touching(surface: Surface, medium: Surface) -> Surface:
-    """A surface of the same shape with another medium behind it, and no space."""
-    nothing = 0 * surface.thickness
-    beside = {"glass": medium.glass, "environment": medium.environment}
-    return replace(surface, thickness=nothing, apertures=(), comment="", **beside)
-
-
 def _behind(surface: int, k: int) -> int:
-    """The number of a surface once two more stand before surface k."""
+    """The number of a surface after two surfaces are inserted before surface k."""
     return surface + 2 if surface >= k else surface
 
 
@@ -150,16 +141,12 @@ def _moved(one: Vary | Solve, k: int) -> Vary | Solve:
 
 def _row(row: Row, k: int) -> Row:
     """A row that names the same surfaces by their new numbers."""
-    kinds = _kinds(row)
+    if row.operand in BOUNDARIES:
+        kinds = ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
+    else:
+        kinds = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
     moved = [_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True)]
     return replace(row, integers=tuple(moved)) if any(kinds) else row
-
-
-def _kinds(row: Row) -> tuple[str, str]:
-    """What the integers of a row name."""
-    if row.operand in BOUNDARIES:
-        return ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
-    return OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
 
 
 def _split(row: Row, k: int, part: float) -> list[Row]:
@@ -173,21 +160,6 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
     if part > 0:
         found.append(replace(row, integers=(k, k + 1), target=part * row.target))
     return found or [replace(row, weight=0.0)]
-
-
-def _optimization_data(
-    optimization_data: OptimizationData, k: int, variables: tuple[Vary, ...], solves: tuple[Solve, ...]
-) -> OptimizationData:
-    """What the file means, by the new numbers of its surfaces; lines of tolerances, which name surfaces, are left."""
-    return dataclasses.replace(
-        optimization_data,
-        variables=variables,
-        solves=solves,
-        merit=tuple(_row(row, k) for row in optimization_data.merit),
-        tolerances=(),
-        semi_diameters=tuple(_behind(one, k) for one in optimization_data.semi_diameters),
-        kept=tuple(_moved(one, k) for one in optimization_data.kept),
-    )
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------
@@ -259,7 +231,8 @@ class Place:
 
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
         """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
-        gaps, space = new_gaps(self.task, self.k), self.task.space
+        space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
+        gaps = np.array([one.quantity == "thickness" and one.surface in new for one in self.task.free.variables])
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
         problem = self.task.problem(thinned(self.task.rows, self.k, part))
@@ -277,10 +250,10 @@ class Place:
         """The minimum on one side of the saddle, of a lens of real thickness. Raises SearchStopped."""
         first = self.stage(0.0, _CYCLES[0], _CAREFUL)
         thicker = [self.stage(part, _CYCLES[1], _CAREFUL) for part in _PARTS]
-        x = self.beside(first, sign)
+        x = self.displaced(first, sign)
         return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
 
-    def beside(self, stage: Stage, sign: float) -> np.ndarray:
+    def displaced(self, stage: Stage, sign: float) -> np.ndarray:
         """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
         x, problem = self.task.model.start, stage.problem
         way = saddle(problem, x, stage.moves(x)).descent
@@ -363,12 +336,9 @@ class Insertion:
             self.started += 1
             if bar is not None:
                 bar.update(1)
-                bar.set_postfix_str(self._words())
+                each = self.each()
+                bar.set_postfix_str(f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else "")
         return sum(end.seconds for end in ends)
-
-    def _words(self) -> str:
-        each = self.each()
-        return f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else ""
 
     def each(self) -> list[tuple[Problem, Minimum]]:
         """All minima, the best first, each with the problem that it is one of."""

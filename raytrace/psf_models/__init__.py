@@ -2,16 +2,26 @@
 
     psf(lens, model="gaussian", fields=…, object_distances=…, pixel=0.005, size=21, tol=1e-3) -> Psf
 
-`models.py` has the call, the table of the models, the choice of an order and the work of several
-processes.
+| module          | contents                                                                                     |
+|-----------------|----------------------------------------------------------------------------------------------|
+| models          | `psf`; table of the models, choice of an order for a tolerance, kernels shared by processes  |
+| result          | Kernels of a model, Psf; moments of rays                                                     |
+| paraxial        | first-order data: a Gaussian of the defocus blur                                             |
+| fourier         | the same with diffraction: a defocused (and aberrated) circular pupil                        |
+| gaussian        | centroid and covariance of traced rays; a Gaussian integrated over pixels                    |
+| drt             | all traced rays: geometric optics                                                            |
+| wave            | the traced wavefront: diffraction with the true aberrations                                  |
+| radial          | rotationally symmetric light along one radius                                                |
+| dft             | sums of waves: matrix DFT, Bessel functions, Huygens                                         |
+| direct_sum      | the direct Huygens sum: converged kernels of waves, reference of the wave model              |
+| pupil_clearance | clear parts of a vignetted pupil                                                             |
+| figures         | figures of PSFs, the finely sampled light in them                                            |
 
-| model    | data of the lens                                                                | module         |
-|----------|---------------------------------------------------------------------------------|----------------|
-| paraxial | focal length, principal planes, entrance pupil: a Gaussian of the defocus blur  | paraxial.py    |
-| fourier  | the same, with diffraction: a defocused (and aberrated) circular pupil          | fourier.py     |
-| gaussian | centroid and covariance of traced rays                                          | gaussian.py    |
-| drt      | all traced rays: geometric optics                                               | drt.py         |
-| wave     | the traced wavefront: diffraction with the true aberrations                     | wave.py        |
+To add a model: a module with `kernels(scene, grid, *, order) -> Kernels`, a class of its numbers and a row of `_ROWS`
+in `models`; `psf`, the command and `rt.compare` read the row.
+
+Tests: tests/test_psf_MODULE.py; test_psf (the call), test_psf_laws (all models), test_psf_estimates (tolerances),
+test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_shards (processes), test_plot_psf.
 """
 
 from raytrace.psf_models.figures import CloseUp as CloseUp

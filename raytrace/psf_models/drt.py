@@ -29,7 +29,7 @@ from raytrace.budget import afford
 from raytrace.maths.numerics import safe_divide, value, varies
 from raytrace.maths.sampling import Grid, sobol
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
-from raytrace.psf_models.result import Kernels, centroid_and_covariance
+from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import Aperture, clearance
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
@@ -410,14 +410,8 @@ def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]
-    arrived = energy.sum(-1)
-    share = safe_divide(energy, arrived[..., None].expand(energy.shape))
-    # Relative to the first ray that arrives, a small spot far off the axis loses no precision.
-    first = (energy > 0) & ((energy > 0).to(torch.int64).cumsum(-1) == 1)
-    reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
-    centroid, covariance = centroid_and_covariance(*torch.where(energy > 0, points - reference, 0.0), share)
-    centroid = centroid + reference[..., 0]
-    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=arrived * light)
+    centroid, covariance = moments_of_rays(points, energy)
+    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=energy.sum(-1) * light)
 
 
 @torch.no_grad()

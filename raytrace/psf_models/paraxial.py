@@ -7,13 +7,13 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import detached, safe_divide
 from raytrace.maths.sampling import Grid
-from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media
 from raytrace.system.surface import is_round
 from raytrace.tracing.base_ray import base_ray
-from raytrace.tracing.launch import object_field
-from raytrace.tracing.paraxial import first_order, signed, system_matrix
+from raytrace.tracing.launch import is_at_infinity, object_field
+from raytrace.tracing.paraxial import chief_ray, first_order, signed, system_matrix
 from raytrace.tracing.scene import Scene, is_on_axis
 from raytrace.tracing.trace import Bent, is_bent, need_axis
 
@@ -86,16 +86,11 @@ def chief_ray_height(scene: Scene) -> Tensor:
     n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
     A, B, C, D = system_matrix(lens.surfaces[1:-1], n, wavelengths)
     to_sensor = lens.surfaces[-2].thickness / n[-1]
-    finite = ~torch.isinf(distance.detach())
-    heights = []
-    for component in field:
-        if lens.fields.telecentric:
-            y, slope = component, torch.zeros_like(component)
-        else:
-            # A field at infinity is a slope, a finite one a height.
-            reach = torch.where(finite, distance + pupil, -1.0)
-            slope = -component / reach
-            y = -pupil * slope
+    at_infinity, telecentric, heights = is_at_infinity(lens), lens.fields.telecentric, []
+    for extent in field:
+        y, slope = chief_ray(
+            extent, at_infinity=at_infinity, distance=distance, entrance_pupil=pupil, parallel=telecentric
+        )
         omega = n[0] * slope
         heights.append((A * y + B * omega + to_sensor * (C * y + D * omega)).expand(scene.shape))
     return torch.stack(heights)

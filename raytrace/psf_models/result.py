@@ -227,6 +227,33 @@ def centroid_and_covariance(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor
     return torch.stack([mean_x, mean_y]), torch.stack(covariance)
 
 
+def moments_of_rays(points: Tensor, energy: Tensor, fold: str = "none") -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) and covariance (3, ...) of rays (2, ..., P) by their energies (..., P); 0 where none arrives.
+
+    fold: the symmetry of the light, see `scene.symmetry`. A ray is subtracted before the mean is formed and the mean
+    before squares are, so that a small spot far off the axis loses no precision and no variance is negative.
+    """
+    lit = energy > 0
+    share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
+    x, y = torch.where(lit, points, 0.0)
+    zero = torch.zeros_like(share[..., 0])
+    if fold == "round":
+        # Turned about the axis, a ray at height r is a ring of second moment r²/2 per axis.
+        variance = 0.5 * (share * (x * x + y * y)).sum(-1)
+        return torch.stack([zero, zero]), torch.stack([variance, zero, variance])
+    first = lit & (lit.to(torch.int64).cumsum(-1) == 1)
+
+    def centred(x: Tensor) -> tuple[Tensor, Tensor]:
+        reference = torch.where(first, x, 0.0).sum(-1, keepdim=True)
+        offset = torch.where(lit, x - reference, 0.0)
+        mean = (share * offset).sum(-1, keepdim=True)
+        return (reference + mean)[..., 0], torch.where(lit, offset - mean, 0.0)
+
+    (x_mean, x), (y_mean, y) = centred(x) if fold == "none" else (zero, x), centred(y)
+    xy = (share * x * y).sum(-1) if fold == "none" else zero
+    return torch.stack([x_mean, y_mean]), torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
+
+
 def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Centroid (2, ...) and covariance (3, ...) of the light of K distributions, (2, ..., K) and (3, ..., K).
 

@@ -23,7 +23,7 @@ from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import dft
 from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves
-from raytrace.psf_models.result import Kernels, combined
+from raytrace.psf_models.result import Kernels, combined, moments_of_rays
 from raytrace.tracing.scene import Scene, symmetry, trace_scene
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
@@ -203,18 +203,8 @@ def probe_of(scene: Scene) -> Wavefront:
 def _moments(light: Waves) -> tuple[Tensor, Tensor]:
     """Centroid (2, ...) mm on the sensor and covariance (3, ...) mm² of the rays."""
     front = light.wavefront
-    share = safe_divide(front.energy, front.energy.sum(-1, keepdim=True))
-    x, y = torch.where(front.valid, front.landing, 0.0)
-    zero = torch.zeros_like(share[..., 0])
-    if light.symmetry == "round":
-        variance = 0.5 * (share * (x * x + y * y)).sum(-1)
-        return front.centre[:2], torch.stack([variance, zero, variance])
-    is_mirrored = light.symmetry == "mirror"
-    mean_x, mean_y = zero if is_mirrored else (share * x).sum(-1), (share * y).sum(-1)
-    x, y = x - mean_x[..., None], y - mean_y[..., None]
-    xy = zero if is_mirrored else (share * x * y).sum(-1)
-    covariance = torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
-    return front.centre[:2] + torch.stack([mean_x, mean_y]), covariance
+    centroid, covariance = moments_of_rays(front.landing, front.energy, light.symmetry)
+    return front.centre[:2] + centroid, covariance
 
 
 def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tensor:

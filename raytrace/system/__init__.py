@@ -1,1 +1,30 @@
-"""The nouns of a lens: surfaces, rays, the lens itself, and how one is built from plain numbers."""
+"""A lens as a value: surfaces, apertures, fields and wavelengths, in mm and µm.
+
+| module            | contents                                                                                   |
+|-------------------|--------------------------------------------------------------------------------------------|
+| lens              | Lens, Fields, SystemAperture; media, conditions (`at`), checks                             |
+| surface           | Surface; its sag and vertex curvature, powers, the y-nu trace                              |
+| shapes            | even and odd asphere, toroid, biconic: table KINDS                                         |
+| sag_terms         | sag added to a shape: height maps, Zernike, fringe, x-y polynomials: table SAG_TERMS       |
+| apertures         | circular, rectangular, elliptic, polygon: table SHAPES                                     |
+| phases            | gratings, holograms, diffractive lenses, ideal lenses, Fresnel facets: table PHASES        |
+| poses             | decentres and tilts                                                                        |
+| intersection      | rays and surfaces: point, normal, the first crossing of an asphere                         |
+| rays              | Rays: positions, directions, validity, optical path                                        |
+| configurations    | the configurations of a zoom or multi-configuration lens                                   |
+| parameter_paths   | numbers of a lens by name                                                                  |
+| optimization_data | variables, solves, pickups and merit function of a file; dimensions: units of its operands |
+| prescription      | `rt.lens`: a lens from rows of plain numbers                                               |
+| identity          | digest of a lens in the files that store numbers for it                                    |
+
+To add:
+
+- a shape: its sag and derivatives in `shapes`, a row of KINDS, and its terms in tracing/cpp/sags.h for the compiled
+  trace (`code=None`: torch alone);
+- sag terms: a value and its functions in `sag_terms`, a row of SAG_TERMS;
+- an aperture: its edges in `apertures`, a row of SHAPES, and its lines in tracing/cpp/apertures.h;
+- a phase: a value and its path in `phases`, a row of PHASES.
+
+Tests: tests/test_MODULE.py; test_shapes adds a kind of each to the tables; test_asphere and test_freeform (sags),
+test_compiled_sags and test_compiled_poses (against the compiled trace), test_hardcases (extreme numbers).
+"""

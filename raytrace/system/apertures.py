@@ -116,31 +116,23 @@ def _polygons(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
     return [Edge(torch.where(odd, -distance, distance), 0.0, size=max(map(abs, sizes)))]
 
 
+def _box(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+    return [Edge(x.abs(), sizes[0]), Edge(y.abs(), sizes[1])]
+
+
+def _reach_of_corners(sizes: Sequence[float]) -> tuple[float, float]:
+    return 0.0, max(map(abs, sizes[1::2]))
+
+
+def _ellipse(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+    return [Edge((x / sizes[0]) ** 2 + (y / sizes[1]) ** 2, 1.0)]
+
+
 SHAPES = {
     "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0),
-    "rectangular": Shape(
-        lambda x, y, sizes: [Edge(x.abs(), sizes[0]), Edge(y.abs(), sizes[1])],
-        lambda sizes: (0.0, sizes[1]),
-        "mirror",
-        ("SQAP", "SQOB"),
-        1,
-    ),
-    "elliptic": Shape(
-        lambda x, y, sizes: [Edge((x / sizes[0]) ** 2 + (y / sizes[1]) ** 2, 1.0)],
-        lambda sizes: (0.0, sizes[1]),
-        "mirror",
-        ("ELAP", "ELOB"),
-        2,
-    ),
-    "polygon": Shape(
-        _polygons,
-        lambda sizes: (0.0, max(map(abs, sizes[1::2]))),
-        "none",
-        ("USAP", "USOB"),
-        3,
-        sizes=None,
-        is_hollow=lambda sizes: True,
-    ),
+    "rectangular": Shape(_box, lambda sizes: (0.0, sizes[1]), "mirror", ("SQAP", "SQOB"), 1),
+    "elliptic": Shape(_ellipse, lambda sizes: (0.0, sizes[1]), "mirror", ("ELAP", "ELOB"), 2),
+    "polygon": Shape(_polygons, _reach_of_corners, "none", ("USAP", "USOB"), 3, None, is_hollow=lambda sizes: True),
 }
 
 

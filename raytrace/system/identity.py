@@ -1,7 +1,8 @@
-"""Identity: what a lens is known by in the files that hold numbers for it."""
+"""Identity of a lens in the files that store numbers for it."""
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -82,7 +83,7 @@ def other_lens(before: Mapping, now: Mapping) -> str:
         return f"{names[0]!r} of {counts[0]} surfaces, not {names[1]!r} of {counts[1]}"
     for k, (a, b) in enumerate(zip(before["surfaces"], now["surfaces"], strict=True)):
         for quantity, one, other in zip((*_SHOWN, "glass"), a, b, strict=True):
-            if k and not _alike(one, other):
+            if k and not alike(one, other):
                 return f"{names[0]!r} with {quantity} {_shown(one)} of surface {k}, not {_shown(other)}"
     return f"{names[0]!r} with other numbers of its surfaces"
 
@@ -94,7 +95,7 @@ def unlike(before: Mapping, now: Mapping) -> str:
     """
     try:
         if "prescription" in now and "prescription" not in before:
-            return "a lens that it does not tell; an older version wrote it"
+            return "an unidentified lens; an older version wrote it"
         if "prescription" in now and (words := other_lens(before, now)):
             return f"another lens: {words}"
         if "variables" in now and before["variables"] != now["variables"]:
@@ -102,14 +103,17 @@ def unlike(before: Mapping, now: Mapping) -> str:
             expected = f"{missing[0]} among them" if missing else ", ".join(now["variables"])
             return f"other variables: {', '.join(map(str, before['variables']))}; expected {expected}"
     except (KeyError, TypeError, ValueError, AttributeError):
-        return "a lens that its damaged identity does not tell"
+        return "a lens whose identity is damaged"
     other = [name for name in now if name not in ("lens", "surfaces") and before.get(name) != now[name]]
     return f"other {', '.join(other)}" if other else ""
 
 
-def _alike(one: object, other: object) -> bool:
+def alike(one: object, other: object) -> bool:
+    """Whether plain values are equal, numbers to the precision of float32."""
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(alike, one, other))
     if isinstance(one, float) and isinstance(other, float):
-        return abs(one - other) <= 1e-6 * max(abs(one), abs(other))  # float32
+        return math.isclose(one, other, rel_tol=1e-6)
     return one == other
 
 

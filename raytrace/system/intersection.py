@@ -16,9 +16,9 @@ from torch import Tensor
 
 from raytrace.maths.numerics import broadcast_shape, differentiating, dot, with_batch_axes
 from raytrace.system.phases import kind_of
-from raytrace.system.sag_terms import Sag
-from raytrace.system.shapes import EVEN, KINDS, Form, Relief, relief, sag_and_derivatives, size_of_terms
-from raytrace.system.surface import Surface, freeform_sag, is_freeform, is_searched, round_sag
+from raytrace.system.sag_terms import Relief, Sag, relief
+from raytrace.system.shapes import EVEN, KINDS, Form, size_of_terms
+from raytrace.system.surface import Surface, freeform_sag, is_freeform, is_searched, round_sag, sag_and_derivatives
 
 
 def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -384,10 +384,7 @@ def _searched(rays: "_Rays", t: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reads_are_free(tensor: Tensor) -> bool:
-    """Whether the host may read a tensor without waiting for a device.
-
-    Elsewhere every ray takes all steps and the bracketed search, with bit-identical results: converged rays are frozen.
-    """
+    """Whether the host may read a tensor without waiting for a device; else every ray takes all steps."""
     return tensor.device.type == "cpu"
 
 

@@ -27,12 +27,7 @@ from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean
 
 #: Units of a field point by the kind of field.
-FIELD_UNITS = {
-    "angle": "degrees",
-    "object_height": "mm",
-    "paraxial_image_height": "mm",
-    "real_image_height": "mm",
-}
+FIELD_UNITS = dict(angle="degrees", object_height="mm", paraxial_image_height="mm", real_image_height="mm")
 
 #: How rays find the stop. "auto" is that of a lens, or of a file, that specifies none.
 RAY_AIMING = {
@@ -238,7 +233,12 @@ def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tens
         if fields is None:
             return torch.stack([like.fields.x, like.fields.y])
         found = field_points(fields, like=like.fields.y)
-        return found if isinstance(fields, Tensor) else _below_90_degrees(like, found)
+        angles = [] if isinstance(fields, Tensor) or like.fields.kind != "angle" else found.T.flatten().tolist()
+        for angle in angles:
+            if abs(angle) >= 90:
+                message = "a field angle is below 90 degrees, for rays start from the plane of the entrance pupil"
+                raise ValueError(f"`fields={angle:g}`: {message}")
+        return found
     if isinstance(fields, Tensor):
         return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
     listed = fields if isinstance(fields, Iterable) else [fields]
@@ -246,16 +246,6 @@ def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tens
     if not points or any(len(point) != 2 for point in points):
         raise ValueError(f"fields {fields!r}: expected numbers y, or pairs (x, y)")
     return torch.tensor(points, dtype=like.dtype, device=like.device).T
-
-
-def _below_90_degrees(lens: Lens, fields: Tensor) -> Tensor:
-    for angle in fields.T.flatten().tolist() if lens.fields.kind == "angle" else ():
-        if abs(angle) >= 90:
-            raise ValueError(
-                f"`fields={angle:g}`: a field angle is below 90 degrees, for rays start from the plane of the entrance "
-                "pupil"
-            )
-    return fields
 
 
 def vector(numbers: Tensor | Iterable[Tensor | float] | float, *, like: Lens) -> Tensor:
@@ -345,7 +335,7 @@ def unknown_changes(lens: Lens) -> dict[int, str]:
 
 
 def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
-    """n (...) of the medium behind a surface at wavelengths (...) µm, beside the lens's air; none of a mirror."""
+    """n (...) of the medium behind a surface at wavelengths (...) µm, relative to the lens's air; a mirror has none."""
     surface, air = lens.surfaces[number], lens.environment
     if air is None and surface.environment is None:
         return refractive_index(surface.glass, wavelength)
@@ -418,11 +408,8 @@ def field_label(lens: Lens, field: Sequence[float]) -> str:
 
 def field_title(lens: Lens) -> str:
     """The kind of field of this lens, in a figure."""
-    return (
-        "Image height"
-        if lens.fields.kind == "real_image_height"
-        else ("Field angle" if lens.fields.kind == "angle" else lens.fields.kind.replace("_", " ").capitalize())
-    )
+    titles = {"real_image_height": "Image height", "angle": "Field angle"}
+    return titles.get(lens.fields.kind) or lens.fields.kind.replace("_", " ").capitalize()
 
 
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
@@ -511,11 +498,8 @@ def _check_kinds(surface: Surface, where: str) -> None:
 
 
 def _check_cone(lens: Lens) -> None:
-    """Refuse a cone of light at the object whose rim lies in the plane of the object, or that is none.
-
-    Of one beyond a right angle, whose rim runs back to a reflector around the object, rays leave on the same lines
-    forwards, within 180 degrees less the angle: the part of the reflector behind its equator is not traced.
-    """
+    """Refuse a cone at the object of a right angle, of 180° and more, or of an NA that is not below the index."""
+    # Of a cone beyond a right angle rays leave on the same lines forwards, within 180 degrees less the angle.
     kind, number = lens.aperture.kind, float(lens.aperture.value)
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")

@@ -81,9 +81,9 @@ class Solve:
         return f"{_where(self)}: {self.kind} {numbers}".rstrip()
 
 
-def _where(one: Vary | Solve) -> str:
-    configuration = f" in configuration {one.configuration}" if one.configuration else ""
-    return f"{one.quantity} of surface {one.surface}{configuration}"
+def _where(rule: Vary | Solve) -> str:
+    configuration = f" in configuration {rule.configuration}" if rule.configuration else ""
+    return f"{rule.quantity} of surface {rule.surface}{configuration}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +139,9 @@ class OptimizationData:
         counts = Counter(row.name for row in self.merit)
         operands = ", ".join(f"{name} x{count}" for name, count in counts.items())
         lines = [
-            *(f"varies: {one}" for one in self.variables),
-            *(f"follows: {one}" for one in self.solves),
-            *(f"kept: {one}" for one in self.kept),
+            *(f"varies: {rule}" for rule in self.variables),
+            *(f"follows: {rule}" for rule in self.solves),
+            *(f"kept: {rule}" for rule in self.kept),
             *([f"merit function of {len(self.merit)} lines: {operands}"] if self.merit else []),
             *([f"tolerances: {len(self.tolerances)} lines"] if self.tolerances else []),
         ]

@@ -1,10 +1,10 @@
-"""Naming: numbers of a lens, their bounds and ranges as words name them.
+"""Parameter paths: the numbers of a lens by name, and the syntax of their bounds and ranges.
 
 thickness:5,6 curvature:1-4 a4:3 sensor     numbers of surfaces, which are counted as in the file
 sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
 2:15                                        least and greatest
 
-Places: the numbers of a surface by name, whatever its kind is: of its shape, its phase and its pose.
+`parameter_paths` lists the numbers of a surface of any kind: of its shape, its phase and its poses.
 """
 
 import dataclasses
@@ -42,18 +42,18 @@ def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
     Entries of a tensor are counted from 1, coefficients by the power of r, or of y, that they belong to. The pose
     behind the surface has its names with "_after", as tilt_x_after.
     """
-    found: dict[str, ParameterPath] = {}
+    paths: dict[str, ParameterPath] = {}
     for field in dataclasses.fields(Surface):
         part = getattr(surface, field.name)
         if field.name == "coefficients":
-            found |= _coefficients(part, KINDS[surface.kind])
+            paths |= _coefficients(part, KINDS[surface.kind])
         elif field.name in SHAPE and field.type == Tensor | None:
-            found[field.name] = ParameterPath((field.name,))
+            paths[field.name] = ParameterPath((field.name,))
         elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
             behind = "_after" if field.name == "after" else ""
-            for own in dataclasses.fields(part):
-                found |= _entries((field.name, own.name), getattr(part, own.name), own.name + behind)
-    return found
+            for inner in dataclasses.fields(part):
+                paths |= _entries((field.name, inner.name), getattr(part, inner.name), inner.name + behind)
+    return paths
 
 
 def _coefficients(part: Tensor | None, kind: Kind) -> dict[str, ParameterPath]:
@@ -71,14 +71,14 @@ def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str,
 
 
 def number_at(part, place: ParameterPath) -> Tensor | None:
-    """The number in its place; None where it is not modelled."""
+    """The number at a path; None where it is not modelled."""
     for name in place.path:
         part = getattr(part, name)
     return part if place.entry is None else part.reshape(-1)[place.entry]
 
 
 def with_number(part, place: ParameterPath, number: Tensor):
-    """The surface with another number in that place."""
+    """The surface with another number at a path."""
     name, *rest = place.path
     old = getattr(part, name)
     if rest:
@@ -102,9 +102,9 @@ def modelled(surface: Surface, name: str) -> Surface:
         return surface
     term = re.fullmatch(r"a(\d+)", name)
     if term and surface.kind == EVEN and 2 <= int(term[1]) <= 2 * KINDS[EVEN].parameters and not int(term[1]) % 2:
-        own = zero.new_zeros(0) if surface.coefficients is None else surface.coefficients
-        further = zero.new_zeros((int(term[1]) // 2 - len(own), *own.shape[1:]))
-        return dataclasses.replace(surface, coefficients=torch.cat([own, further]))
+        terms = zero.new_zeros(0) if surface.coefficients is None else surface.coefficients
+        further = zero.new_zeros((int(term[1]) // 2 - len(terms), *terms.shape[1:]))
+        return dataclasses.replace(surface, coefficients=torch.cat([terms, further]))
     field, side = name.removesuffix("_after"), "after" if name.endswith("_after") else "before"
     pose = getattr(surface, side) or Pose()
     if field in _POSED and isinstance(pose, Pose):
@@ -117,40 +117,40 @@ MOST = 10_000
 
 
 class BadVariables(ValueError):
-    """A list of variables that the lens does not have, or that cannot be read."""
+    """Malformed variables, or variables that the lens does not have."""
 
 
 class BadLimits(ValueError):
-    """Limits that cannot be read, or that nothing can keep to."""
+    """Malformed or contradictory limits."""
 
 
 def joined(words: str | Sequence[str]) -> str:
-    """Words as one text, that may come as several."""
+    """A text, or several words joined by blanks."""
     return words if isinstance(words, str) else " ".join(words)
 
 
 def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
-    """The numbers of a list like "1,3-5". Raises BadVariables naming the word that it is part of."""
-    found: list[int] = []
+    """The numbers of a list like "1,3-5". Raises BadVariables with the word."""
+    listed: list[int] = []
     for part in numbers.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
         if not match:
             raise BadVariables(f"{word!r}: {part!r} is no {what} number; expected numbers and ranges like 1,3-5")
         first, last = (int(digits) if len(digits) < 10 else MOST + 1 for digits in (match[1], match[2] or match[1]))
-        if last > MOST or len(found) + last - first > MOST:
+        if last > MOST or len(listed) + last - first > MOST:
             raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {what} {MOST}, which no lens has")
-        found += range(first, last + 1)
-    return found
+        listed += range(first, last + 1)
+    return listed
 
 
 def sensor(lens: Lens) -> int:
-    """The surface behind which the sensor stands."""
+    """The number of the last surface before the sensor."""
     return len(lens.surfaces) - 2
 
 
 def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
-    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1..0". Raises BadVariables saying what is wrong."""
-    found = {}
+    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1..0". Raises BadVariables."""
+    bounds = {}
     for word in text.split():
         name, _, ends = word.rpartition(":")
         try:
@@ -160,12 +160,12 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
             raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
         if not low < high:
             raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
-        found[name] = (low, high)
-    return found
+        bounds[name] = (low, high)
+    return bounds
 
 
 def parse_range(text: str) -> tuple[float, float]:
-    """Least and greatest of "2:15", or of "2" (nothing at most). Raises BadLimits saying what is wrong."""
+    """Least and greatest of "2:15", or of "2" (nothing at most). Raises BadLimits."""
     least, colon, most = text.partition(":")
     try:
         low, high = float(least), float(most) if colon else math.inf

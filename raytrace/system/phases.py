@@ -1,4 +1,4 @@
-"""Phases: what a thin structure on a surface does to light beside Snell's law; one row for every kind.
+"""Phases: optical path that a thin structure adds on a surface, or its action in place of Snell's law; a row a kind.
 
 A grating, a hologram or a diffractive lens adds a path p(x, y), in mm, and its gradient to what light carries along
 the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`tracing.trace`). An ideal lens bends slopes instead, and the facets

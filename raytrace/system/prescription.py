@@ -1,4 +1,4 @@
-"""Build: a lens from plain numbers, as one types it from a book or a patent.
+"""A lens built from plain numbers, as printed in a book or a patent.
 
 lens([dict(radius=37.4, thickness=5.9, glass="SK4"), …], stop=5, f_number=3.5, fields=[0, 8.4, 11.9])
 """
@@ -17,7 +17,7 @@ from raytrace.words import named_value
 
 
 class BadPrescription(ValueError):
-    """Numbers that do not make a lens: says which surface, what was found and what was expected."""
+    """Numbers that make no lens; the message has the surface, the value found and the value expected."""
 
 
 def lens(
@@ -59,7 +59,7 @@ def lens(
     if kind not in FIELD_UNITS:
         raise BadPrescription(f"field_kind {kind!r}: expected one of {', '.join(FIELD_UNITS)}")
     points = field_points(fields, like=wavelengths)
-    found = Lens(
+    built = Lens(
         surfaces=(Surface(_tensor(object_distance)), *surfaces, Surface(_tensor(0.0))),
         stop=stop,
         aperture=_aperture(aperture),
@@ -72,11 +72,11 @@ def lens(
         ray_aiming=ray_aiming,
     )
     try:
-        check_unit(wavelengths, (surface.glass for surface in found.surfaces))
-        check(found)
+        check_unit(wavelengths, (surface.glass for surface in built.surfaces))
+        check(built)
     except ValueError as error:
         raise BadPrescription(str(error)) from error
-    return found
+    return built
 
 
 def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surface:
@@ -86,15 +86,15 @@ def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surf
         raise BadPrescription(
             f"{where}: {named_value(row)}; expected a mapping, as dict(radius=50, thickness=5, glass='N-BK7')"
         )
-    given = {key: value for key, value in row.items() if not _is_empty(value)}
-    if "thickness" not in given:
+    cells = {key: value for key, value in row.items() if not _is_empty(value)}
+    if "thickness" not in cells:
         raise BadPrescription(f"{where}: no thickness; give mm to the next vertex, 0 where they touch")
     plane = {"radius": math.inf, "curvature": 0.0}
-    if any(not isinstance(given.get(key), Tensor) and given.get(key) == flat for key, flat in plane.items()):
-        given = {key: value for key, value in given.items() if key not in plane}
-    given["glass"] = medium(given.get("glass", AIR), catalogs, where)
+    if any(not isinstance(cells.get(key), Tensor) and cells.get(key) == flat for key, flat in plane.items()):
+        cells = {key: value for key, value in cells.items() if key not in plane}
+    cells["glass"] = medium(cells.get("glass", AIR), catalogs, where)
     try:
-        return changed(Surface(_tensor(0.0)), given, where, like=_tensor(0.0))
+        return changed(Surface(_tensor(0.0)), cells, where, like=_tensor(0.0))
     except (TypeError, ValueError) as error:
         raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
 
@@ -112,12 +112,12 @@ def medium(glass: Glass | str | float | Sequence[float], catalogs: Sequence[str]
     return AIR if not isinstance(glass, Tensor) and float(glass) == 1 else constant(glass)
 
 
-def _aperture(given: Mapping[str, float]) -> SystemAperture:
+def _aperture(apertures: Mapping[str, float]) -> SystemAperture:
     names = {"f_number": "image_f_number"} | {kind: kind for kind in APERTURE_KINDS}
-    if len(given) != 1 or next(iter(given)) not in names:
-        found = ", ".join(given) or "none"
-        raise BadPrescription(f"aperture: {found} given; expected one of {', '.join(names)}, as f_number=3.5")
-    ((name, number),) = given.items()
+    if len(apertures) != 1 or next(iter(apertures)) not in names:
+        listed = ", ".join(apertures) or "none"
+        raise BadPrescription(f"aperture: {listed} given; expected one of {', '.join(names)}, as f_number=3.5")
+    ((name, number),) = apertures.items()
     return SystemAperture(names[name], _tensor(number))
 
 
@@ -129,8 +129,8 @@ def _tensor(value) -> Tensor:
     return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
 
 
-def _vector(numbers, what: str) -> Tensor:
+def _vector(numbers, quantity: str) -> Tensor:
     try:
         return torch.as_tensor(numbers, dtype=torch.float64).reshape(-1)
     except (TypeError, ValueError) as error:
-        raise BadPrescription(f"{what} {numbers!r}: expected numbers") from error
+        raise BadPrescription(f"{quantity} {numbers!r}: expected numbers") from error

@@ -10,18 +10,19 @@
     PowerSag        D = h + Σ_k c_k E_k(u, v),  u = (x - x_0)/R,  v = (y - y_0)/R
 
 Slopes and second derivatives are written out, and autograd may differentiate them further. Functions take the tensors
-of sag terms in float64; each kind is a row of `shapes.SAG_TERMS`. IrregularSag and TiltSag are converted to
+of sag terms in float64; each kind is a row of SAG_TERMS. IrregularSag and TiltSag are converted to
 PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linear maps that autograd follows.
 """
 
+import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
+from raytrace.maths.bivariate import Sag, polynomial_xy, powers, zernike_to_powers
 from raytrace.maths.numerics import polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
@@ -72,17 +73,6 @@ class FringeSag:
     radius: Tensor
     centre_x: Tensor
     centre_y: Tensor
-
-
-class Sag(NamedTuple):
-    """D (...) mm with its slopes and second derivatives (...); those above the highest asked for are 0."""
-
-    z: Tensor
-    x: Tensor
-    y: Tensor
-    xx: Tensor
-    xy: Tensor
-    yy: Tensor
 
 
 def spline(grid: GridSag) -> SplineSag:
@@ -346,3 +336,63 @@ def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     """A bound on |D| up to a radius (...) mm of the vertex."""
     centre_x, centre_y, unit, height, coefficients = numbers
     return height.abs() + polynomial_size((coefficients, unit), radius + centre_x.abs() + centre_y.abs())
+
+
+@dataclasses.dataclass(frozen=True)
+class SagTermKind:
+    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
+
+    sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
+    it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
+    prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
+    powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
+    traced by torch alone.
+    """
+
+    sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
+    size: Callable[[Sequence[Tensor], Tensor], Tensor]
+    covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda _, x, y: torch.ones_like(x, dtype=torch.bool)
+    prepare: Callable = lambda sag_terms: sag_terms
+    is_round: bool = False
+    powers: Callable | None = None
+    compiled: int | None = None
+
+
+SAG_TERMS = {
+    "GridSag": SagTermKind(spline_sag, spline_size, spline_covers, prepare=spline),
+    "SplineSag": SagTermKind(spline_sag, spline_size, spline_covers),
+    "ZernikeSag": SagTermKind(zernike_sag, zernike_size, powers=powers_of_zernike, compiled=91),
+    "FringeSag": SagTermKind(fringe_sag, fringe_size, powers=powers_of_fringe, compiled=37),
+    "PolynomialSag": SagTermKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
+    "IrregularSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "TiltSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "PowerSag": SagTermKind(power_sag, power_size, powers=lambda sag_terms: sag_terms),
+}
+
+SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
+
+
+@dataclasses.dataclass(frozen=True)
+class Relief:
+    """sag terms made ready for rays: its row, by the name of its class, and its numbers."""
+
+    kind: str
+    numbers: Sequence[Tensor]
+
+    def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
+        """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
+        return SAG_TERMS[self.kind].sag(self.numbers, x, y, highest)
+
+    def covers(self, x: Tensor, y: Tensor) -> Tensor:
+        """Whether there is a surface at points (...) mm."""
+        return SAG_TERMS[self.kind].covers(self.numbers, x, y)
+
+    def size(self, radius: Tensor) -> Tensor:
+        """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
+        return SAG_TERMS[self.kind].size(self.numbers, radius)
+
+
+def relief(sag_terms: SagTerms) -> Relief:
+    """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
+    name = type(sag_terms).__name__
+    return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])

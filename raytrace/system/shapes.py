@@ -7,46 +7,19 @@
 A toroid is the curve g turned about a line along y through z = 1/c_x. Of toroid and biconic, curvature c and conic k
 are those of the section along y; the other numbers are coefficients. Beyond its edge a surface keeps the height there.
 
-KINDS has a row for each `Surface.kind`, SAG_TERMS one for each class of `Surface.sag_terms`, D(x, y). A new kind is a
-new row, which tracing, derivatives, first order, variables, figures and files read, and its terms in
+KINDS has a row for each `Surface.kind`, `sag_terms.SAG_TERMS` one for each class of `Surface.sag_terms`, D(x, y). A new
+kind is a new row, which tracing, derivatives, first order, variables, figures and files read, and its terms in
 tracing/cpp/sags.h, if the compiled engine is to trace it.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
+from raytrace.maths.bivariate import Sag
 from raytrace.maths.numerics import polynomial
-from raytrace.system.sag_terms import (
-    FringeSag,
-    GridSag,
-    IrregularSag,
-    PolynomialSag,
-    PowerSag,
-    Sag,
-    SplineSag,
-    TiltSag,
-    ZernikeSag,
-    as_polynomial,
-    fringe_sag,
-    fringe_size,
-    polynomial_sag,
-    polynomial_size,
-    power_sag,
-    power_size,
-    powers_of_fringe,
-    powers_of_polynomial,
-    powers_of_zernike,
-    spline,
-    spline_covers,
-    spline_sag,
-    spline_size,
-    zernike_sag,
-    zernike_size,
-)
 
 EVEN = "even asphere"
 _TIP = 1e-24  # mm²: r² up to which a ray goes through the vertex
@@ -239,7 +212,7 @@ class Kind:
     least, most: how many coefficients it has.
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
-    words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
+    words: entries of the column "type" of a table; an empty one is resolved by the powers of the terms.
     code: the kind in tracing/cpp/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
@@ -278,117 +251,10 @@ KINDS = {
     for kind in (
         Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
         Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4, compiled=8),
-        Kind(
-            "toroidal",
-            zemax="TOROIDAL",
-            form=TOROIDAL,
-            heads=("curvature_x",),
-            least=1,
-            most=8,
-            code=5,
-            compiled=8,
-        ),
-        Kind(
-            "biconic",
-            zemax="BICONICX",
-            form=BICONIC,
-            heads=("curvature_x", "conic_x"),
-            least=2,
-            most=2,
-            code=6,
-        ),
+        Kind("toroidal", zemax="TOROIDAL", form=TOROIDAL, heads=("curvature_x",), least=1, most=8, code=5, compiled=8),
+        Kind("biconic", zemax="BICONICX", form=BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2, code=6),
     )
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class SagTermKind:
-    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
-
-    sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
-    it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
-    prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
-    powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
-    traced by torch alone.
-    """
-
-    sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
-    size: Callable[[Sequence[Tensor], Tensor], Tensor]
-    covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda numbers, x, y: torch.ones_like(
-        x, dtype=torch.bool
-    )
-    prepare: Callable = lambda sag_terms: sag_terms
-    is_round: bool = False
-    powers: Callable | None = None
-    compiled: int | None = None
-
-
-SAG_TERMS = {
-    "GridSag": SagTermKind(spline_sag, spline_size, spline_covers, prepare=spline),
-    "SplineSag": SagTermKind(spline_sag, spline_size, spline_covers),
-    "ZernikeSag": SagTermKind(zernike_sag, zernike_size, powers=powers_of_zernike, compiled=91),
-    "FringeSag": SagTermKind(fringe_sag, fringe_size, powers=powers_of_fringe, compiled=37),
-    "PolynomialSag": SagTermKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
-    "IrregularSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "TiltSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "PowerSag": SagTermKind(power_sag, power_size, powers=lambda sag_terms: sag_terms),
-}
-
-SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
-
-
-@dataclasses.dataclass(frozen=True)
-class Relief:
-    """sag terms made ready for rays: its row, by the name of its class, and its numbers."""
-
-    kind: str
-    numbers: Sequence[Tensor]
-
-    def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
-        """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
-        return SAG_TERMS[self.kind].sag(self.numbers, x, y, highest)
-
-    def covers(self, x: Tensor, y: Tensor) -> Tensor:
-        """Whether there is a surface at points (...) mm."""
-        return SAG_TERMS[self.kind].covers(self.numbers, x, y)
-
-    def size(self, radius: Tensor) -> Tensor:
-        """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
-        return SAG_TERMS[self.kind].size(self.numbers, radius)
-
-
-def relief(sag_terms: SagTerms) -> Relief:
-    """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
-    name = type(sag_terms).__name__
-    return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])
-
-
-def sag_and_derivatives(
-    u: Tensor,
-    curvature: Tensor | None,
-    conic: Tensor | None,
-    coefficients: Tensor | None,
-    highest: int = 2,
-    *,
-    along: Tensor | float = 1.0,
-    kind: str = EVEN,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
-
-    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
-    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
-
-    S = c u/(1+w) + Σ_j a_j b_j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
-    """
-    S = dS = d2S = torch.zeros_like(u)
-    if curvature is not None:
-        S, dS, d2S = conic_terms(u, curvature, conic, highest, along)
-    if coefficients is not None:
-        P, dP, d2P = KINDS[kind].terms(u, coefficients, highest, along)
-        S = S + P
-        dS = dS if dP is None else dS + dP
-        d2S = d2S if d2P is None else d2S + d2P
-    return S, dS, d2S
 
 
 def size_of_terms(u: Tensor, coefficients: Tensor, kind: str = EVEN) -> Tensor:

@@ -18,8 +18,8 @@ from raytrace.maths.numerics import value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
 from raytrace.system.poses import Gap, Pose, Turn
-from raytrace.system.sag_terms import Sag
-from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, SagTerms, relief, sag_and_derivatives
+from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
+from raytrace.system.shapes import EVEN, KINDS, conic_terms
 
 
 @value
@@ -31,7 +31,7 @@ class Surface:
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of the `kind`, a key of `shapes.KINDS`: of an even asphere of r², r⁴, … in
         mm^(1-2j), of a toroid its curvature along x and terms of y², y⁴, …; None if not aspheric.
-    sag_terms: added sag D, of a kind of `shapes.SAG_TERMS`, or None. A height at the vertex belongs to the thickness
+    sag_terms: added sag D, of a kind of `sag_terms.SAG_TERMS`, or None. A height at the vertex belongs to the thickness
         before: paraxial optics takes D(0, 0) and the slopes there as 0.
     phase: optical path added by the surface, or its action in place of Snell's law, of a kind of `phases.PHASES`; None
         for a surface that refracts or reflects.
@@ -168,9 +168,37 @@ def sag_at(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
 
 
 def round_sag(surface: Surface, u: Tensor, highest: int, along: Tensor | float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
-    """`shapes.sag_and_derivatives` of a round kind, without sag terms."""
+    """`sag_and_derivatives` of a round kind, without sag terms."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     return sag_and_derivatives(u, c, k, a, highest, along=along, kind=surface.kind)
+
+
+def sag_and_derivatives(
+    u: Tensor,
+    curvature: Tensor | None,
+    conic: Tensor | None,
+    coefficients: Tensor | None,
+    highest: int = 2,
+    *,
+    along: Tensor | float = 1.0,
+    kind: str = EVEN,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
+
+    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
+    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
+
+    S = c u/(1+w) + Σ_j a_j b_j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
+    """
+    S = dS = d2S = torch.zeros_like(u)
+    if curvature is not None:
+        S, dS, d2S = conic_terms(u, curvature, conic, highest, along)
+    if coefficients is not None:
+        P, dP, d2P = KINDS[kind].terms(u, coefficients, highest, along)
+        S = S + P
+        dS = dS if dP is None else dS + dP
+        d2S = d2S if d2P is None else d2S + d2P
+    return S, dS, d2S
 
 
 def freeform_sag(surface: Surface, x: Tensor, y: Tensor, highest: int) -> Sag:

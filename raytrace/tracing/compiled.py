@@ -26,8 +26,8 @@ from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.poses import Gap, Turn, passage
 from raytrace.system.rays import Rays
-from raytrace.system.sag_terms import PowerSag
-from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS
+from raytrace.system.sag_terms import SAG_TERMS, PowerSag
+from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.compiler import NoCompiler, is_built, library
 
@@ -312,12 +312,13 @@ def _form_of(surface: Surface, n1: Tensor, wavelength: Tensor | None) -> tuple[i
 
 
 def with_numbers(
-    structure: Structure, surfaces: Sequence[Surface], numbers: Sequence[Tensor]
+    structure: Structure, surfaces: Sequence[Surface], table: Tensor, batch: Sequence[int]
 ) -> tuple[list[Surface], list[Tensor], Tensor | None]:
-    """Surfaces, indices and gap of a structure with these numbers: `structure_of` inverted.
+    """Surfaces, indices and gap of a structure with a table of numbers, for rays (*batch, P): `structure_of` inverted.
 
     Every row becomes a surface; turned axes become a coordinate break.
     """
+    numbers = table[0].unbind(0) if len(table) == 1 else table.reshape(*batch, 1, table.shape[-1]).unbind(-1)
     rows = [_Row(*row) for row in structure.layout.tolist()]
     gaps = [None if row.gap < 0 else numbers[row.gap] for row in rows]
     real = iter([surface for surface in surfaces if not surface.is_break])
@@ -461,9 +462,7 @@ def trace_compiled(
         return forward(task)
 
     def again(valid: Tensor, position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor) -> Rays:
-        single = len(table) == 1
-        numbers = table[0].unbind(0) if single else table.reshape(*valid.shape[:-1], 1, table.shape[-1]).unbind(-1)
-        rebuilt, indices, gap = with_numbers(task.structure, surfaces, numbers)
+        rebuilt, indices, gap = with_numbers(task.structure, surfaces, table, valid.shape[:-1])
         return eager(rebuilt, Rays(position, direction, valid, opl), indices=indices, side=side, gap=gap)
 
     position, direction, opl, valid = _Compiled.apply(task.structure, again, task.valid, *task.inputs)

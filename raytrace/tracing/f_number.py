@@ -34,7 +34,7 @@ def working_f_number(lens: Lens) -> Tensor:
 def axial_f_number(lens: Lens) -> Tensor:
     """1/(2 n′ |u′|) (...) of the paraxial rays of the axial object point at the primary wavelength.
 
-    Where the axis bends, of rays beside the base ray: the geometric mean of both sections, as wide as the ellipse that
+    Where the axis bends, of rays close to the base ray: the geometric mean of both sections, that of the ellipse that
     light fills; that of one where the other is parallel.
     """
     if not is_bent(lens):

@@ -1,4 +1,4 @@
-"""Focus: the sensor distance of the smallest spot, and the verb `focus`.
+"""Focus: the sensor distance of the smallest spot.
 
 Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
 square radius about each spot's own centroid is a parabola in s, and its minimum over objects, fields and wavelengths of

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
-from raytrace.system.lens import Lens, media
-from raytrace.system.surface import Surface, is_posed, is_round, power, signed, vertex_curvature, ynu
+from raytrace.system.lens import Lens, is_round_about_axis, media
+from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
 
 @value
@@ -226,6 +226,13 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     diameter = diameter * torch.ones_like(focal_length) if kind == "entrance_pupil_diameter" else diameter
     scale = data.marginal_height(kind, diameter, distance, vergence, tan_cone)
     slope_object, slope_image = scale * vergence / n_object, scale * data.omega_behind(vergence) / n_image
+    # |n ū y| at the entrance pupil, |n u h| at the object or |n′ u′ h′| at the image, by the kind of field.
+    largest = torch.hypot(*largest_field(lens))[0]
+    if lens.fields.kind == "angle":
+        invariant = n_object * (0.5 * diameter) * torch.tan(torch.deg2rad(largest))
+    else:
+        at_object = lens.fields.kind == "object_height"
+        invariant = (n_object * slope_object if at_object else n_image * slope_image) * largest
     petzval = petzval_sum([vertex_curvature(s) for s in surfaces], n) * torch.ones_like(n_object)
     return FirstOrder(
         power=-C,
@@ -242,7 +249,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         paraxial_image_distance=data.image_distance(vergence),
         magnification=data.magnification(vergence),
         angular_magnification=data.angular_magnification,
-        optical_invariant=_optical_invariant(lens, 0.5 * diameter, n_object, slope_object, n_image * slope_image),
+        optical_invariant=invariant.abs(),
         object_na=(n_object * torch.sin(torch.atan(slope_object))).abs(),
         image_na=(n_image * torch.sin(torch.atan(slope_image))).abs(),
         petzval_radius=-1 / (n_image * petzval),
@@ -263,7 +270,7 @@ def largest_field(lens: Lens) -> Tensor:
     Where not every surface is round about one axis it is the outermost itself: directions are not alike.
     """
     size = torch.hypot(lens.fields.x, lens.fields.y)
-    if all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces):
+    if is_round_about_axis(lens):
         largest = size.amax()
         return torch.stack([torch.zeros_like(largest), largest])[:, None]
     outermost = size.argmax()
@@ -284,11 +291,8 @@ def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
     """Paraxial image distance (...) mm from the last surface before the image; object_distance: (...) mm or inf."""
     wavelength = lens.primary if wavelength is None else wavelength
-    surfaces = lens.surfaces[1:-1]
-    n = signed(surfaces, media(lens, wavelength)[:-1])
-    A, B, C, D = system_matrix(surfaces, n, wavelength)
-    vergence = n[0] / object_distance
-    return -n[-1] * (A + B * vergence) / (C + D * vergence)
+    n = signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
+    return gaussian(lens, n, wavelength).image_distance(n[0] / object_distance)
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
@@ -299,11 +303,3 @@ def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
 
 def _tan_cone(lens: Lens, n_object: Tensor) -> Tensor | None:
     return torch.tan(cone_angle(lens, n_object)) if lens.aperture.kind in CONES else None
-
-
-def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
-    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, by the kind of field."""
-    largest = torch.hypot(*largest_field(lens))[0]
-    if lens.fields.kind == "angle":
-        return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()
-    return ((n_object * slope_object if lens.fields.kind == "object_height" else omega_image) * largest).abs()

@@ -122,11 +122,11 @@ def warn_of_failures(
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
     for place, (field, lost) in enumerate(zip(fields[:, some].unbind(1), dark[some].tolist(), strict=True)):
-        said: dict[str, list[str]] = {}
+        wavelengths_of: dict[str, list[str]] = {}
         for w, wavelength in enumerate(wavelengths.tolist()):
             if lost[w]:
-                said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
-        for words, colours in said.items():
+                wavelengths_of.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
+        for words, colours in wavelengths_of.items():
             _warn(f"{at}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
         _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")

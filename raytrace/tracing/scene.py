@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import RAY_BYTES, afford
+from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, value, varies
 from raytrace.system.apertures import SHAPES
 from raytrace.system.lens import Lens, is_round_about_axis, media, with_object_distance
@@ -292,13 +292,8 @@ def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
 
     Raises budget.OverBudget for more rays than fit in memory.
     """
-    D, F, W = scene.shape
-    P = pupil.shape[-1]
-    afford(
-        RAY_BYTES * D * F * W * P,
-        f"{D * F * W * P:,} rays ({D} object distances × {F} fields × {W} wavelengths × {P:,} of the pupil)",
-        helps="ask for fewer fields, wavelengths or pupil points",
-    )
+    (D, F, W), P = scene.shape, pupil.shape[-1]
+    afford_rays(P, object_distances=D, fields=F, wavelengths=W)
     rays = trace_bundle(_bundle(scene, pupil), scene.memo)
     batch = D, F, W, P
     return Rays(

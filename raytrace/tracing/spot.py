@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.budget import RAY_BYTES, afford
+from raytrace.budget import RAY_BYTES, afford, afford_rays
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
-from raytrace.tracing.trace import is_bent, lens_steps, sequence_of, trace_surfaces
+from raytrace.tracing.trace import is_bent, sequence_of, trace_surfaces, without_apertures
 
 
 @value
@@ -111,16 +111,12 @@ def _power_of_two(vectors: Tensor) -> Tensor:
 def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
     """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
 
-    The sensor may touch glass: what bends rays there does not tell where they came from. Raises budget.OverBudget for
+    The image surface does not refract: the sensor may touch glass. Raises budget.OverBudget for
     more rays than memory holds.
     """
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    F, W, P = lens.fields.y.numel() if fields is None else fields.shape[1], len(wavelengths), pupil.shape[-1]
-    afford(
-        RAY_BYTES * F * W * P,
-        f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} of the pupil)",
-        helps="ask for fewer fields, wavelengths or pupil points",
-    )
+    count = lens.fields.y.numel() if fields is None else fields.shape[1]
+    afford_rays(pupil.shape[-1], fields=count, wavelengths=len(wavelengths))
     indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
     indices = [*indices[:-1], indices[-2]]
@@ -184,7 +180,14 @@ def arrivals(
     F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
     count = f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points)"
     afford(RAY_BYTES * W * P + _KEPT_BYTES * F * W * P, count, helps="ask for fewer, or by `rays`, which keeps none")
-    each = [_field(lens, pupil, field[:, None], ray_aiming) for field in progress(fields.unbind(1))]
+    each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
+    for field in progress(fields.unbind(1)):
+        rays = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
+        reached = rays.valid
+        for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
+            reached = reached & ~crossing.missed & ~crossing.totally_reflected
+            on_sensor = crossing.rays, status, reached
+        each.append(on_sensor)
     joined = Rays(
         torch.cat([rays.position for rays, *_ in each], 1),
         torch.cat([rays.direction for rays, *_ in each], 1),
@@ -196,33 +199,24 @@ def arrivals(
     return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
 
 
-def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> tuple[Rays, Tensor, Tensor]:
-    """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
-    rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
-    reached = rays.valid
-    for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
-        reached = reached & ~crossing.missed & ~crossing.totally_reflected
-        on_sensor = crossing.rays, status, reached
-    return on_sensor
-
-
 def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
     """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
     rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    return rays.position[:2, ..., 0], chief_arrives(lens, rays, fields, wavelengths)
+
+
+def chief_arrives(lens: Lens, rays: Rays, fields: Tensor, wavelengths: Tensor) -> Tensor:
+    """Whether the first of the rays (3, F, W, P), chief rays, arrive or were only vignetted, (F, W)."""
     if is_bent(lens):
-        return rays.position[:2, ..., 0], unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
+        return unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
     on_axis = (fields == 0).all(0)[:, None]
-    return rays.position[:2, ..., 0], (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
+    return (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
 
 
 @torch.no_grad()
 def unclipped(lens: Lens, pupil: Tensor, fields: Tensor, wavelengths: Tensor) -> Tensor:
     """Which rays (F, W, P) of pupil points (2, P) reach the sensor, or would if nothing clipped any."""
-    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    reached = rays.valid
-    for crossing in lens_steps(lens, rays, wavelengths[:, None]):
-        reached = reached & ~crossing.missed & ~crossing.totally_reflected
-    return reached
+    return image_rays(without_apertures(lens), pupil, fields=fields, wavelengths=wavelengths).valid
 
 
 def chief_reference(lens: Lens, fields: Tensor) -> Tensor:

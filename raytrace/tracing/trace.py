@@ -273,10 +273,16 @@ def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]
     return stop, arrives
 
 
+def without_apertures(lens: Lens) -> Lens:
+    """The lens without apertures: no ray is vignetted."""
+    surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
+    return dataclasses.replace(lens, surfaces=surfaces)
+
+
 def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
     """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
     indices = media(lens, wavelength)
-    unclipped = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces]
+    unclipped = without_apertures(lens).surfaces
     rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
     for last in numbers:
         rays = trace_surfaces(
@@ -404,9 +410,7 @@ def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
 
 
 def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
-    shape = *task.valid.shape[:-1], 1
-    numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
-    own, indices, gap = with_numbers(task.structure, surfaces, numbers)
+    own, indices, gap = with_numbers(task.structure, surfaces, table, task.valid.shape[:-1])
     return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
 
 

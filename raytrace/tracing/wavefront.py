@@ -17,7 +17,7 @@ from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, beam_share, trace_scene
 from raytrace.tracing.spot import where_lit
-from raytrace.tracing.trace import is_bent
+from raytrace.tracing.trace import is_bent, without_apertures
 
 _WORST_CONDITION = 1e4  # of a fit of Zernike polynomials: beyond, its coefficients say nothing of the pupil
 
@@ -126,21 +126,16 @@ def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
     """Rays of pupil points, the chief ray first, and which have numbers that mean something."""
     rays = trace_scene(scene, with_chief)
     if is_bent(scene.lens):
-        return rays, rays.valid | _unclipped(scene, with_chief)
+        # Behind turned axes coordinates do not show which rays would arrive if nothing vignetted them.
+        if not any(surface.apertures for surface in scene.lens.surfaces):
+            return rays, rays.valid
+        with torch.no_grad():
+            unclipped = dataclasses.replace(scene, lens=without_apertures(scene.lens), memo=None)
+            return rays, rays.valid | trace_scene(unclipped, with_chief).valid
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
     # A chief ray along the axis has the numbers of a lost ray, and means them.
     on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
     return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
-
-
-def _unclipped(scene: Scene, pupil: Tensor) -> Tensor:
-    """Which rays would arrive if nothing clipped any (D, F, W, P): behind turned axes numbers alone do not tell."""
-    if not any(surface.apertures for surface in scene.lens.surfaces):
-        return torch.zeros_like(scene.fields[0], dtype=torch.bool)[:, None, None]
-    surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in scene.lens.surfaces)
-    open_lens = dataclasses.replace(scene.lens, surfaces=surfaces)
-    with torch.no_grad():
-        return trace_scene(dataclasses.replace(scene, lens=open_lens, memo=None), pupil).valid
 
 
 def _at_chief(quantity: Tensor, valid: Tensor, usable: Tensor) -> Tensor:
@@ -210,7 +205,7 @@ def zernike_coefficients(
     """Coefficients 1 … count (D, F, W, count) in mm, fitted to the rays that arrive.
 
     numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
-    empty: what they are where the light fills too little of the entrance pupil to tell them apart (a fit would enlarge
+    empty: what they are where the light fills too little of the entrance pupil to separate them (a fit would enlarge
     the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot_of`.
     Raises ValueError for another numbering.
     """

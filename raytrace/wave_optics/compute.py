@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -228,7 +228,7 @@ def wave_psf(
     wavelengths: Sequence[float] = COLOURS,
     pixel: float = 0.00369,
     size: int = 128,
-    engine: str = "auto",
+    engine: Literal["auto", "pupil", "radial", "fresnel", "angular_spectrum"] = "auto",
     samples: int | None = None,
     tol: float = 1e-3,
     progress: Progress = _silent,

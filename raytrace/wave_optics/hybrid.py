@@ -27,12 +27,11 @@ from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels
 from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, media, with_object_distance
-from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
-from raytrace.system.shapes import relief
+from raytrace.system.sag_terms import GridSag, ZernikeSag, relief, spline
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
-from raytrace.tracing.trace import sequence_of, trace_surfaces
+from raytrace.tracing.trace import at_stop
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 
@@ -184,9 +183,7 @@ def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
     lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
     field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
     rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
-    indices = media(lens, wavelength)[: lens.stop + 1]
-    hit = trace_surfaces(sequence_of(lens)[: lens.stop], rays, indices=indices, wavelength=wavelength)
-    return hit.position[:2].expand(2, *scene.shape, pupil.shape[-1])
+    return at_stop(lens, rays, wavelength)[0].expand(2, *scene.shape, pupil.shape[-1])
 
 
 def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from fractions import Fraction
 
+from raytrace.io.assembly import BENT, RETURNED, REVERSED
 from raytrace.io.source import (
     IGNORED,
     READ,
@@ -62,8 +63,8 @@ _COMMENT_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
 LEFT_HANDED = ("ADE", "BDE")
 
-#: Types of decentres and tilts: the axes return, bend as a mirror does, or turn back behind the surface.
-POSE_TYPES = ("DAR", "BEN", "REV")
+#: Types of decentres and tilts, by the axes behind the surface.
+POSE_TYPES = {"DAR": RETURNED, "BEN": BENT, "REV": REVERSED}
 
 
 SYSTEM_READ = {

@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import MOST_POINTS, LensDraft, assemble, clear_aperture, pose_of
+from raytrace.io.assembly import BENT, MOST_POINTS, ONWARD, LensDraft, assemble, clear_aperture, poses_of
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -38,6 +38,7 @@ from raytrace.io.codev.keywords import (
     LETTERS,
     MOST_TERMS,
     NANOMETRE,
+    POSE_TYPES,
     POSE_WORDS,
     RING,
     SYSTEM_APERTURES,
@@ -60,13 +61,14 @@ from raytrace.io.source import (
     plain_text,
     refuse_few,
     shown,
+    unit_of,
     words,
 )
 from raytrace.materials.glass import AIR, MIRROR, Glass, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
 from raytrace.system.phases import RadialPhase
-from raytrace.system.poses import Pose, undone
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface, medium_surfaces, power, signed, ynu
 
 #: Millimetres in a unit of DIM.
@@ -105,7 +107,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
         surface = _surface(block, unit, before, comments, library, report)
         before = before if surface.is_mirror or surface.is_break else surface.glass
         surfaces.append(surface)
-    solve, primary = system.last("PIM"), reference.integer(0, "number of the reference wavelength") if reference else 1
+    solve, primary = system.last("PIM"), system.integer("REF", "number of the reference wavelength", 1)
     if solve and not (solve.words and solve.words[0][:1] in "Nn") and 1 <= primary <= len(waves):
         surfaces = _at_paraxial_image(surfaces, double(waves[primary - 1]), solve.place, report)
     *front, last, image = surfaces  # the thickness of the image is the defocus
@@ -146,11 +148,7 @@ def _unit(system: Block, report: Draft) -> float:
         report.warn("no DIM: lengths are taken for mm", system.place)
         return 1.0
     word = unquoted(record.words[0]).upper() if record.words else ""
-    if word not in _UNITS:
-        raise LensFileError(f"DIM is {shown(word)}, expected M (mm), C (cm) or I (inches)", record.place)
-    if _UNITS[word] != 1:
-        report.note(f"lengths of the file are in {'cm' if word[0] == 'C' else 'inches'}; converted to mm")
-    return _UNITS[word]
+    return unit_of(word, _UNITS, "DIM", "M (mm), C (cm) or I (inches)", record.place, report)
 
 
 def _at_paraxial_image(surfaces: list[Surface], wavelength: Tensor, place: Place, report: Draft) -> list[Surface]:
@@ -339,11 +337,11 @@ def _surface(
     radius = number((stated.text or "?").strip(), "radius", stated.place) if stated else 1.0
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
-    slope = block.last("CUY")  # or RDY, a radius; 0 is a plane in both
-    value = slope.number(0, "radius or curvature") if slope else 0.0
+    slope = block.number("CUY", "radius or curvature")  # 0 is a plane in both
+    is_radius = slope and block.last("CUY").keyword == "RDY"
     return Surface(
         thickness=_thickness(block, unit),
-        curvature=nonzero(value / unit if slope.keyword == "CUY" else 1.0 / (value * unit)) if value else None,
+        curvature=nonzero(1.0 / (slope * unit) if is_radius else slope / unit),
         **_conic_and_terms(block, unit),
         phase=_phase(block, radius, unit),
         before=ahead,
@@ -371,13 +369,13 @@ def _thickness(block: Block, unit: float) -> Tensor:
 
 def _conic_and_terms(block: Block, unit: float) -> dict:
     """The conic constant and the terms a_j of r^2j: A is a_2; those up to the last letter that is there."""
-    flat, record, type_ = block.last("CUF"), block.last("K"), block.last("TYPE")
+    flat, type_ = block.last("CUF"), block.last("TYPE")
     kind = type_.keyword if type_ else "SPH"
     if flat and flat.number(0, "CUF", 0.0):
         raise UnsupportedSurface(f"CUF {flat.words[0][:40]} (fraction of a curvature) is not modelled", flat.place)
-    conic = record.number(0, "conic constant") if record else 0.0
+    conic = block.number("K", "conic constant")
     if conic and kind == "SPH":
-        raise LensFileError("K on a sphere; put CON or ASP before it", record.place)
+        raise LensFileError("K on a sphere; put CON or ASP before it", block.last("K").place)
     records = {j: record for j, letter in enumerate(LETTERS, 2) if (record := block.last(letter))}
     terms = {j: record.number(0, "coefficient") for j, record in records.items()}
     if kind == "ASP":
@@ -438,31 +436,22 @@ def _phase(block: Block, radius: float, unit: float) -> RadialPhase | None:
             radians[j] = float(Fraction(2 * math.pi) * coefficient * Fraction(radius) ** (2 * j) / length) + 0.0
         except OverflowError as error:
             raise LensFileError(f"HCO C{j} is too large", record.place) from error
-    order = block.last("HOR")
     coefficients = double([radians.get(j, 0.0) for j in range(1, max(radians, default=0) + 1)])
-    return RadialPhase(coefficients, double(radius), double(order.number(0, "order") if order else 1.0))
+    return RadialPhase(coefficients, double(radius), double(block.number("HOR", "order", 1.0)))
 
 
 def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
     """The pose of a surface and the one behind it, by decentres, tilts and their type: DAR, REV, BEN or none."""
     numbers = {}
     for name, word in POSE_WORDS.items():
-        if record := block.last(word):
-            factor = -1.0 if word in LEFT_HANDED else 1.0 if name.startswith("tilt") else unit
-            numbers[name] = factor * record.number(0, "decentre or tilt")
-    pose, type_ = pose_of(numbers), block.last("POSE")
-    word = type_.keyword if type_ else ""
-    if pose is None or not word:
-        return pose, None
-    if word == "DAR":
-        return pose, undone(pose)
-    if word == "REV":
-        return None, undone(pose)
-    tilts = {name: value for name, value in numbers.items() if name.startswith("tilt") and value}
-    if len(tilts) > 1:
+        factor = -1.0 if word in LEFT_HANDED else 1.0 if name.startswith("tilt") else unit
+        numbers[name] = factor * block.number(word, "decentre or tilt")
+    type_ = block.last("POSE")
+    axes = POSE_TYPES[type_.keyword] if type_ else ONWARD
+    if axes == BENT and sum(bool(value) for name, value in numbers.items() if name.startswith("tilt")) > 1:
         message = "BEN with tilts about several axes, to which CODE V adds one of its own, is not modelled"
         raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", type_.place)
-    return pose, pose_of(tilts)
+    return poses_of(numbers, axes)
 
 
 # -- apertures --------------------------------------------------------------------------------------------------------

@@ -36,7 +36,6 @@ from raytrace.io.source import (
     Record,
     by_word,
     double,
-    exact,
     integer,
     is_infinite,
     is_number,
@@ -44,6 +43,7 @@ from raytrace.io.source import (
     plain,
     shown,
 )
+from raytrace.io.zemax.optimization import STATUSES, VARIABLE, TypedSurface, path_of
 from raytrace.io.zemax.surfaces import (
     AIMING,
     AIMINGS,
@@ -54,18 +54,14 @@ from raytrace.io.zemax.surfaces import (
     SIZE,
     SWITCH,
     TEXT,
-    Numbers,
     Sections,
     SurfaceType,
     ValueRow,
     aperture_keywords,
-    glass_source,
     in_millimetres,
     inverse,
     is_blank,
     numbers_of,
-    type_name,
-    types,
 )
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass
@@ -76,7 +72,7 @@ from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, Path, ScaledPath, part, same, taken, with_part
 from raytrace.system.lens import Lens, unknown_changes
 from raytrace.system.optimization_data import Solve, Vary
-from raytrace.system.parameter_paths import ParameterPath, parameter_paths
+from raytrace.system.parameter_paths import parameter_paths
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import IrregularSag
 from raytrace.system.surface import Surface
@@ -202,17 +198,14 @@ def _grouped(cells: Sequence[Cell], count: int, report: Draft) -> list[tuple[Cel
 
 
 class LensFile(NamedTuple):
-    """A file with its lens as stored: sections, mm in its unit of length, and the medium of a GLAS record."""
+    """A file with its lens as stored: its surfaces with types and numbers, their rules, and the medium of a record."""
 
     sections: Sections
     lens: Lens
     millimetres: float
+    surfaces: Sequence[TypedSurface]
+    rules: Sequence[Vary | Solve]
     medium: Callable[[Record], Glass]
-
-    def typed(self, k: int) -> tuple[SurfaceType, Numbers]:
-        """The type of a surface, and its numbers."""
-        row = types()[type_name(self.sections.surfaces[k])]
-        return row, numbers_of(self.sections.surfaces[k], row, self.millimetres)
 
 
 class PlacedOperand(NamedTuple):
@@ -282,10 +275,6 @@ def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens
     except ValueError as error:
         raise LensFileError(str(error), head.place) from error
     return chosen, list(_rules(operands, lens))
-
-
-#: Status of a number of a configuration: 1 is a variable.
-VARIABLE, STATUSES = 1, {2: "pickup", 4: "thermal"}
 
 
 def _rules(operands: Sequence[PlacedOperand], lens: Lens) -> Iterator[Vary | Solve]:
@@ -367,6 +356,11 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
         for k in (first.number,) if row.of == "surface" else first.covered or ():
             if not 0 <= k <= last:
                 raise LensFileError(f"{first.name} of surface {k}; expected one from 0 to {last}", first.record.place)
+        if row.keyword == "XDAT" and _is_of_terms(first.parameter, file.surfaces[first.number].row):
+            words = [_terms(cell, file) for cell in cells]
+            names = [name for name in ("coefficients", "sag_terms", "phase") if any(name in each for each in words)]
+            paths = tuple(ScaledPath(("surfaces", first.number, name)) for name in names)
+            return placed(paths=paths, words=tuple(tuple(map(each.get, names)) for each in words))
         paths, like = _paths_of_parameter(first, row, file) if not row.path else _paths(first, row, file)
         if not paths:
             return unplaced
@@ -411,7 +405,8 @@ def _paths(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath,
 
 def _paths_in_surface(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
     """`_paths` of a value of a surface."""
-    lens, k, path, (kind, _) = file.lens, cell.number, row.path_in_lens(cell.number), file.typed(cell.number)
+    lens, k, path = file.lens, cell.number, row.path_in_lens(cell.number)
+    kind = file.surfaces[k].row
     block, surface = file.sections.surfaces[k], file.lens.surfaces[k]
     is_missing = {
         "CURV": "curvature" not in kind.holds,
@@ -429,7 +424,7 @@ def _paths_in_surface(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[
             raise LensFileError(f"{cell.name} of surface {k}, which has no glass", cell.record.place)
         if row.word > 1 and not is_blank(record) and record.integer(1, "flag", 0) != 1:
             return (), lens
-        paths += _picked_glasses(k, file) if row.word == 1 else []
+        paths += _picked_up(paths, file)[0] if row.word == 1 else []
     elif row.keyword == "SCBD" and part(lens, path[:-1]) is None:
         side = _numbered(block, "SCBD", {"before": "1", "after": "2"}[path[2]])
         pose = Pose(tilts_first=bool(side and side.number(1, "order", 0.0)))
@@ -442,24 +437,22 @@ def _paths_in_surface(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[
         paths += [ScaledPath((*path[:2], "sag_terms", "radius"))] if irregular else []
         sized = lens.stop == k and lens.aperture.kind == "float_by_stop"
         paths += [ScaledPath(("aperture", "value"))] if sized else []
-    elif row.keyword in _PICKUPS:
-        paths += _picked_up(cell, row, file, {})
+    elif row.keyword in ("DISZ", "CURV"):
+        paths += _picked_up(paths, file)[0]
     return tuple(paths), like
 
 
 def _paths_of_parameter(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
     """The paths of PARM or XDAT by the row of the surface's type, with its pickups; and a lens that models them."""
-    k, j, likes = cell.number, cell.parameter, {}
-    kind, numbers = file.typed(k)
-    if row.keyword == "XDAT" and kind.terms is not None and (j == 1 or (j == 2 and kind.terms_are_coefficients)):
-        quantity = "number of terms" if j == 1 else "radius of normalisation"
-        message = f"the {quantity} of a surface that is {kind.name} is the same in all configurations here"
-        raise LensFileError(message, cell.record.place)
-    factors, likes[k] = kind.places(file.lens.surfaces[k], numbers, row.keyword, j)
+    k, j, lens = cell.number, cell.parameter, file.lens
+    kind, numbers = file.surfaces[k].row, file.surfaces[k].numbers
+    if any(rule.kind == "PPAR" and rule.quantity == f"PARM {j}" and rule.numbers[:1] == (k,) for rule in _solves(file)):
+        raise LensFileError(f"parameter {j} is picked up by a rule that is not followed", cell.record.place)
+    factors, like = kind.places(lens.surfaces[k], numbers, row.keyword, j)
     paths = [ScaledPath(("surfaces", k, *place.steps), factor) for place, factor in factors.items()]
-    paths += _picked_up(cell, row, file, likes) if row.keyword == "PARM" and paths else []
-    surfaces = tuple(likes.get(number, surface) for number, surface in enumerate(file.lens.surfaces))
-    return tuple(paths), dataclasses.replace(file.lens, surfaces=surfaces)
+    picked, likes = _picked_up(paths, file) if row.keyword == "PARM" else ([], {})
+    surfaces = tuple({k: like, **likes}.get(number, surface) for number, surface in enumerate(lens.surfaces))
+    return (*paths, *picked), dataclasses.replace(lens, surfaces=surfaces)
 
 
 def _environment_paths(cell: Cell, path: Path, lens: Lens) -> list[Path]:
@@ -476,67 +469,36 @@ def _environment_paths(cell: Cell, path: Path, lens: Lens) -> list[Path]:
     return [path, *sharing]
 
 
-#: Pickups of numbers: by the keyword of the number, that of the rule, and the first word of the rule.
-#: PPAR j surface factor offset: parameter j; PZUP surface factor offset: thickness; CURV c 4 surface factor.
-_PICKUPS = {"PARM": ("PPAR", 1), "DISZ": ("PZUP", 0), "CURV": ("CURV", 2)}
+def _solves(file: LensFile) -> list[Solve]:
+    return [rule for rule in file.rules if isinstance(rule, Solve)]
 
 
-def _picked_up(cell: Cell, row: ValueRow, file: LensFile, likes: dict[int, Surface]) -> list[ScaledPath]:
-    """The paths of pickups of a number, from the object on, as a pickup looks back; likes: surfaces that model them.
+def _picked_up(paths: Sequence[ScaledPath], file: LensFile) -> tuple[list[ScaledPath], dict[int, Surface]]:
+    """The paths of pickups of a value, from the object on, as a pickup looks back; and surfaces that model them.
 
     A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
     """
-    if row.keyword not in _PICKUPS:
-        return []
-    keyword, first = _PICKUPS[row.keyword]
-    blocks, j, paths = file.sections.surfaces, str(cell.parameter), []
-    followed = {cell.number: (1.0, 0.0)}  # factor and offset, in the unit of the file
-
-    def stored(block: Block) -> float | None:
-        record = _numbered(block, "PARM", j) if row.keyword == "PARM" else block.last(row.keyword)
-        text = record.words[row.word - 1] if record and row.word <= len(record.words) else ""
-        return plain(text) if is_number(text) else None
-
-    for k, block in enumerate(blocks):
-        rule = _numbered(block, "PPAR", j) if keyword == "PPAR" else block.last(keyword)
-        numbers = [plain(word) for word in rule.words[first : first + 3] if is_number(word)] if rule else []
-        if len(numbers) < 2 or (keyword == "CURV" and (rule.words[1] != "4" or any(numbers[2:]))):
+    followed, likes = {scaled.path: scaled for scaled in paths}, {}
+    for solve in (rule for rule in _solves(file) if rule.kind == "pickup"):
+        k = solve.surface
+        if not 0 <= solve.source <= k:
             continue
-        source, factor, offset = numbers[0], numbers[1], sum(numbers[2:])
-        if source not in followed or not source < k:
+        like = file.surfaces[k].modelled(solve.quantity)
+        of_source = solve.quantity_of_source or solve.quantity
+        inner = path_of(file.surfaces[solve.source].modelled(of_source), of_source)
+        source, path = followed.get(("surfaces", solve.source, *(inner or ()))), path_of(like, solve.quantity)
+        if source is None or path is None or ("surfaces", k, *path) in followed:
             continue
-        held, wanted = stored(block), stored(blocks[int(source)])
-        if held is None or wanted is None or abs(held - (factor * wanted + offset)) > 1e-9 * abs(held) + 1e-300:
-            continue
-        scale, shift = followed[source]
-        factor, offset = followed[k] = factor * scale, factor * shift + offset
-        kind, values = file.typed(k)
-        places, power = {ParameterPath((row.path,)): 1.0}, row.power
-        if row.keyword == "PARM":
-            power = kind.power("PARM", cell.parameter)
-            places, likes[k] = kind.places(file.lens.surfaces[k], values, "PARM", cell.parameter)
-        elif row.keyword == "CURV" and "curvature" not in kind.holds:
-            places = {}
-        if places and (power is INVERSE and offset):
-            message = f"picked up by surface {k} with an offset, as a length of which the lens holds the reciprocal"
-            raise LensFileError(message, cell.record.place)
-        if places and row.keyword == "PARM" and power != file.typed(cell.number)[0].power("PARM", cell.parameter):
-            raise LensFileError(f"picked up by surface {k}, whose parameter has another unit", cell.record.place)
-        scale = 1 / factor if power is INVERSE else factor
-        offset = in_millimetres(offset, power or 0, file.millimetres)
-        paths += [ScaledPath(("surfaces", k, *place.steps), f * scale, f * offset) for place, f in places.items()]
-    return paths
-
-
-def _picked_glasses(number: int, file: LensFile) -> list[ScaledPath]:
-    """The media of the surfaces that pick up the glass of a surface."""
-    blocks, followed = file.sections.surfaces, [number]
-    for k, block in enumerate(blocks):
-        record, source = block.last("GLAS"), glass_source(block)
-        held = blocks[source].last("GLAS") if source in followed else None
-        if source in followed and (is_blank(record) or (held and held.words[:1] == record.words[:1])):
-            followed.append(k)
-    return [ScaledPath(("surfaces", k, "glass")) for k in followed[1:]]
+        stored, wanted = part(file.lens, ("surfaces", k, *path)), part(file.lens, source.path)
+        if isinstance(wanted, Glass):
+            agrees = same(stored, wanted)
+        else:
+            value, rule = float(stored or 0.0), solve.scale * float(wanted or 0.0) + solve.offset
+            agrees = abs(value - rule) <= 1e-9 * abs(rule) + 1e-300
+        if agrees:
+            factor, offset = solve.scale * source.factor, solve.scale * source.offset + solve.offset
+            followed["surfaces", k, *path], likes[k] = ScaledPath(("surfaces", k, *path), factor, offset), like
+    return [*followed.values()][len(paths) :], likes
 
 
 def _numbered(block: Block, keyword: str, number: str) -> Record | None:
@@ -565,7 +527,7 @@ def _number(cell: Cell, row: ValueRow, file: LensFile) -> float:
         raise LensFileError(f"{cell.name} is {shown(text)}; only the object may be at infinity", place)
     value, power = number(text, label, place), power_of(row, file.lens)
     if not row.path:
-        kind, numbers = file.typed(cell.number)
+        kind, numbers = file.surfaces[cell.number].row, file.surfaces[cell.number].numbers
         power = kind.power(row.keyword, cell.parameter)
     try:
         value = inverse(text, file.millimetres) if power is INVERSE else in_millimetres(value, power, file.millimetres)
@@ -598,6 +560,23 @@ def _medium(cell: Cell, row: ValueRow, file: LensFile) -> Glass:
     if record and record.words and record.words[0].upper() == cell.value.upper():
         return file.lens.surfaces[cell.number].glass  # of the same name, with the indices that the file has for it
     return file.medium(Record("GLAS", (cell.value, "0", "0", "1.5", "40"), "", place)) if cell.value else AIR
+
+
+def _is_of_terms(j: int, row: SurfaceType) -> bool:
+    """Whether XDAT j changes every term: their number, or the radius by which coefficients are normalised."""
+    return row.terms is not None and (j == 1 or (j == 2 and row.terms_are_coefficients))
+
+
+def _terms(cell: Cell, file: LensFile) -> dict:
+    """The fields of a surface whose terms have another number (XDAT 1), or another radius of normalisation (XDAT 2)."""
+    typed, place = file.surfaces[cell.number], cell.record.place
+    changed = Block(typed.block.place)
+    datum = Record("XDAT", (str(cell.parameter), cell.value), "", place)
+    changed.records = {**typed.block.records, "XDAT": [*typed.block.all("XDAT"), datum]}
+    try:
+        return typed.row.fields(numbers_of(changed, typed.row, file.millimetres))
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
 
 
 def _words(cell: Cell, row: ValueRow, file: LensFile, paths: Sequence[ScaledPath]) -> tuple:
@@ -699,7 +678,7 @@ def environment(system: Block) -> Environment | None:
     record = system.last("ENVD")
     if record is None or not record.integer(2, "whether indices follow the environment", 0):
         return None
-    return environment_at((record.number(0, "temperature"), record.number(1, "pressure")), record.place)
+    return environment_at([ROWS[name].read(record) for name in ENVIRONMENT_OPERANDS], record.place)
 
 
 def report_environment(sections: Sections, lens: Lens, report: Draft) -> None:
@@ -726,8 +705,7 @@ def environment_line(lens: Lens, place: Place) -> str:
     """The line of ENVD."""
     if lens.environment is None:
         return "ENVD 20 1 0"
-    values = (exact(getattr(lens.environment, name), name, place) for name in ENVIRONMENT_OPERANDS.values())
-    return " ".join(["ENVD", *values, "1"])
+    return " ".join(["ENVD", *(ROWS[name].write(lens, place) for name in ENVIRONMENT_OPERANDS), "1"])
 
 
 def is_of_surfaces(operand: Operand) -> bool:

@@ -43,21 +43,20 @@ from raytrace.io.source import (
     plain,
     read_text,
 )
-from raytrace.io.zemax.configurations import STATUSES, VARIABLE
 from raytrace.io.zemax.surfaces import (
     BLANK,
-    FIRST_TERM,
     INVERSE,
     SYSTEM_IGNORED,
     TAIL_REASON,
-    Named,
     Numbers,
     Sections,
     SurfaceType,
     in_millimetres,
+    inverse,
     measured,
     numbers_of,
     records,
+    spelled_inverse,
     type_name,
     type_of,
     types,
@@ -109,6 +108,9 @@ _FOLLOWED = ("pickup", *(r.kind for r in (*CURVATURE_SOLVES.values(), *THICKNESS
 _FIXED, _SEMI_DIAMETER_RULES = 1, {2: "pickup", 3: "maximum"}
 _MODEL, _GLASS_RULES = 1, {2: "pickup", 3: "substitute"}
 
+#: Status of a number of a configuration: 1 is a variable.
+VARIABLE, STATUSES = 1, {2: "pickup", 4: "thermal"}
+
 #: Quantities of a model glass, by the position of the word of GLAS that makes them variable.
 _GLASS_NUMBERS = {6: "index", 7: "abbe_number", 8: "partial_dispersion"}
 
@@ -132,12 +134,16 @@ class TypedSurface(NamedTuple):
     def number(self) -> int:
         return self.block.place.surface
 
-    def names(self, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
-        return self.row.names(self.surface, self.numbers, keyword, j)
+    def names(self, keyword: str, j: int) -> dict[str, float]:
+        """The numbers of the lens that PARM j, or XDAT j, gives, by their names, each with its factor."""
+        return self.row.names(self.surface, self.numbers, keyword, j)[0]
+
+    def modelled(self, quantity: str) -> Surface:
+        """The surface with a quantity of its type modelled, where it was 0."""
+        return self.row.named(self.surface, self.numbers).get(quantity, ("", 0, self.surface))[2]
 
     def code(self, keyword: str) -> int:
-        record = self.block.last(keyword)
-        return record.integer(1, "code", 0) if record else 0
+        return self.block.integer(keyword, "code", 0, 1)
 
     def numbered(self, keyword: str) -> list[tuple[int, Record]]:
         """The records of a keyword in the order of their numbers."""
@@ -150,7 +156,7 @@ class TypedSurface(NamedTuple):
         """The rule of a code, and the surface that it refers to."""
         code = self.code(keyword)
         refers = code in kinds and kinds[code] != "substitute"
-        source = self.block.last(keyword).integer(2, "surface", 0) if refers else 0
+        source = self.block.integer(keyword, "surface", 0, 2) if refers else 0
         return self.solve(quantity, kinds.get(code, f"code {code}"), source=source)
 
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
@@ -256,55 +262,74 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
 def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
     numbers = _solve_numbers(record, 1)
     source = _source(numbers, typed.number)
-    named, _ = typed.names("PARM", j)
-    there, _ = surfaces[source].names("PARM", j) if source is not None else ((), None)
-    power = typed.row.parameters[j].power if j in typed.row.parameters else 0
-    is_linear = named and there and power is not INVERSE and named[0].factor == there[0].factor == 1
+    names, names_there = typed.names("PARM", j), {} if source is None else surfaces[source].names("PARM", j)
+    name, there = next(iter(names), ""), next(iter(names_there), "")
+    power = typed.row.power("PARM", j)
+    is_linear = name and there and names[name] == names_there[there] == 1
+    if power is INVERSE:  # the lens holds the reciprocals of lengths, which are proportional without an offset
+        is_linear = is_linear and len(numbers) > 1 and numbers[1] and not any(numbers[2:])
     if not is_linear or any(numbers[3:]) or len(numbers) < 2:
         yield typed.solve(f"PARM {j}", "PPAR", _with_offset(numbers, power or 0, typed.millimetres))
         return
-    offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power, typed.millimetres)
-    other = there[0].name if there[0].name != named[0].name else ""
-    yield typed.pickup(named[0].name, source, numbers[1], offset, other)
-    yield from _followers(typed, named)
+    offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power or 0, typed.millimetres)
+    scale = inverse(record.words[2], 1.0) if power is INVERSE else numbers[1]
+    yield typed.pickup(name, source, scale, offset, there if there != name else "")
+    yield from _followers(typed, names)
 
 
 def _parameter_variable(typed: TypedSurface, keyword: str, j: int) -> list[Vary | Solve]:
-    named, _ = typed.names(keyword, j)
-    if not named:
+    names = typed.names(keyword, j)
+    if not names:
         return [typed.solve(f"{keyword} {j}", "variable")]
-    return [Vary(typed.number, named[0].name), *_followers(typed, named)]
+    return [Vary(typed.number, next(iter(names))), *_followers(typed, names)]
 
 
-def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> list[Solve]:
+def _followers(typed: TypedSurface, names: dict[str, float]) -> list[Solve]:
     """The further numbers of the lens that a number of the file gives, as pickups of the first."""
-    first, *others = named
-    return [typed.pickup(n.name, typed.number, n.factor / first.factor, other=first.name) for n in others]
+    first, *others = names
+    return [typed.pickup(name, typed.number, names[name] / names[first], other=first) for name in others]
 
 
 # -- the optimisation data of a file, read ----------------------------------------------------------------------------
 
 
-def read(sections: Sections, lens: Lens, millimetres: float, configured: Sequence[Vary | Solve], report: Draft) -> Lens:
-    """The lens with its optimisation data, None where the file has none; every variable is modelled.
-
-    configured: the variables and pickups of the numbers that operands set.
-    """
+def typed_surfaces(sections: Sections, lens: Lens, millimetres: float) -> list[TypedSurface]:
+    """The surfaces with their records, types and numbers."""
     surfaces = []
     for block, surface in zip(sections.surfaces, lens.surfaces, strict=True):
         row = types()[type_name(block)]
         surfaces.append(TypedSurface(block, surface, row, numbers_of(block, row, millimetres), millimetres))
-    head = sections.system.last("MNUM")
+    return surfaces
+
+
+def rules_of(surfaces: Sequence[TypedSurface], report: Draft) -> list[Vary | Solve]:
+    """The variables, solves and pickups of the surfaces, in the order of their evaluation."""
+    return [rule for typed in surfaces for rule in _rules(typed, surfaces, report)]
+
+
+def read(
+    sections: Sections,
+    lens: Lens,
+    surfaces: Sequence[TypedSurface],
+    rules: Sequence[Vary | Solve],
+    configured: Sequence[Vary | Solve],
+    report: Draft,
+) -> Lens:
+    """The lens with its optimisation data, None where the file has none; every variable is modelled.
+
+    rules: of the surfaces; configured: the variables and pickups of the numbers that operands set.
+    """
+    millimetres, head = surfaces[0].millimetres, sections.system.last("MNUM")
     start = head.place.line if head and head.place.line > sections.surfaces[-1].place.line else math.inf
     tail = [record for record in sections.tail if record.place.line < start]
     set_by_operands = {operand.paths[0].path for operand in lens.operands if operand.paths}
 
     def is_overridden(rule: Vary | Solve) -> bool:
         """Whether a variable of a surface is a number of the configurations, whose status holds."""
-        path = _path_of(lens.surfaces[rule.surface], rule.quantity) if isinstance(rule, Vary) else None
+        path = path_of(lens.surfaces[rule.surface], rule.quantity) if isinstance(rule, Vary) else None
         return path is not None and ("surfaces", rule.surface, *path) in set_by_operands
 
-    rules = [rule for typed in surfaces for rule in _rules(typed, surfaces, report) if not is_overridden(rule)]
+    rules = [rule for rule in rules if not is_overridden(rule)]
     variables = tuple(rule for rule in (*rules, *configured) if isinstance(rule, Vary))
     solves = [rule for rule in (*rules, *configured) if isinstance(rule, Solve)]
     for solve in solves:
@@ -348,26 +373,16 @@ def _is_followed(solve: Solve) -> bool:
     return solve.kind == "pickup" and bool(solve.numbers) and is_linear
 
 
-def _path_of(surface: Surface, quantity: str) -> LensPath | None:
+def path_of(surface: Surface, quantity: str) -> LensPath | None:
     """The path of a quantity in a surface; None where the surface does not have it."""
-    if quantity == "thickness":
-        return ("thickness",)
+    if quantity in ("thickness", "glass", "curvature"):
+        return (quantity,)
     place = parameter_paths(surface).get(quantity)
     return place and place.steps
 
 
 def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and solves and pickups of them."""
-
-    def modelled(typed: TypedSurface, name: str) -> Surface:
-        if name not in ("thickness", "curvature", "conic", *_GLASS_NUMBERS.values()):
-            data = [("XDAT", record.integer(0, "number of the datum")) for record in typed.block.all("XDAT")]
-            for keyword, j in (*(("PARM", j) for j in typed.row.parameters), *data):
-                named, like = typed.names(keyword, j)
-                if name in [number.name for number in named]:
-                    return like
-        return typed.surface
-
     moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
     for solve in data.solves:
         source = (solve.source, solve.quantity_of_source or solve.quantity)
@@ -375,8 +390,8 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
             moving.add((solve.surface, solve.quantity))
     changed = list(lens.surfaces)
     for number, name in sorted(moving):
-        like = modelled(surfaces[number], name)
-        path = _path_of(like, name)
+        like = surfaces[number].modelled(name)
+        path = path_of(like, name)
         if path is not None and part(changed[number], path) is None:
             changed[number] = with_part(changed[number], path, double(0.0), like=like)
     return dataclasses.replace(lens, surfaces=tuple(changed))
@@ -502,7 +517,9 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
             code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
         lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
     rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
-    parameters = _parameters(lens.surfaces[number]) if rules else {}
+    row, surface = types().get(type_of(lens.surfaces[number]) or ""), lens.surfaces[number]
+    has_numbers = bool(rules) and row is not None
+    parameters = row.named(surface, row.numbers(surface)._replace(size=surface.semi_diameter)) if has_numbers else {}
     for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
@@ -522,7 +539,7 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
                 lines, words[3] = with_glass_line(lines), str(rule.source)
             lines = changed(lines, "GLAS", words)
         else:
-            lines = _with_parameter(lines, rule, parameters, place)
+            lines = _with_parameter(lines, rule, row, parameters, place)
     return lines
 
 
@@ -537,10 +554,10 @@ def _operand_pickups(lens: Lens, number: int, place: Place) -> list[Solve]:
         if number == operand.number or not followed or followed[0].path[2] == "environment":
             continue
         path, scale, offset = followed[0]
-        names = {found.steps: name for name, found in parameter_paths(lens.surfaces[number]).items()}
+        names = {at.steps: name for name, at in parameter_paths(lens.surfaces[number]).items()}
         is_parameter = operand.name in ("PRAM", *(f"PAR{j}" for j in range(1, 9)))
         quantity = names.get(path[2:]) if is_parameter else quantities.get(operand.name)
-        if not quantity or path[2:] != operand.paths[0].path[2:] or path[2] == "phase":
+        if not quantity or path[2:] != operand.paths[0].path[2:]:
             raise LensFileError(f"follows {operand} by a rule that is not written", place)
         pickups.append(Solve(number, quantity, "pickup", source=operand.number, scale=scale, offset=offset))
     return pickups
@@ -608,9 +625,9 @@ def with_glass_line(lines: Lines) -> Lines:
     return _behind(lines, "DISZ", f"GLAS {BLANK} 0 0 1.5 40 0 0 0 0 0 0")
 
 
-def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: Place) -> Lines:
+def _with_parameter(lines: Lines, rule: Vary | Solve, row: SurfaceType, parameters: dict, place: Place) -> Lines:
     keyword, _, j = rule.quantity.partition(" ")
-    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))
+    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))[:2]
     if not keyword:
         raise _unheld(rule, place)
     is_variable = isinstance(rule, Vary) or rule.kind == "variable"
@@ -622,23 +639,11 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
     if is_variable:
         line = f"VPAR {j}"
     elif rule.kind == "pickup":
-        line = f"PPAR {j} {rule.source} {rule.scale!r} {rule.offset!r} 0"
+        scale = spelled_inverse(rule.scale) if row.parameters[j].power is INVERSE else repr(rule.scale)
+        line = f"PPAR {j} {rule.source} {scale} {rule.offset!r} 0"
     else:
         line = " ".join([f"PPAR {j}", *map(_spelled, rule.numbers)])
     return _behind(lines, f"PARM {j}", line)
-
-
-def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
-    """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
-    row, by_name = types().get(type_of(surface) or ""), {}
-    if row is None:
-        return by_name
-    numbers = row.numbers(surface)._replace(size=surface.semi_diameter)
-    data = 0 if numbers.terms is None else len(numbers.terms)
-    for keyword, j in (*(("PARM", j) for j in row.parameters), *(("XDAT", FIRST_TERM + k) for k in range(data))):
-        for named in row.names(surface, numbers, keyword, j)[0]:
-            by_name.setdefault(named.name, (keyword, j))
-    return by_name
 
 
 def _unheld(rule: Vary | Solve, place: Place) -> LensFileError:

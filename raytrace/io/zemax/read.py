@@ -25,9 +25,9 @@ from raytrace.io.source import (
     LensFileError,
     Record,
     UnsupportedSurface,
-    in_lines,
     refuse_few,
     shown,
+    unit_of,
 )
 from raytrace.io.zemax import configurations, optimization
 from raytrace.io.zemax.surfaces import (
@@ -36,6 +36,7 @@ from raytrace.io.zemax.surfaces import (
     FIELD_LISTS,
     FIELD_NAMES,
     NOTE_PIECE,
+    ROWS,
     SYSTEM_APERTURES,
     Sections,
     build,
@@ -77,13 +78,14 @@ def read(
         ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
         ("FTYP", 6, "afocal", "afocal image space (FTYP, seventh value); the image is taken as a plane"),
     ):
-        record = parts.system.last(keyword)
-        if record and record.integer(position, quantity, 0):
-            report.warn(message, record.place)
+        if parts.system.integer(keyword, quantity, 0, position):
+            report.warn(message, parts.system.last(keyword).place)
     of_name = partial(medium, catalogs=came, user=catalogs, report=report.again())
-    file_as_stored = configurations.LensFile(parts, lens, unit, of_name)
-    lens, configured = configurations.read(file_as_stored, report, configuration)
-    lens = optimization.read(parts, lens, unit, configured, report)
+    typed = optimization.typed_surfaces(parts, lens, unit)
+    rules = optimization.rules_of(typed, report)
+    as_stored = configurations.LensFile(parts, lens, unit, typed, rules, of_name)
+    lens, configured = configurations.read(as_stored, report, configuration)
+    lens = optimization.read(parts, lens, typed, rules, configured, report)
     configurations.report_environment(parts, lens, report)
     return lens
 
@@ -93,8 +95,8 @@ def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
     system, stop = parts.system, _stop(parts.surfaces)
     name, environment = system.last("NAME"), configurations.environment(system)
     aiming, primary = system.last("RAIM"), system.last("PWAV")
-    kind = aiming.integer(1, "ray aiming", 0) if aiming else None
-    if aiming and not 0 <= kind < len(AIMINGS):
+    kind = system.integer("RAIM", "ray aiming", 0, 1)
+    if not 0 <= kind < len(AIMINGS):
         raise LensFileError(f"RAIM of kind {kind}, expected 0 (off), 1 (paraxial) or 2 (real)", aiming.place)
     wavelengths = _wavelengths(system, report)
     if primary is None and len(wavelengths["wavelengths"]) > 1:
@@ -107,11 +109,11 @@ def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
         aperture=aperture,
         **_fields(system, unit, report),
         **wavelengths,
-        primary_wavelength=primary.integer(0, "primary wavelength") if primary else 1,
+        primary_wavelength=system.integer("PWAV", "primary wavelength", 1),
         name=name.text.strip() if name else "",
         notes=_notes(system),
         catalogs=tuple(name for record in system.all("GCAT") for name in record.words),
-        ray_aiming="auto" if kind is None else AIMINGS[kind],
+        ray_aiming=AIMINGS[kind] if aiming else "auto",
         environment=environment,
     )
     draft.sources |= {
@@ -152,21 +154,13 @@ def _millimetres(system: Block, report: Draft) -> float:
         report.note("no UNIT: lengths are in mm")
         return 1.0
     unit = record.words[0].upper() if record.words else ""
-    if unit not in MILLIMETRES:
-        raise LensFileError(f"UNIT is {shown(unit)}, expected one of MM, CM, IN, METER", record.place)
-    if unit != "MM":
-        report.note(f"lengths of the file are in {unit}; converted to mm")
-    return MILLIMETRES[unit]
+    return unit_of(unit, MILLIMETRES, "UNIT", "one of MM, CM, IN, METER", record.place, report)
 
 
 def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, report: Draft) -> tuple[str, float, Record]:
     """The system aperture: ENPD, FNUM (0 image space, 1 working), OBNA (0 sine, 1 cone angle) or FLOA (by the stop)."""
-    records = system.all("ENPD", "FNUM", "OBNA", "FLOA")
-    if not records:
-        raise LensFileError("no system aperture; expected one of ENPD, FNUM, OBNA, FLOA", system.place)
-    record = records[-1]
-    if len({other.keyword for other in records}) > 1:
-        report.warn(f"several system apertures ({in_lines(records)}); the last is used", record.place)
+    keywords = dict.fromkeys(keyword for keyword, _ in SYSTEM_APERTURES.values())
+    record = system.last_of_kind(keywords, "system aperture", report)
     if record.keyword == "FLOA":
         if not stop_semi_diameter:
             raise LensFileError("FLOA (float by stop size), but the stop surface has no DIAM", record.place)
@@ -198,7 +192,7 @@ def _count(system: Block, position: int, quantity: str) -> int | None:
 def _fields(system: Block, unit: float, report: Draft) -> dict:
     """The field points: FTYP (kind, telecentric, count), XFLN, YFLN, weights and vignetting factors."""
     record = system.last("FTYP")
-    kind = record.integer(0, "kind of field", 0) if record else 0
+    kind = system.integer("FTYP", "kind of field", 0)
     if not 0 <= kind < len(FIELD_KINDS):
         name = f" ({FIELD_NAMES[kind]})" if kind in FIELD_NAMES else ""
         raise LensFileError(f"FTYP {kind}{name} is not modelled; expected a kind of field from 0 to 3", record.place)
@@ -220,7 +214,7 @@ def _fields(system: Block, unit: float, report: Draft) -> dict:
         "y": [length * value for value in lists["y"]],
         "field_weights": lists["weight"],
         "vignetting": [lists[name] for name in FIELD_LISTS if name.isupper()],
-        "telecentric": bool(record.integer(1, "telecentric", 0)) if record else False,
+        "telecentric": bool(system.integer("FTYP", "telecentric", 0, 1)),
     }
 
 
@@ -255,7 +249,7 @@ def _wavelengths(system: Block, report: Draft) -> dict:
         report.warn(f"the number of wavelengths is not stated (FTYP, fourth value); {count} taken", place)
     if all(slot in slots for slot in range(1, count + 1)):
         chosen = [slots[slot] for slot in range(1, count + 1)]
-        pairs = [(record.number(1, "wavelength"), record.number(2, "weight", 1.0), record) for record in chosen]
+        pairs = [(ROWS["WAVE"].read(record), ROWS["WLWT"].read(record, 1.0, 1.0), record) for record in chosen]
     elif listed is not None and len(listed.words) >= count:
         weight = [weights.number(k, "weight", 1.0) if weights else 1.0 for k in range(count)]
         pairs = [(listed.number(k, "wavelength"), weight[k], listed) for k in range(count)]

@@ -68,7 +68,6 @@ from raytrace.materials.glass import Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Operand, count, same, with_operands
 from raytrace.system.lens import Lens
-from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed
 
@@ -164,25 +163,24 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
     kind = _type(surface, place)
-    curvature = exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":
         semi_diameter = float(lens.aperture.value)
-    size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, 'semi-diameter', place)} 1"
+    size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, ROWS['SDIA'].quantity, place)} 1"
     # an aperture that follows the semi-diameter from one configuration to the next
     followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
-    posed = () if kind == "COORDBRK" or poses_are_parameters(surface) else ((1, surface.before), (2, surface.after))
+    posed = () if kind == "COORDBRK" or poses_are_parameters(surface) else ((1, "before"), (2, "after"))
     comment = one_line(surface.comment, "the comment", place)
     return [
         f"SURF {number}",
         *(["  STOP"] if number == lens.stop else []),
         f"  TYPE {kind}",
-        *(f"  SCBD {side} {_pose(pose, place)}" for side, pose in posed if pose is not None),
-        f'  CURV {curvature} 0 0 0 0 ""',
+        *(f"  SCBD {side} {_pose(surface, name, place)}" for side, name in posed if getattr(surface, name) is not None),
+        f'  CURV {ROWS["CRVT"].write(surface, place)} 0 0 0 0 ""',
         *_numbers(surface, types()[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
-        *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
+        *([] if surface.conic is None else [f"  CONI {ROWS['CONN'].write(surface, place)}"]),
         f'  DIAM {size} 0 0 1 ""',
         *_apertures(surface.apertures, place, ("surfaces", number, "apertures") in followed),
         *([f"  COMM {comment}"] if comment else []),
@@ -242,13 +240,13 @@ def _numbers(surface: Surface, row: SurfaceType, place: Place) -> list[str]:
     return lines + [f'  XDAT {i} {text} 0 0 1.0 0.0 0 ""' for i, text in enumerate(data, 1)]
 
 
-def _pose(pose: Pose, place: Place) -> str:
-    """Order, decentres and tilts of an SCBD line."""
+def _pose(surface: Surface, name: str, place: Place) -> str:
+    """Order, decentres and tilts of an SCBD line, of the pose `before` or `after` a surface."""
+    pose = getattr(surface, name)
     if pose.z is not None:
         message = "a decentre along z; add it to the thickness before; a .zmx file cannot hold it"
         raise LensFileError(message, place)
-    values = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
-    numbers = (exact(value, "tilt or decentre", place) for value in values)
+    numbers = (row.write(surface, place) for row in ROWS.values() if row.path.startswith(f"{name}."))
     return " ".join([str(int(pose.tilts_first)), "0", *numbers])
 
 
@@ -282,7 +280,7 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place, floats: bool) -> l
     keyword = "FLAP" if floats else shape.zemax[aperture.obscures]
     lines = [f"  {keyword} {' '.join(sizes)} 0"] if shape.sizes else [f"  {keyword} 0 0 0", *_corners(sizes, place)]
     if any(aperture.centre):
-        x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)
+        x, y = (exact(number, ROWS["APDX"].quantity, place) for number in aperture.centre)
         lines.append(f"  OBDC {x} {y}")
     return lines
 
@@ -419,6 +417,8 @@ def _value(operand: Operand, k: int, lens: Lens, place: Place) -> str:
         text = exact(number, str(operand), place)
         return text if row is None else _in_file_unit(text, operand, row, lens)
     content = operand.values()[k]
+    if row is not None and row.keyword == "XDAT":
+        raise LensFileError(f"{operand}: terms of another number or radius in each configuration, not written", place)
     if row is None:
         return one_line(str(content), str(operand), place).replace('"', "'")
     if row.kind == GLASS:

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.sampling import Grid, gauss_rings, square
-from raytrace.psf_models.dft import huygens, sub_pixels
+from raytrace.psf_models.dft import huygens, nodes_per_pixel, rings_and_arms, sub_pixels
+from raytrace.psf_models.wave import phase_along_radius
 from raytrace.tracing.scene import Scene, trace_scene
 from raytrace.tracing.wavefront import wavefront_of
 
@@ -33,9 +34,33 @@ class Sampling:
     arms: int
     nodes: int
 
+    def scaled(self, part: float, nodes: int = 0) -> "Sampling":
+        """A part of the rings and arms, at least 4 and 8, and so many nodes more, at least 2."""
+        arms = max(8, 4 * round(part * self.arms / 4))
+        return Sampling(max(4, round(part * self.rings)), arms, max(2, self.nodes + nodes))
+
     def __str__(self) -> str:
         pupil = f"{self.rings} × {self.arms} rings" if self.arms else f"{self.rings}² grid"
         return f"{pupil}, {self.nodes}² a pixel"
+
+
+@torch.no_grad()
+def sampling_of(scene: Scene, grid: Grid) -> Sampling:
+    """Rings, arms and nodes of the wave model at order 0, from the phase over the pupil. Raises ValueError."""
+    front = wavefront_of(scene, *gauss_rings(8, 32))
+    offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
+    reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
+    L, M = front.direction[:2, 0, 0, 0]
+    spread = torch.hypot(L - L.mean(), M - M.mean()).max()
+    cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
+    rings, arms = rings_and_arms(phase_along_radius(front, reach), 0)
+    return Sampling(rings, arms, nodes_per_pixel(float(grid.pitch), cutoff, 0))
+
+
+def reference(scene: Scene, grid: Grid) -> Tensor:
+    """The converged kernel (rows, columns) of a scene of shape (1, 1, 1). Raises ValueError."""
+    known = sampling_of(scene, grid)
+    return direct_sum(scene, grid, Sampling(known.rings + 4, known.arms + 16, known.nodes).scaled(0.75, 2))[0]
 
 
 @torch.no_grad()

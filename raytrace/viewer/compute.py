@@ -1,0 +1,328 @@
+"""Numbers and drawings of a lens that the viewer shows, all of them from the library's analyses.
+
+`refresh` is what a drag needs. Slower analyses follow when the slider is released: `mtf_of_field`, of diffraction, and
+the warnings of the analyses, `remarks`.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.analysis.chief import field_curvature_of
+from raytrace.analysis.fans import ray_fan_of
+from raytrace.analysis.layout import draw_layout
+from raytrace.analysis.mtf import geometric_mtf, least_reach, mtf, transfer
+from raytrace.analysis.setting import field_range
+from raytrace.analysis.spot_diagram import airy_radius, field_spots
+from raytrace.materials.glass import label
+from raytrace.maths.numerics import detached
+from raytrace.maths.sampling import hexapolar
+from raytrace.plotting import style
+from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Lens, field_label, field_points
+from raytrace.system.parameter_paths import number_at, parameter_paths
+from raytrace.tracing.geometry import warn_of_defects
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.paraxial import FirstOrder, first_order
+from raytrace.tracing.ray_failures import ray_failures
+from raytrace.viewer.state import State, shown_fields, word_of
+
+#: Rays of a fan and of a field in the layout, rings of dots, fields of a curve, frequencies of the MTF.
+FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
+_DIGITS = 5  # of drawings
+
+#: First-order data: words, unit, and the number.
+FIRST_ORDER: tuple[tuple[str, str, Callable[[FirstOrder], Tensor]], ...] = (
+    ("EFL", "mm", lambda one: one.effective_focal_length),
+    ("BFD", "mm", lambda one: one.back_focal_distance),
+    ("F/#", "", lambda one: one.f_number),
+    ("working F/#", "", lambda one: one.paraxial_working_f_number),
+    ("EPD", "mm", lambda one: one.entrance_pupil_diameter),
+    ("exit pupil", "mm", lambda one: one.exit_pupil_diameter),
+    ("m", "", lambda one: one.magnification),
+    ("image at", "mm", lambda one: one.paraxial_image_distance),
+)
+
+
+def plain(numbers) -> list | float | None:
+    """Numbers for JSON; None for nan and infinity."""
+    if isinstance(numbers, Tensor):
+        numbers = numbers.tolist()
+    if isinstance(numbers, list):
+        return [plain(one) for one in numbers]
+    return numbers if math.isfinite(numbers) else None
+
+
+def rounded(numbers: np.ndarray, digits: int = _DIGITS) -> list:
+    """Numbers of a drawing, to so many digits of the largest; None for nan."""
+    numbers = np.asarray(numbers, dtype=float)
+    there = np.isfinite(numbers)
+    largest = np.abs(numbers[there]).max(initial=0.0)
+    places = digits - 1 - math.floor(math.log10(largest)) if largest > 0 else 0
+    found = numbers.round(places).tolist()
+    return found if there.all() else plain(found)
+
+
+def hexadecimal(colour: str | tuple[float, ...]) -> str:
+    return colour if isinstance(colour, str) else "#" + "".join(f"{round(255 * part):02x}" for part in colour)
+
+
+# -- the drawing of a lens
+
+
+class Drawing:
+    """Axes of a figure, of which the cross section of a lens takes lines and areas: the viewer draws these itself."""
+
+    def __init__(self):
+        self.shapes, self.patches, self.limits = [], [], {"x": (0.0, 1.0), "y": (0.0, 1.0)}
+        self.dataLim = self
+
+    def plot(self, x, y, *marker, color="", linewidth=1.0, linestyle="", gid="", **look) -> None:
+        dashed = linestyle not in ("", "-") and not marker
+        self._add(x, y, kind="mark" if marker else "line", stroke=color, width=linewidth, dashed=dashed, id=gid)
+
+    def fill(self, x, y, *, facecolor="", color="", gid="", **look) -> None:
+        self._add(x, y, kind="area", fill=facecolor or color, id=gid)
+
+    def _add(self, x, y, **look) -> None:
+        look |= {name: hexadecimal(look[name]) for name in ("stroke", "fill") if name in look}
+        points = np.stack(np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float)))
+        self.shapes.append({**look, "points": points})
+
+    def annotate(self, words: str, place: tuple, *more, **look) -> None:
+        self.shapes.append({"kind": "text", "text": words, "points": np.array(place, dtype=float)[:, None]})
+
+    def set_xlim(self, low: float, high: float) -> None:
+        self.limits["x"] = low, high
+
+    def set_ylim(self, low: float, high: float) -> None:
+        self.limits["y"] = low, high
+
+    def get_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower left and upper right corner of all shapes."""
+        points = np.concatenate([one["points"] for one in self.shapes], 1)
+        return points.min(1), points.max(1)
+
+    def relim(self) -> None:
+        """Limits follow the shapes."""
+
+    def set_aspect(self, aspect: str) -> None:
+        """Both directions have one scale."""
+
+    axis = set_aspect
+
+    def document(self) -> dict:
+        size = self.limits["x"][1] - self.limits["x"][0]
+        places = _DIGITS - 1 - math.floor(math.log10(size))
+        shapes = [{**one, "points": one["points"].round(places).tolist()} for one in self.shapes]
+        return {"shapes": shapes, **self.limits}
+
+
+def layout_of(lens: Lens, fields: Tensor) -> dict:
+    """The cross section with the rays of fields (2, F). Raises ValueError for a lens that cannot be drawn."""
+    drawing = Drawing()
+    draw_layout(drawing, lens, fields=fields, rays=RAYS)
+    return drawing.document()
+
+
+# -- analyses
+
+
+def spots_of(lens: Lens, fields: Tensor) -> dict:
+    """Spots of fields (2, F): radii in µm, and dots in thousandths of the largest radius about the centroid."""
+    whole, dots = field_spots(lens, fields=fields, rings=RINGS)
+    offset = torch.where(dots.valid, dots.points - whole.centroid[:, :, None, None], torch.nan)
+    half = float(whole.geometric_radius.nan_to_num(0.0).max())
+    scaled = (1e3 / half if half > 0 else 0.0) * style.array(offset)
+    listed = []
+    for field in np.moveaxis(scaled, 0, -1):  # (W, P, 2)
+        listed.append([dot[~np.isnan(dot[:, 0])].round().astype(int).ravel().tolist() for dot in field])
+    return {
+        "rms": plain(1e3 * whole.rms_radius),
+        "geometric": plain(1e3 * whole.geometric_radius),
+        "airy": plain(1e3 * float(airy_radius(lens))),
+        "half": 1e3 * half,
+        "dots": listed,
+    }
+
+
+def fans_of(lens: Lens, fields: Tensor) -> dict:
+    """Ray fans in µm, (F, W, P) each; None where no ray arrives."""
+    fan = ray_fan_of(lens, fields, FAN)
+    sections = {}
+    for name, curve, valid in (
+        ("tangential", fan.tangential, fan.tangential_valid),
+        ("sagittal", fan.sagittal, fan.sagittal_valid),
+    ):
+        sections[name] = rounded(style.array(torch.where(valid, 1e3 * curve, torch.nan)), 6)
+    return {"pupil": plain(fan.pupil), **sections}
+
+
+def curvature_of(lens: Lens) -> dict:
+    """Field curvature in mm over fields from the axis to the largest, (W, F) each."""
+    fields = field_range(lens, FIELDS)
+    found = field_curvature_of(lens, fields)
+    curves = {"tangential": found.tangential, "sagittal": found.sagittal}
+    masked = {name: torch.where(found.valid, curve, torch.nan).T for name, curve in curves.items()}
+    return {"field": plain(fields[1]), **{name: rounded(style.array(curve), 6) for name, curve in masked.items()}}
+
+
+def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = False) -> dict:
+    """MTF (F, K) of rays, or of diffraction, up to the highest frequency in cycles/mm."""
+    frequencies = torch.linspace(0.0, highest, FREQUENCIES, dtype=fields.dtype)
+    found = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
+    return {
+        "frequency": plain(frequencies),
+        "tangential": rounded(style.array(found.tangential)),
+        "sagittal": rounded(style.array(found.sagittal)),
+        "limit": None if found.limit is None else rounded(style.array(found.limit)),
+        "transfer": transfer(found),
+    }
+
+
+def first_order_of(lens: Lens) -> list[dict]:
+    paraxial = first_order(lens)
+    return [
+        {"name": words, "value": plain(float(number(paraxial))), "unit": unit} for words, unit, number in FIRST_ORDER
+    ]
+
+
+def refresh(state: State) -> dict:
+    """All numbers that follow an edit. Analyses that the lens does not have are None, with reasons in `problems`."""
+    document = {"prescription": prescription(state), "problems": []}
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # `remarks` has them
+        lens, problems = _simple(state.lens), document["problems"]
+        fields = shown_fields(lens)
+        document["analyses"] = _analyses(lens, fields, state.frequency, problems)
+        document["stored"] = None
+        if state.compare:
+            stored = _simple(state.stored)
+            document["stored"] = _analyses(stored, shown_fields(stored), state.frequency, [])
+        spots = document["analyses"]["spots"]
+        dark = [f for f, radius in enumerate(spots["rms"] if spots else ()) if radius is None]
+        if dark:
+            document["problems"] = _lost(lens, fields[:, dark])
+    document["message"] = state.message
+    return document
+
+
+def _simple(lens: Lens) -> Lens:
+    """The lens as plain numbers; vignetting factors that are all 0 are not modelled."""
+    lens = detached(lens)
+    if lens.fields.vignetting is None or bool(lens.fields.vignetting.any()):
+        return lens
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
+
+
+def _analyses(lens: Lens, fields: Tensor, highest: float, problems: list[str]) -> dict:
+    found = {"fields": [field_label(lens, point) for point in fields.T.tolist()]}
+    found["wavelengths"] = plain(lens.wavelengths)
+    found["field_colours"] = style.field_colours(fields.shape[1])
+    found["wavelength_colours"] = [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())]
+    for name, analysis in {
+        "layout": lambda: layout_of(lens, fields),
+        "spots": lambda: spots_of(lens, fields),
+        "fans": lambda: fans_of(lens, fields),
+        "mtf": lambda: mtf_of(lens, fields, min(highest, least_reach(1e-3 * found["spots"]["half"]))),
+        "curvature": lambda: curvature_of(lens),
+        "first_order": lambda: first_order_of(lens),
+    }.items():
+        try:
+            found[name] = analysis()
+        except (ValueError, RuntimeError) as error:
+            found[name] = None
+            problems.append(str(error))
+    return found
+
+
+def _lost(lens: Lens, fields: Tensor) -> list[str]:
+    """Where the rays of fields (2, F) end, none of which reaches the sensor."""
+    pupil = hexapolar(4, dtype=lens.wavelengths.dtype)[0]
+    failures = ray_failures(lens, pupil, fields=fields, wavelengths=lens.primary[None])
+    return [f"field {field_label(lens, one)}: {failures.words(f, 0)}" for f, one in enumerate(fields.T.tolist())]
+
+
+def mtf_of_field(state: State, field: int) -> dict:
+    """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lens = _simple(state.lens)
+        fields = shown_fields(lens)[:, field : field + 1]
+        if not fields.shape[1]:
+            return {"message": f"field {field}: this lens has fewer fields"}
+        found = {"field": field, "mtf": None}
+        whole = field_spots(lens, fields=shown_fields(lens), rings=1)[0]
+        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency / 3:
+            return found  # of so large a blur diffraction shows nothing
+        try:
+            return {**found, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
+        except (ValueError, RuntimeError):  # as `refresh` reports
+            return found
+
+
+def remarks(state: State) -> list[str]:
+    """The warnings of the analyses: rays that miss the stop, surfaces and gaps that cannot be made."""
+    lens = detached(state.lens)
+    with torch.no_grad(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_filling(lens, field_points(None, like=lens))
+        warn_of_defects(lens)
+    return [*dict.fromkeys(str(one.message) for one in caught)]
+
+
+# -- the prescription
+
+
+def prescription(state: State) -> dict:
+    """The table of the lens and its conditions."""
+    lens = detached(state.lens)
+    data = lens.optimization_data
+    follows = {word_of(one) for one in (data.solves if data else ())}
+    rows, last = [], len(lens.surfaces) - 1
+    for k, surface in enumerate(lens.surfaces):
+        numbers = {} if k == last else {"thickness": surface.thickness}
+        if k > 0:
+            paths = parameter_paths(surface).items()
+            numbers |= {name: number_at(surface, path) for name, path in paths}
+        if surface.is_break:
+            numbers = {name: one for name, one in numbers.items() if name not in ("curvature", "conic")}
+        here = [{word.split(":")[0] for word in words if word.endswith(f":{k}")} for words in (state.vary, follows)]
+        rows.append(
+            {
+                "surface": k,
+                "cells": {name: plain(0.0 if one is None else float(one)) for name, one in numbers.items()},
+                "glass": None if k == last or surface.is_break else label(surface.glass),
+                "semi_diameter": surface.semi_diameter,
+                "comment": surface.comment,
+                "stop": k == lens.stop,
+                "vary": sorted(here[0]),
+                "follows": sorted(here[1]),
+            }
+        )
+    kinds = [lens.aperture.kind, "image_f_number", "entrance_pupil_diameter"]
+    return {
+        "name": lens.name,
+        "rows": rows,
+        "fields": {"kind": lens.fields.kind, "unit": FIELD_UNITS[lens.fields.kind], "y": plain(lens.fields.y)},
+        "wavelengths": plain(lens.wavelengths),
+        "primary": lens.primary_wavelength,
+        "aperture": {
+            "kind": lens.aperture.kind,
+            "value": float(lens.aperture.value),
+            "unit": APERTURE_KINDS[lens.aperture.kind],
+            "kinds": [*dict.fromkeys(kinds)],
+        },
+        "configuration": lens.current_configuration,
+        "configurations": len(lens.configurations) if lens.operands else 1,
+        "undo": len(state.past),
+        "redo": len(state.future),
+        "frequency": state.frequency,
+        "merit": state.merit,
+        "file_merit": bool(data and data.merit),
+        "compare": state.compare,
+    }

@@ -1,0 +1,291 @@
+"""State of the viewer: a lens that is edited, and the function from a state and an event to the next state.
+
+An event is a mapping with a `type`, a key of EVENTS, as the page sends it. Numbers are named as in the variable syntax:
+a surface and a quantity of `parameter_paths`. An event that cannot be carried out changes nothing but `message`.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.mtf import frequency_range
+from raytrace.optimization.merit import KINDS
+from raytrace.optimization.variables import Model, freedom, path_of
+from raytrace.plotting import style
+from raytrace.system.configurations import freed, kept
+from raytrace.system.lens import APERTURE_KINDS, Lens, SystemAperture, check, field_points
+from raytrace.system.optimization_data import Vary
+from raytrace.system.parameter_paths import modelled, with_number
+from raytrace.system.prescription import medium
+from raytrace.tracing.paraxial import first_order
+
+#: Steps of undo that are kept.
+DEPTH = 500
+
+
+@dataclass(frozen=True)
+class State:
+    """What the viewer shows.
+
+    lens, vary: the lens and its variables, words of the variable syntax; stored: the lens of the file, for comparison.
+    past, future: pairs (lens, vary), the latest last. merit: what is optimised, a key of `merit.KINDS` or "" for the
+    merit function of the file; frequency: the highest of the MTF, cycles/mm. compare: whether the stored lens is drawn
+    too; dragged: the number that a slider moves; message: why the last event changed nothing.
+    """
+
+    lens: Lens
+    stored: Lens
+    vary: tuple[str, ...] = ()
+    merit: str = ""
+    past: tuple[tuple[Lens, tuple[str, ...]], ...] = ()
+    future: tuple[tuple[Lens, tuple[str, ...]], ...] = ()
+    frequency: float = 100.0
+    compare: bool = False
+    dragged: str = ""
+    message: str = ""
+
+
+def initial(lens: Lens) -> State:
+    """The state of a lens as it was read, with the variables of its file."""
+    data = lens.optimization_data
+    words = dict.fromkeys(map(word_of, data.variables if data else ()))
+    try:
+        highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
+    except ValueError:
+        highest = 100.0
+    return State(lens, lens, tuple(words), "" if data and data.merit else "spot", frequency=highest)
+
+
+def shown_fields(lens: Lens) -> Tensor:
+    """The fields that are drawn (2, F), at most five, spread over all."""
+    points = field_points(None, like=lens)
+    count = points.shape[1]
+    return points[:, torch.linspace(0, count - 1, min(count, 5)).round().long()]
+
+
+def reduce(state: State, event: Mapping) -> State:
+    """The state behind an event; the same one with a message where the event cannot be carried out."""
+    change = EVENTS.get(event.get("type"))
+    if change is None:
+        return dataclasses.replace(state, message=f"unknown event {event.get('type')!r}")
+    try:
+        return change(dataclasses.replace(state, message=""), event)
+    except (ValueError, RuntimeError, LookupError) as error:
+        words = f"{error.args[0]!r} is missing" if type(error) is KeyError else str(error)
+        return dataclasses.replace(state, message=words)
+
+
+def word_of(one: Vary) -> str:
+    """A variable as a word of the variable syntax, "curvature:3"; of all configurations."""
+    return f"{one.quantity}:{one.surface}"
+
+
+def variables(state: State) -> list[str | Vary]:
+    """The variables for `optimize`: those of the file with their bounds, others as words."""
+    data = state.lens.optimization_data
+    of_file = [one for one in (data.variables if data else ()) if word_of(one) in state.vary]
+    return [*of_file, *(word for word in state.vary if word not in map(word_of, of_file))]
+
+
+# -- numbers
+
+
+def number(text: object, what: str) -> float:
+    """A number from a table or a slider. Raises ValueError for a text that is none, and for nan."""
+    try:
+        found = float(str(text).strip().replace("−", "-").replace("∞", "inf"))
+    except ValueError:
+        found = math.nan
+    if math.isnan(found):
+        raise ValueError(f"{what}: {str(text)!r} is not a number; nothing was changed")
+    return found
+
+
+def numbers(texts: object, what: str) -> list[float]:
+    """Several numbers, a list or a text like "0, 14 20". Raises ValueError."""
+    words = re.split(r"[,;\s]+", texts.strip()) if isinstance(texts, str) else texts
+    if not isinstance(words, Sequence) or not [word for word in words if word != ""]:
+        raise ValueError(f"{what}: expected at least one number; nothing was changed")
+    return [number(word, what) for word in words if word != ""]
+
+
+def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
+    """The lens with another number, or glass, of a surface; its solves and pickups follow. Raises ValueError."""
+    what = f"{quantity} of surface {surface}"
+    if not 0 <= surface < len(lens.surfaces):
+        raise ValueError(f"{what}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
+    if quantity == "glass":
+        lens = lens.replace(surface, glass=medium(str(text), lens.catalogs, f"surface {surface}"))
+    elif quantity == "semi_diameter":
+        size = number(text, what) if str(text).strip() else None
+        if size is not None and not 0 <= size < math.inf:
+            raise ValueError(f"{what}: found {size:g}; expected mm, 0 or more")
+        lens = lens.replace(surface, semi_diameter=size)
+    else:
+        given = number(text, what)
+        if quantity == "radius":
+            if given == 0:
+                raise ValueError(f"{what}: found 0; a plane has radius inf")
+            quantity, given = "curvature", 1 / given
+        if not math.isfinite(given) and (surface, quantity) != (0, "thickness"):
+            raise ValueError(f"{what}: found {given:g}; expected a finite number")
+        whole = modelled(lens.surfaces[surface], quantity)
+        place = path_of(whole, quantity, f"surface {surface}: ")
+        changed = with_number(whole, place, lens.surfaces[-2].thickness.new_tensor(given))
+        surfaces = (*lens.surfaces[:surface], changed, *lens.surfaces[surface + 1 :])
+        lens = dataclasses.replace(lens, surfaces=surfaces)
+        lens = kept(lens) if lens.operands else lens
+    check(lens)
+    return solved(lens)
+
+
+def solved(lens: Lens) -> Lens:
+    """The lens whose solves and pickups hold."""
+    if lens.optimization_data is None or not lens.optimization_data.solves:
+        return lens
+    free = freedom(lens)
+    return Model(free.lens, (), free.solves).lens_at(torch.zeros(0).numpy())
+
+
+def aperture_value(lens: Lens, kind: str) -> float:
+    """The number of a system aperture of another kind for the same paraxial beam."""
+    paraxial = first_order(lens)
+    numbers = {
+        "image_f_number": paraxial.f_number,
+        "entrance_pupil_diameter": paraxial.entrance_pupil_diameter,
+        "paraxial_working_f_number": paraxial.paraxial_working_f_number,
+        "float_by_stop": paraxial.stop_height.abs(),
+        "object_na": paraxial.object_na,
+        lens.aperture.kind: lens.aperture.value,
+    }
+    if kind not in numbers:
+        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(numbers)}")
+    return float(numbers[kind])
+
+
+# -- events
+
+
+def _edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag: str = "") -> State:
+    """The state with another lens; the one before can be undone. A drag of one number is one step."""
+    goes_on = bool(state.dragged) and state.dragged == drag
+    past = state.past if goes_on else (*state.past, (state.lens, state.vary))[-DEPTH:]
+    vary = state.vary if vary is None else vary
+    return dataclasses.replace(state, lens=lens, vary=vary, past=past, future=(), dragged=drag)
+
+
+def _edit(state: State, event: Mapping) -> State:
+    surface, quantity = int(event["surface"]), str(event["quantity"])
+    named = "curvature" if quantity == "radius" else quantity
+    key = f"{named}:{surface}"
+    lens = with_value(state.lens, surface, quantity, event["value"])
+    found = _edited(state, lens, drag=key if event.get("drag") or state.dragged == key else "")
+    return found if event.get("drag") else dataclasses.replace(found, dragged="")
+
+
+def _vary(state: State, event: Mapping) -> State:
+    word = f"{event['quantity']}:{int(event['surface'])}"
+    chosen = tuple(one for one in state.vary if one != word)
+    if event.get("on"):
+        freedom(state.lens, word)
+        chosen = (*chosen, word)
+    return _edited(state, state.lens, chosen)
+
+
+def _fields(state: State, event: Mapping) -> State:
+    """Fields along y; where as many are given as there are, x, weights and vignetting factors stay."""
+    lens, y = state.lens, numbers(event["values"], "fields")
+    if len(y) == len(lens.fields.y):
+        fields = dataclasses.replace(lens.fields, y=lens.fields.y.new_tensor(y))
+        lens = dataclasses.replace(freed(lens, fields=y), fields=fields)
+        check(lens)
+        return _edited(state, solved(lens), drag="")
+    return _edited(state, solved(lens.at(fields=y)))
+
+
+def _wavelengths(state: State, event: Mapping) -> State:
+    """The primary wavelength and weights stay where the new list has them."""
+    lens = state.lens
+    values = numbers(event["values"], "wavelengths")
+    found = lens.at(wavelengths=values)
+    weights = dict(zip(lens.wavelengths.tolist(), lens.wavelength_weights.tolist(), strict=True))
+    primary = float(lens.primary)
+    found = dataclasses.replace(
+        found,
+        wavelength_weights=lens.wavelength_weights.new_tensor([weights.get(one, 1.0) for one in values]),
+        primary_wavelength=1 + values.index(primary) if primary in values else 1,
+    )
+    return _edited(state, solved(found))
+
+
+def _primary(state: State, event: Mapping) -> State:
+    lens = dataclasses.replace(state.lens, primary_wavelength=int(event["number"]))
+    check(lens)
+    return _edited(state, solved(lens))
+
+
+def _aperture(state: State, event: Mapping) -> State:
+    kind = str(event.get("kind") or state.lens.aperture.kind)
+    if kind not in APERTURE_KINDS:
+        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(APERTURE_KINDS)}")
+    given = event.get("value")
+    size = aperture_value(state.lens, kind) if given is None else number(given, "aperture")
+    lens = freed(state.lens, f_number=size)
+    lens = dataclasses.replace(lens, aperture=SystemAperture(kind, lens.wavelengths.new_tensor(size)))
+    check(lens)
+    drag = "aperture" if event.get("drag") or state.dragged == "aperture" else ""
+    found = _edited(state, solved(lens), drag=drag)
+    return found if event.get("drag") else dataclasses.replace(found, dragged="")
+
+
+def _frequency(state: State, event: Mapping) -> State:
+    highest = number(event["value"], "highest frequency")
+    if not 0 < highest < math.inf:
+        raise ValueError(f"highest frequency: found {highest:g}; expected cycles/mm, more than 0")
+    return dataclasses.replace(state, frequency=highest)
+
+
+def _configuration(state: State, event: Mapping) -> State:
+    return _edited(state, state.lens.configuration(int(event["number"])))
+
+
+def _step(state: State, source: str) -> State:
+    """Undo, from "past", or redo, from "future"."""
+    before = state.past if source == "past" else state.future
+    if not before:
+        return dataclasses.replace(state, message=f"nothing to {'undo' if source == 'past' else 'redo'}", dragged="")
+    (lens, vary), here = before[-1], (state.lens, state.vary)
+    past, future = (before[:-1], (*state.future, here)) if source == "past" else ((*state.past, here), before[:-1])
+    return dataclasses.replace(state, lens=lens, vary=vary, past=past, future=future, dragged="")
+
+
+def _merit(state: State, event: Mapping) -> State:
+    kind = str(event["kind"])
+    data = state.lens.optimization_data
+    if kind not in KINDS and not (kind == "" and data and data.merit):
+        raise ValueError(f"merit {kind!r}: expected one of {', '.join(KINDS)}")
+    return dataclasses.replace(state, merit=kind)
+
+
+#: Events by their type.
+EVENTS: dict[str, Callable[[State, Mapping], State]] = {
+    "edit": _edit,
+    "vary": _vary,
+    "fields": _fields,
+    "wavelengths": _wavelengths,
+    "primary": _primary,
+    "aperture": _aperture,
+    "configuration": _configuration,
+    "frequency": _frequency,
+    "merit": _merit,
+    "compare": lambda state, event: dataclasses.replace(state, compare=bool(event.get("on"))),
+    "undo": lambda state, event: _step(state, "past"),
+    "redo": lambda state, event: _step(state, "future"),
+    "restore": lambda state, event: _edited(state, state.stored, initial(state.stored).vary),
+    "lens": lambda state, event: _edited(state, event["lens"]),
+}

@@ -1,0 +1,284 @@
+"""The viewer without a browser: states and events, the numbers of a refresh, sessions, saving, optimising."""
+
+import dataclasses
+import json
+import math
+import time
+
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace.viewer import compute
+from raytrace.viewer.session import Session
+from raytrace.viewer.state import initial, reduce, shown_fields, variables
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    return rt.read_lens("cooke_triplet")
+
+
+@pytest.fixture
+def state(triplet):
+    return initial(triplet)
+
+
+def edit(state, quantity, surface, value, **more):
+    return reduce(state, {"type": "edit", "surface": surface, "quantity": quantity, "value": value, **more})
+
+
+# -- states and events
+
+
+def test_a_number_is_edited_undone_and_redone(state):
+    thick = edit(state, "thickness", 3, "3.25")
+    assert float(thick.lens.surfaces[3].thickness) == 3.25
+    round_ = edit(thick, "radius", 1, 40)
+    assert float(round_.lens.surfaces[1].curvature) == 1 / 40
+    back = reduce(reduce(round_, {"type": "undo"}), {"type": "undo"})
+    assert back.lens is state.lens
+    assert reduce(back, {"type": "undo"}).message == "nothing to undo"
+    again = reduce(back, {"type": "redo"})
+    assert float(again.lens.surfaces[3].thickness) == 3.25
+    assert reduce(again, {"type": "redo"}).lens is round_.lens
+    assert not edit(again, "radius", 1, 41).future
+    restored = reduce(round_, {"type": "restore"})
+    assert restored.lens is state.stored
+    assert reduce(restored, {"type": "undo"}).lens is round_.lens
+
+
+def test_a_drag_is_one_step(state):
+    dragged = state
+    for thickness in (3.0, 3.1, 3.2):
+        dragged = edit(dragged, "thickness", 3, thickness, drag=True)
+    released = edit(dragged, "thickness", 3, 3.3)
+    assert len(released.past) == 1
+    assert reduce(released, {"type": "undo"}).lens is state.lens
+    other = edit(edit(dragged, "thickness", 4, 3.0, drag=True), "thickness", 3, 2.0, drag=True)
+    assert len(other.past) == 3
+    assert len(edit(edit(state, "thickness", 3, 3.0), "thickness", 3, 3.1).past) == 2
+
+
+@pytest.mark.parametrize(
+    ("event", "said"),
+    [
+        ({"quantity": "radius", "surface": 1, "value": "abc"}, "radius of surface 1: 'abc' is not a number"),
+        ({"quantity": "radius", "surface": 1, "value": "nan"}, "is not a number"),
+        ({"quantity": "radius", "surface": 1, "value": ""}, "is not a number"),
+        ({"quantity": "radius", "surface": 1, "value": 0}, "a plane has radius inf"),
+        ({"quantity": "curvature", "surface": 1, "value": "inf"}, "expected a finite number"),
+        ({"quantity": "thickness", "surface": 2, "value": "inf"}, "expected a finite number"),
+        ({"quantity": "thickness", "surface": 99, "value": 1}, "this lens has surfaces 0 to 8"),
+        ({"quantity": "thicknes", "surface": 2, "value": 1}, "no 'thicknes'; it has thickness"),
+        ({"quantity": "glass", "surface": 1, "value": "NO-GLASS"}, "NO-GLASS"),
+        ({"quantity": "thickness", "surface": 2}, "'value' is missing"),
+        ({"type": "fields", "values": "0, x"}, "fields: 'x' is not a number"),
+        ({"type": "fields", "values": ""}, "at least one number"),
+        ({"type": "fields", "values": "95"}, "90 degrees"),
+        ({"type": "wavelengths", "values": "550"}, "did you mean 0.55?"),
+        ({"type": "aperture", "value": "-3"}, "expected a number above 0"),
+        ({"type": "aperture", "kind": "wide", "value": 3}, "expected one of"),
+        ({"type": "configuration", "number": 2}, "has one configuration"),
+        ({"type": "vary", "quantity": "glas", "surface": 1, "on": True}, "no 'glas'"),
+        ({"type": "frequency", "value": 0}, "more than 0"),
+        ({"type": "merit", "kind": "beauty"}, "expected one of spot"),
+        ({"type": "shake"}, "unknown event 'shake'"),
+        ({}, "unknown event"),
+    ],
+)
+def test_what_cannot_be_carried_out_changes_nothing_but_the_message(state, event, said):
+    found = reduce(state, {"type": "edit", **event} if "quantity" in event else event)
+    if "on" in event:
+        found = reduce(state, {**event, "type": "vary"})
+    assert said in found.message
+    assert dataclasses.replace(found, message="") == state
+    assert reduce(found, {"type": "compare", "on": True}).message == ""
+
+
+def test_numbers_may_be_typed_with_a_real_minus_and_infinity(state):
+    assert float(edit(state, "radius", 1, "−25.5").lens.surfaces[1].curvature) == -1 / 25.5
+    assert float(edit(state, "radius", 1, "∞").lens.surfaces[1].curvature) == 0
+    near = edit(state, "thickness", 0, "500")
+    assert float(near.lens.surfaces[0].thickness) == 500
+    assert math.isinf(edit(near, "thickness", 0, "inf").lens.surfaces[0].thickness)
+
+
+def test_glass_conic_and_semi_diameter_are_edited(state):
+    found = edit(edit(state, "glass", 1, "N-BK7"), "conic", 2, -0.5)
+    found = edit(edit(found, "semi_diameter", 1, "12"), "a4", 2, 1e-6)
+    assert not found.message
+    assert found.lens.surfaces[1].glass.name == "N-BK7"
+    assert float(found.lens.surfaces[2].conic) == -0.5
+    assert found.lens.surfaces[2].coefficients.tolist() == [0, 1e-6]
+    assert found.lens.surfaces[1].semi_diameter == 12
+    assert edit(found, "semi_diameter", 1, "").lens.surfaces[1].semi_diameter is None
+
+
+def test_conditions(state):
+    fields = reduce(state, {"type": "fields", "values": "0 5, 10; 15"})
+    assert fields.lens.fields.y.tolist() == [0, 5, 10, 15]
+    waves = reduce(state, {"type": "wavelengths", "values": [0.45, float(state.lens.primary)]})
+    assert waves.lens.wavelengths.tolist() == [0.45, float(state.lens.primary)]
+    assert waves.lens.primary_wavelength == 2
+    assert reduce(waves, {"type": "primary", "number": 1}).lens.primary_wavelength == 1
+    same = reduce(state, {"type": "aperture", "kind": "image_f_number"})
+    assert float(same.lens.aperture.value) == pytest.approx(float(rt.first_order(state.lens).f_number), rel=1e-12)
+    assert float(reduce(same, {"type": "aperture", "value": "5.6"}).lens.aperture.value) == 5.6
+
+
+def test_variables_are_ticked_and_those_of_the_file_keep_their_bounds(state):
+    ticked = reduce(state, {"type": "vary", "quantity": "curvature", "surface": 3, "on": True})
+    assert ticked.vary == ("curvature:3",)
+    assert variables(ticked) == ["curvature:3"]
+    assert reduce(ticked, {"type": "vary", "quantity": "curvature", "surface": 3, "on": False}).vary == ()
+    found = rt.optimize(state.lens, merit="spot", vary="curvature:1 thickness:2", bounds="thickness:10,15", cycles=1)
+    stored = initial(found.lens)
+    assert stored.vary == ("curvature:1", "thickness:2")
+    assert stored.merit == ""
+    assert [one.bounds for one in variables(stored)] == [(), (10.0, 15.0)]
+
+
+def test_solves_of_the_file_hold_and_configurations_keep_their_numbers(triplet):
+    free = rt.optimize(triplet, merit="spot", vary="curvature:1 sensor=marginal_height(0)", cycles=1).lens
+    solved = edit(initial(free), "radius", 1, 40)
+    axial = rt.first_order(solved.lens).paraxial_image_distance
+    assert float(solved.lens.surfaces[-2].thickness) == pytest.approx(float(axial), abs=1e-9)
+    zoom = initial(triplet.with_configurations(thickness={2: [12.0, 13.0]}))
+    second = edit(reduce(zoom, {"type": "configuration", "number": 2}), "thickness", 2, 14.0)
+    assert second.lens.operands[0].numbers.tolist() == [12, 14]
+    assert float(second.lens.configuration(1).surfaces[2].thickness) == 12
+
+
+# -- numbers
+
+
+@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
+@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss"])
+def test_numbers_of_a_refresh_are_those_of_the_library(name):
+    first = initial(rt.read_lens(name))
+    state = edit(first, "thickness", 2, 1.002 * float(first.lens.surfaces[2].thickness))
+    found = compute.refresh(state)["analyses"]
+    lens, fields = state.lens, shown_fields(state.lens)
+    paraxial = rt.first_order(lens)
+    values = {one["name"]: one["value"] for one in found["first_order"]}
+    assert values["EFL"] == float(paraxial.effective_focal_length)
+    assert values["F/#"] == float(paraxial.f_number)
+    spots = rt.spot(lens, fields=fields)
+    assert found["spots"]["rms"] == pytest.approx((1e3 * spots.whole.rms_radius).tolist(), rel=1e-7)
+    fan = rt.ray_fan(lens, fields=fields, points=compute.FAN)
+    for section, curve in (("tangential", fan.tangential), ("sagittal", fan.sagittal)):
+        assert torch.tensor(found["fans"][section]).sub(1e3 * curve).abs().max() < 1e-5 * (1e3 * curve).abs().max()
+    frequencies = found["mtf"]["frequency"]
+    mtf = rt.mtf(lens, frequencies, fields=fields, geometric=True)
+    assert torch.allclose(torch.tensor(found["mtf"]["tangential"], dtype=torch.float64), mtf.tangential, atol=1e-4)
+    curves = rt.field_curvature(lens, samples=compute.FIELDS)
+    for section, curve in (("tangential", curves.tangential), ("sagittal", curves.sagittal)):
+        shown = torch.tensor(found["curvature"][section], dtype=torch.float64)
+        assert torch.allclose(shown, curve.T, atol=1e-5 * float(curve.abs().max()))
+    slow = compute.mtf_of_field(state, 1)["mtf"]
+    exact = rt.mtf(lens, frequencies, fields=fields[:, 1:2])
+    assert slow["transfer"] == "diffraction"
+    assert torch.allclose(torch.tensor(slow["sagittal"], dtype=torch.float64), exact.sagittal, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["hubble", "phone", "singlet", "zoom"])
+def test_every_kind_of_lens_has_a_document(name):
+    lens = rt.read_lens("cooke_triplet" if name == "zoom" else name)
+    if name == "zoom":
+        lens = lens.with_configurations(thickness={2: [12.0, 13.0]})
+    state = reduce(initial(lens), {"type": "compare", "on": True})
+    found = compute.refresh(state)
+    text = json.dumps(found, allow_nan=False)
+    assert len(text) < 1_000_000
+    assert found["problems"] == []
+    assert found["analyses"] == found["stored"]
+    kinds = {shape["kind"] for shape in found["analyses"]["layout"]["shapes"]}
+    assert {"area", "line", "text"} <= kinds
+    assert found["prescription"]["configurations"] == len(lens.configurations)
+
+
+def test_a_lens_that_loses_all_rays_says_where(state):
+    lost = edit(state, "radius", 1, 1)
+    found = compute.refresh(lost)
+    assert not lost.message
+    assert found["analyses"]["spots"]["rms"] == [None] * 3
+    assert found["analyses"]["mtf"] is None
+    assert found["analyses"]["first_order"][0]["value"] == pytest.approx(
+        float(rt.first_order(lost.lens).effective_focal_length)
+    )
+    assert len(found["problems"]) == 3
+    assert "rays lost" in found["problems"][0]
+    json.dumps(found, allow_nan=False)
+    assert compute.mtf_of_field(lost, 0)["mtf"] is None
+    assert all(isinstance(one, str) for one in compute.remarks(lost))
+
+
+def test_a_large_blur_has_an_mtf_as_far_as_few_rays_show_it(state):
+    found = compute.refresh(edit(state, "thickness", 2, 8.5))["analyses"]["mtf"]
+    assert 0 < found["frequency"][-1] < state.frequency
+    assert max(found["sagittal"][0][-5:]) < 0.2
+    assert compute.mtf_of_field(edit(state, "thickness", 2, 8.5), 0)["mtf"] is None
+
+
+# -- sessions
+
+
+def test_a_session_saves_where_it_is_told_and_nowhere_else(triplet, tmp_path):
+    file = tmp_path / "lens.zmx"
+    rt.write_lens(triplet, file)
+    before = file.read_bytes()
+    session = Session(rt.read_lens(file), file)
+    assert session.answer({"type": "open"})["path"] == str(tmp_path / "lens_edited.zmx")
+    session.answer({"type": "edit", "surface": 3, "quantity": "thickness", "value": 3})
+    assert "exists" in session.answer({"type": "save", "path": str(file)})["message"]
+    assert "give the name" in session.answer({"type": "save", "path": ""})["message"]
+    assert "suffix" in session.answer({"type": "save", "path": str(tmp_path / "lens.doc")})["message"]
+    assert "cannot be written" in session.answer({"type": "save", "path": str(tmp_path / "no" / "lens.zmx")})["message"]
+    assert file.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [file]
+    assert session.answer({"type": "save", "path": str(tmp_path / "other.csv")})["message"].startswith("written")
+    assert float(rt.read_lens(tmp_path / "other.csv").surfaces[3].thickness) == 3
+    assert session.answer({"type": "save", "path": str(file), "overwrite": True})["message"].startswith("written")
+    assert float(rt.read_lens(file).surfaces[3].thickness) == 3
+
+
+def finished(session, until=60):
+    """The last reply of the optimisation of a session."""
+    ends = time.monotonic() + until
+    while time.monotonic() < ends:
+        reply = session.answer({"type": "progress"})
+        if not reply["optimisation"]["running"]:
+            return reply
+        time.sleep(0.05)
+    raise AssertionError("the optimisation does not end")
+
+
+def test_an_optimisation_runs_beside_the_session_stops_and_can_be_undone(triplet):
+    session = Session(triplet)
+    assert "nothing varies" in session.answer({"type": "optimise"})["message"]
+    for surface in (1, 2, 3, 4, 6, 7):
+        session.answer({"type": "vary", "quantity": "curvature", "surface": surface, "on": True})
+    assert session.answer({"type": "optimise"})["optimisation"]["running"]
+    refused = session.answer({"type": "edit", "surface": 3, "quantity": "thickness", "value": 3})
+    assert "optimisation is running" in refused["message"]
+    session.answer({"type": "stop"})
+    reply = finished(session)
+    assert reply["optimisation"]["failure"] == ""
+    assert reply["optimisation"]["cycles"] <= 30
+    assert reply["analyses"]["spots"]["rms"][0] is not None
+    assert session.optimisation is None
+    optimised = session.state.lens
+    assert session.answer({"type": "undo"})["message"] == ""
+    assert session.state.lens is triplet
+    session.answer({"type": "redo"})
+    assert session.state.lens is optimised
+
+
+def test_a_failure_of_an_optimisation_is_one_message(triplet):
+    session = Session(triplet)
+    session.answer({"type": "vary", "quantity": "curvature", "surface": 1, "on": True})
+    session.answer({"type": "edit", "surface": 1, "quantity": "radius", "value": 0.5})
+    session.answer({"type": "optimise"})
+    reply = finished(session)
+    assert reply["optimisation"]["failure"] or "analyses" in reply
