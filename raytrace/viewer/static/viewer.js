@@ -315,6 +315,8 @@ class Viewer {
     if (!(e.ctrlKey || e.metaKey)) return;
     const key = e.key.toLowerCase();
     if (key === "z" || key === "y") {
+      const { dataset, value } = e.target;
+      if (dataset.shown !== undefined && dataset.shown !== value) return; // the text that is being typed
       e.preventDefault();
       this.event({ type: key === "y" || e.shiftKey ? "redo" : "undo" });
     } else if (key === "enter") {
@@ -447,7 +449,9 @@ class Viewer {
 
   // A text field shows its number, unless something else is typed into it at the moment.
   show(input, text, refused = false) {
-    if (document.activeElement !== input || input.dataset.sent || refused) input.value = text;
+    const isTyping = document.activeElement === input && input.value !== input.dataset.shown && !input.dataset.sent && !refused;
+    if (!isTyping) input.value = text;
+    input.dataset.shown = text;
     delete input.dataset.sent;
   }
 
