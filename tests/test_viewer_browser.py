@@ -116,11 +116,14 @@ def settled(page) -> None:
 
 def changed(page, action) -> None:
     """Do something, and wait for the new numbers."""
+    idle = f"{VIEWER}[aria-busy=false]"
+    page.wait_for_selector(idle)
     before = count(page)
     action()
     deadline = time.monotonic() + 60
     while count(page) == before and time.monotonic() < deadline:
         page.wait_for_timeout(20)
+    page.wait_for_selector(idle)
     assert count(page) > before
 
 
@@ -304,7 +307,7 @@ def test_an_optimisation_is_stopped(page):
     for name in ("curvature:1", "curvature:2", "curvature:3", "curvature:4", "curvature:6", "thickness:2"):
         page.check(f'[data-vary="{name}"]')
     settled(page)
-    page.select_option('[aria-label="merit function"]', "wavefront")
+    page.select_option('[aria-label="merit function"]', "mtf")
     settled(page)
     page.click("text=Optimise")
     page.wait_for_selector(f"{VIEWER}.running")

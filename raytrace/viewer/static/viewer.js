@@ -337,6 +337,7 @@ class Viewer {
 
   async run(event) {
     this.busy = true;
+    this.root.setAttribute("aria-busy", "true");
     clearTimeout(this.settling);
     const started = performance.now();
     try {
@@ -347,6 +348,7 @@ class Viewer {
     }
     this.busy = false;
     if (this.queue && this.queue.length) this.run(this.queue.shift());
+    else this.root.setAttribute("aria-busy", "false");
   }
 
   receive(reply, event, waited) {
@@ -511,7 +513,8 @@ class Viewer {
     this.controls.push((lens, refused) => {
       const value = lens.rows[surface].cells[name];
       this.show(input, shownAs(value), refused);
-      vary.checked = lens.rows[surface].vary.includes(name);
+      const waits = (this.queue || []).some((one) => one.type === "vary" && one.surface === surface && one.quantity === name);
+      if (!waits) vary.checked = lens.rows[surface].vary.includes(name);
       slider.hidden = value === null;
       vary.hidden = value === null || surface === lens.rows.length - 1;
       if (value === null || slider.dataset.held) return;
