@@ -10,7 +10,7 @@ const KINDS = {
   image_f_number: "F-number", entrance_pupil_diameter: "entrance pupil, mm", object_na: "object NA",
   paraxial_working_f_number: "working F-number", object_cone_angle: "object cone, °", float_by_stop: "stop radius, mm",
 };
-const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF" };
+const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF, ¼ and ½ of range" };
 
 // -- small parts ------------------------------------------------------------------------------------------------------
 
