@@ -1,14 +1,17 @@
 """Settings of the book: `python -m sphinx docs docs/_build/html` builds it; `-b linkcheck` checks external links."""
 
+import re
+import sys
 import tomllib
 from pathlib import Path
 
 root = Path(__file__).parent
+sys.path.insert(0, str(root))
 
 project = "raytrace"
 release = tomllib.loads((root.parent / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build", "experiments"]
 nitpicky = False
 
@@ -34,3 +37,30 @@ linkcheck_anchors = True
 linkcheck_timeout = 10
 linkcheck_retries = 1
 linkcheck_report_timeouts_as_broken = False
+
+
+#: The start of a statement about an argument in a docstring: "fields: …".
+LABEL = re.compile(r"(Raises|Returns|Warns|Source)\b|[a-z][\w, ()]{0,60}: ")
+
+
+def paragraphs(app, what, name, obj, options, lines: list[str]) -> None:
+    """The text of a docstring, which is plain, as paragraphs of reStructuredText; code in backticks stays code."""
+    parts = [""]
+    for line in (line.strip() for line in lines):
+        if not line or LABEL.match(line):
+            parts.append("")
+        parts[-1] = f"{parts[-1]} {line}".strip()
+    texts = [re.split(r"`([^`]+)`", part.replace("``", "`")) for part in parts if part]
+    lines[:] = []
+    for text in texts:
+        plain = [re.sub(r"([\\*|_<>])", r"\\\1", piece) for piece in text[::2]]
+        code = [f"\\ ``{piece.strip()}``\\ " for piece in text[1::2]] + [""]
+        lines += ["".join(piece for pair in zip(plain, code, strict=True) for piece in pair), ""]
+
+
+def setup(app):
+    """Write the pages that follow from tables of the package before the build reads them."""
+    from generate import write
+
+    app.connect("builder-inited", write)
+    app.connect("autodoc-process-docstring", paragraphs)

@@ -21,16 +21,16 @@ from raytrace.system.lens import media
 from raytrace.tracing.trace import cross
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
-#: Rooms that nothing imports: experiments and measurements, no part of the library.
+#: Packages that no other imports: measurements.
 APART = ("bench",)
 
 
-def lines_of_rooms() -> Counter[str]:
-    """Lines by room, a folder or a file directly under the package."""
+def lines_of_packages() -> Counter[str]:
+    """Lines by package, a folder or a file directly under the package."""
     found = Counter()
     for path in PACKAGE.rglob("*.py"):
-        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        found[room] += len(path.read_text(encoding="utf-8").splitlines())
+        package = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        found[package] += len(path.read_text(encoding="utf-8").splitlines())
     return found
 
 
@@ -56,11 +56,11 @@ def lines_by_kind() -> Counter[str]:
 
 
 def lines_of_library() -> int:
-    return sum(lines for room, lines in lines_of_rooms().items() if room not in APART)
+    return sum(lines for package, lines in lines_of_packages().items() if package not in APART)
 
 
 def body_lengths() -> dict[str, int]:
-    """Lines of the body of every function, by "room/file.py:line name"."""
+    """Lines of the body of every function, by "package/file.py:line name"."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -111,7 +111,7 @@ def _floor(name: str) -> int:
 
 def walks() -> dict[str, Callable[[], object]]:
     """One refraction at a sphere, the PSF of traced rays, a cycle of optimize, and a training step."""
-    lens = rt.read_lens("double_gauss").at(object_distance=25e3)
+    lens = rt.read_lens("double_gauss").at(object_distance=25e3, fields=[0, 5])  # rays fill the stop: no warning
     first, second = media(lens, lens.wavelengths[:1])[:2]
     start, along = (torch.tensor(v, dtype=torch.float64)[:, None] for v in ([0.0, 5.0, 0.0], [0.0, 0.0, 1.0]))
     camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet(), model="gaussian")
@@ -139,10 +139,12 @@ def tell_walks() -> None:
 
 
 def main() -> None:
-    rooms, lengths = lines_of_rooms(), body_lengths()
-    for room, lines in sorted(rooms.items(), key=lambda one: -one[1]):
-        print(f"{lines:7,} {room}")
-    print(f"{sum(rooms.values()):7,} lines, {lines_of_library():,} of them the library (all but {' and '.join(APART)})")
+    packages, lengths = lines_of_packages(), body_lengths()
+    for package, lines in sorted(packages.items(), key=lambda one: -one[1]):
+        print(f"{lines:7,} {package}")
+    print(
+        f"{sum(packages.values()):7,} lines, {lines_of_library():,} of them the library (all but {' and '.join(APART)})"
+    )
     print("        " + ", ".join(f"{lines:,} {kind}" for kind, lines in lines_by_kind().most_common()))
     median, long = statistics.median(lengths.values()), sum(length > 25 for length in lengths.values())
     print(f"{len(lengths):7,} functions, median body {median:g} lines, {long} of more than 25")

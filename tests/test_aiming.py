@@ -41,8 +41,8 @@ def test_every_verb_traces_the_beam_that_fills_a_decentred_stop():
     # 24.6 µm of coma and astigmatism; the beam about the axis of the mirror has 1.08 µm.
     assert float(rt.spot(lens).rms_radius) == pytest.approx(0.0245941, abs=1e-6)
     assert float(rt.spot(lens.at(ray_aiming="off")).rms_radius) == pytest.approx(0.0010765, abs=1e-6)
-    for verb in (rt.wavefront, rt.ray_fan):
-        assert str(verb(lens)) == str(verb(real)), verb
+    for function in (rt.wavefront, rt.ray_fan):
+        assert str(function(lens)) == str(function(real)), function
     assert "auto: real" in str(rt.info(lens))
 
 
@@ -83,9 +83,9 @@ def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(
                       r"centre, marginal rays by .* \(1 of 2 fields .*`ray_aiming=real`") as warned:  # fmt: skip
         rt.spot(lens, fields=[0, 40])
     assert len(warned) == 1
-    for verb in (rt.layout, rt.ray_fan, rt.wavefront, rt.mtf, rt.psf, rt.trace, rt.focus, rt.relative_illumination):
+    for function in (rt.layout, rt.ray_fan, rt.wavefront, rt.mtf, rt.psf, rt.trace, rt.focus, rt.relative_illumination):
         with pytest.warns(UnfilledStop, match="field 40 degrees"):
-            verb(lens, fields=[40])
+            function(lens, fields=[40])
     curvature = lens.surfaces[1].curvature.clone().requires_grad_()
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnfilledStop)

@@ -189,7 +189,7 @@ def paraxial(surfaces, y=1.0, u=0.0, n=1.0):
     return y, u
 
 
-# ---------------------------------------------------------------- the door
+# ---------------------------------------------------------------- the command
 
 
 def test_help_imports_nothing_heavy():

@@ -34,8 +34,8 @@ def test_nanometres_are_refused_by_every_command(run, command):
 
 @pytest.mark.parametrize("command", ["info", "spot", "focus", "trace", "psf --model paraxial", "distortion", "layout"])
 def test_extrapolation_is_reported_once_for_each_glass(run, command):
-    verb, *options = command.split()
-    found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if verb == "layout" else []))
+    name, *options = command.split()
+    found = run(name, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if name == "layout" else []))
     assert found.code == 0
     warned = [line for line in found.err.splitlines() if "extrapolated" in line]
     assert [line.split(": ")[3].split(" is ")[0] for line in warned] == ["SK2 (SCHOTT)", "SK16 (SCHOTT)", "F5 (SCHOTT)"]
@@ -70,15 +70,15 @@ def test_an_object_na_of_a_distant_object_is_reported_with_a_remedy(run, command
     for old, new in NA.items():
         text = text.replace(old, new)
     Path("na.zmx").write_text(text, encoding="utf-8")
-    verb, *options = command.split()
-    distance = ["--focus-distance" if verb == "compare" else "--object-distance", 25000]
-    found = run(verb, "na.zmx", *distance, *options)
+    name, *options = command.split()
+    distance = ["--focus-distance" if name == "compare" else "--object-distance", 25000]
+    found = run(name, "na.zmx", *distance, *options)
     assert "all " in found.err
     assert "rays lost: missed surface 3" in found.err
     assert "the aperture is an object NA of 0.1, whose entrance pupil is" in found.err
     assert "F-number" in found.err
     assert "nan" not in found.out
-    held = run(verb, "na.zmx", *distance, *options, "--epd", 12.5) if verb != "compare" else None
+    held = run(name, "na.zmx", *distance, *options, "--epd", 12.5) if name != "compare" else None
     assert held is None or "lost" not in held.err
 
 
@@ -121,8 +121,8 @@ LOST = "no ray of field 0 degrees reaches the sensor: all 217 rays lost: vignett
     ],
 )
 def test_undefined_quantities_are_one_line_with_the_cause(run, command, change, message):
-    verb, *options = command.split()
-    found = run(verb, singlet("nasty", change), *options)
+    name, *options = command.split()
+    found = run(name, singlet("nasty", change), *options)
     assert found.code == 1
     assert found.out == ""
     assert message in found.err.splitlines()[-1]

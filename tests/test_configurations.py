@@ -327,6 +327,14 @@ def test_a_focal_length_that_is_picked_up_is_followed_by_its_reciprocal(tmp_path
         read(broken)[0].configuration(2)
 
 
+def test_terms_of_another_radius_are_followed_and_not_written(tmp_path):
+    surface = "TYPE XASPHERE\nXDAT 1 1\nXDAT 2 10\nXDAT 3 0.1"
+    lens = read(file(tail=two("EDVA", 1, "10", "5", 2), surface=surface))[0]
+    assert [one.surfaces[1].coefficients.tolist() for one in lens.configurations] == [[0.1 / 10**2], [0.1 / 5**2]]
+    with pytest.raises(LensFileError, match="EDVA 1 2: terms of another number or radius"):
+        write_lens(lens, tmp_path / "lens.zmx")
+
+
 def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
     tail = operands('MOFF 0 1 "far" 0 0', 'MOFF 0 2 "near" 0 0', "CWGT 0 1 1 0 0", "CWGT 0 2 2.5 0 0")
     lens = read(file(tail=tail))[0]

@@ -4,9 +4,10 @@ import ast
 import functools
 import importlib
 import re
+from pathlib import Path
 from types import ModuleType
 
-from test_layers import FLOORS, MODULES, PACKAGE, parsed, room
+from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 import raytrace
 
@@ -15,7 +16,7 @@ DOTTED = re.compile(r"`((?:\w+\.)+\w+)(?:\([^`]*)?`")
 CODE, DATA = ("py", "cpp", "h"), ("csv", "json", "pt", "zmx")
 #: Libraries, and other people's programs that a reader of their files speaks of.
 ELSEWHERE = ("nn", "seq_model", "torch")
-#: Rooms whose modules a name may mean; those of the others only from inside of them.
+#: Packages whose modules any docstring may name; modules of the others are named within their package only.
 LIBRARY = {*FLOORS} - {"bench", "cli", "plot"}
 
 
@@ -51,15 +52,16 @@ def is_there(dotted: str, name: str) -> bool:
     if first in ELSEWHERE or words[-1:] in [[data] for data in DATA]:
         return True
     if words[-1:] in [[code] for code in CODE]:
-        return any(PACKAGE.rglob(dotted))
+        return any(PACKAGE.rglob(dotted)) or (Path(__file__).parent / dotted).exists()
     if dotted in MODULES or first == "rt":
         return dotted in MODULES or words[0] in raytrace.PUBLIC
-    homes = [module(one) for one in MODULES if one.split(".")[-1] == first and room(one) in (room(name), *LIBRARY)]
+    within = (package_of(name), *LIBRARY)
+    homes = [module(one) for one in MODULES if one.split(".")[-1] == first and package_of(one) in within]
     homes += [getattr(home, first) for home in (module(name), raytrace) if hasattr(home, first)]
     homes += [
         getattr(module(where), one)
         for where, one in classes()
-        if one in (first, first.capitalize()) and room(where) in (room(name), *LIBRARY)
+        if one in (first, first.capitalize()) and package_of(where) in within
     ]
     for home in homes:
         try:

@@ -50,7 +50,7 @@ def readable(path: Path) -> Lens | None:
         return None
 
 
-# -- round trips ------------------------------------------------------------------------------------------------------
+# -- round trips -------------------------------------------------------------------------------------------------------
 
 
 def test_the_double_gauss_is_that_of_the_publication_in_both_files():
@@ -166,7 +166,7 @@ def test_texts_of_any_language_round_trip(suffix, tmp_path):
     assert again.notes == lens.notes
 
 
-# -- what cannot be written -------------------------------------------------------------------------------------------
+# -- what cannot be written --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
         write_lens(read_lens("double_gauss"), tmp_path / "no such folder" / "lens.zmx")
 
 
-# -- the door ---------------------------------------------------------------------------------------------------------
+# -- reading and writing -----------------------------------------------------------------------------------------------
 
 
 def test_suffixes_and_paths_that_are_no_lens_files(tmp_path):
@@ -299,7 +299,7 @@ def test_long_lines_do_not_hang(line, name):
     read_damaged(Path(name), content)
 
 
-# -- damaged files ----------------------------------------------------------------------------------------------------
+# -- damaged files -----------------------------------------------------------------------------------------------------
 
 _NUMBERS = "nan inf -inf INFINITY 1e999 1e308 -1e308 1e-320 0 -1 1 2 24 99 12345678901234567890 1_0 ١ 1,5 -0.0 10,20"
 _NAMES = '___BLANK MIRROR AIR 517642 STANDARD EVENASPH COORDBRK SURF STOP IN M METER 1.5/ = ( ) # : nm + é \x00 " ""'
@@ -404,7 +404,7 @@ def test_a_file_cut_off_anywhere_is_no_shorter_lens(path):
         assert len(cut.surfaces) == len(lens.surfaces)
 
 
-# -- the verbs --------------------------------------------------------------------------------------------------------
+# -- the commands ------------------------------------------------------------------------------------------------------
 
 
 def test_check_reports_the_data_read():

@@ -93,7 +93,7 @@ def test_first_and_second_derivatives_in_wavelength_and_coefficients(formula):
     assert gradgradcheck(n, (coefficients, wavelengths), rtol=1e-5, atol=1e-5)
 
 
-# -- next to a pole, beyond it, and where there is nothing -----------------------------------------------------------
+# -- next to a pole, beyond it, and where there is nothing -------------------------------------------------------------
 
 
 def test_index_and_slope_next_to_a_pole_are_exact_to_rounding():
@@ -183,7 +183,7 @@ def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zer
         assert all((gradient == 0.0).all() for gradient in gradients if gradient is not None)
 
 
-# -- the door ---------------------------------------------------------------------------------------------------------
+# -- the public functions ----------------------------------------------------------------------------------------------
 
 
 def test_index_warns_outside_the_range_and_names_glass_wavelength_and_range():
@@ -220,7 +220,7 @@ def test_a_mirror_has_no_index():
         refractive_index(MIRROR, float64(0.5))
 
 
-# -- shapes, dtypes, transforms --------------------------------------------------------------------------------------
+# -- shapes, dtypes, transforms ----------------------------------------------------------------------------------------
 
 
 def test_any_shape_and_the_dtype_of_the_wavelength():
@@ -259,7 +259,7 @@ def test_torch_func_transforms_and_compile_accept_it():
     assert torch.equal(compiled(BK7, wavelengths), refractive_index(BK7, wavelengths))
 
 
-# -- figures of a glass -----------------------------------------------------------------------------------------------
+# -- figures of a glass ------------------------------------------------------------------------------------------------
 
 
 def test_bk7_has_its_published_figures():
@@ -277,7 +277,7 @@ def test_a_medium_without_dispersion_has_abbe_number_zero():
     assert nd(AIR) == 1.0
 
 
-# -- model glass and MIL code -----------------------------------------------------------------------------------------
+# -- model glass and MIL code ------------------------------------------------------------------------------------------
 
 FIT_LINES = float64([0.5876, 0.4861, 0.6563, 0.4358])
 

@@ -12,7 +12,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 
-#: Floor of every room, a folder or a file directly under raytrace/; inside a room imports only have to run one way.
+#: Layer of every package, a folder or a file directly under raytrace/; within one, imports have no cycles.
 FLOORS = {
     # knows no optics: words of messages; files that travel with the package, processes that share one computation
     "words": -2,
@@ -25,12 +25,12 @@ FLOORS = {
     "pages": 1,
     "stores": 1,
     "settings": 1,
-    # nouns
+    # data and physics
     "materials": 2,
     "system": 3,
     # lens files
     "io": 4,
-    # verbs
+    # computations
     "tracing": 5,
     "psf_models": 6,
     "analysis": 7,
@@ -43,7 +43,7 @@ FLOORS = {
     "cli": 12,
     # measurements: nothing imports them
     "bench": 13,
-    # the package's door
+    # the public API
     "public": 14,
     "__init__": 14,
     "__main__": 14,
@@ -82,15 +82,15 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def room(name: str) -> str:
+def package_of(name: str) -> str:
     return name.split(".")[0]
 
 
 def floor(name: str) -> int:
     """The layer of the package of a module."""
-    if room(name) not in FLOORS:
-        pytest.fail(f"raytrace/{room(name)} has no layer: add it to FLOORS in {__file__}")
-    return FLOORS[room(name)]
+    if package_of(name) not in FLOORS:
+        pytest.fail(f"raytrace/{package_of(name)} has no layer: add it to FLOORS in {__file__}")
+    return FLOORS[package_of(name)]
 
 
 def imported(node: ast.AST) -> list[str]:
@@ -135,13 +135,13 @@ def folder_of(name: str) -> str | None:
 def test_imports_only_from_lower_floors(name):
     for other in imports(MODULES[name]):
         assert other != "<relative>", "relative imports hide the floor: write from raytrace.x import y"
-        if other in MODULES and room(other) != room(name):
+        if other in MODULES and package_of(other) != package_of(name):
             assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other} (floor {floor(other)})"
 
 
-@pytest.mark.parametrize("folder", sorted({room(name) for name in MODULES if "." in name}))
-def test_imports_inside_a_room_run_one_way(folder):
-    inside = {name: path for name, path in MODULES.items() if room(name) == folder}
+@pytest.mark.parametrize("folder", sorted({package_of(name) for name in MODULES if "." in name}))
+def test_imports_within_a_package_have_no_cycles(folder):
+    inside = {name: path for name, path in MODULES.items() if package_of(name) == folder}
     remaining = {
         name: [o for o in (*imports(path), *_folders(name, imports(path))) if o in inside and o != name]
         for name, path in inside.items()
@@ -233,9 +233,9 @@ def test_every_package_that_is_imported_is_declared():
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extra = project["optional-dependencies"]["view"]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extra)}
-    library = (path for name, path in MODULES.items() if room(name) != "bench")
+    library = (path for name, path in MODULES.items() if package_of(name) != "bench")
     roots = {name.split(".")[0] for path in library for name in imports(path)}
-    others = roots - set(sys.stdlib_module_names) - {room(name) for name in MODULES} - {"raytrace"}
+    others = roots - set(sys.stdlib_module_names) - {package_of(name) for name in MODULES} - {"raytrace"}
     assert {DISTRIBUTIONS.get(name, name) for name in others} <= declared
 
 

@@ -157,8 +157,8 @@ def test_long_tables_share_lines_and_list_every_row_when_asked(lens):
         str(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6), each=each)) for each in (False, True)
     )
     rows = len(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6)).row)
-    assert len(every.splitlines()) == 2 + rows
-    assert len(together.splitlines()) == 2 + 3
+    assert len(every.splitlines()) == 3 + rows  # the merit, headings and units
+    assert len(together.splitlines()) == 3 + 3
     assert str(rt.Merit.default(lens)).count("TRAC") == 21
 
 

@@ -222,7 +222,7 @@ READERS = {
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name, tmp_path, capfd):
     read, refused = survive(READERS[name](tmp_path), 200, seed=1)
-    assert read  # what is never read tests nothing behind the door
+    assert read  # unread files would test nothing
     assert refused
     capfd.readouterr()  # libtiff speaks to the terminal
 

@@ -1,4 +1,4 @@
-"""Operands of aberrations: against the verbs of analysis, stored figures, and derivatives against differences."""
+"""Operands of aberrations: against the analyses, stored figures, and derivatives against differences."""
 
 import dataclasses
 from pathlib import Path

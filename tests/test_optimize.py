@@ -1,4 +1,4 @@
-"""Optimising: the step, the descent, the verb and its command."""
+"""Optimising: the step, the descent, the function and its command."""
 
 import dataclasses
 import json

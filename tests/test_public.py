@@ -232,7 +232,7 @@ def test_a_lens_is_focused_by_every_criterion(tmp_path):
 
 
 def test_every_function_has_a_derivative_with_respect_to_a_curvature():
-    """lens.replace with a tensor that requires a gradient: every verb carries it, or shows the lens all the same."""
+    """lens.replace with a tensor that requires a gradient: every function carries it, or prints the lens unchanged."""
     lens = rt.read_lens("cooke_triplet")
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     bent = lens.replace(3, curvature=curvature)
@@ -275,9 +275,9 @@ def test_a_lens_shows_itself():
     assert "<pre>" in batch._repr_html_()
 
 
-# -- one verb, one door ------------------------------------------------------------------------------------------------
+# -- functions and their commands --------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own; those of bench, codesign and wave are none.
+#: Commands of one public function; not those of bench, codesign and wave.
 VERBS = [command for command in COMMANDS if command.verb in rt.PUBLIC]
 #: Those that need no merit function.
 OF_A_LENS = [c for c in VERBS if c.run is None and c.name not in ("evaluate", "optimize", "search")]
@@ -319,7 +319,7 @@ def assert_alike(one, other) -> None:
 
 @pytest.mark.parametrize("command", OF_A_LENS, ids=lambda command: command.name)
 def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
-    """As JSON by the verb itself; as text the result already computed."""
+    """As JSON by the function itself; as text the result already computed."""
     assert main([command.name, "cooke_triplet", "--json"]) == 0
     printed = capsys.readouterr().out
     found = getattr(rt, command.verb)(rt.read_lens("cooke_triplet"))

@@ -1,4 +1,4 @@
-"""Verbs as `raytrace` exports them: a path for a lens, one number for several, both spellings, and misuse in words."""
+"""Arguments of the public functions: a path for a lens, one number for several, both spellings, errors of misuse."""
 
 import dataclasses
 import functools
@@ -17,11 +17,11 @@ from raytrace.tracing.spot import spot_of
 from raytrace.tracing.trace import trace_lens
 
 NAN = float("nan")
-VERBS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
-PARAMETERS = {name: inspect.signature(verb).parameters for name, verb in VERBS.items()}
+FUNCTIONS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
+PARAMETERS = {name: inspect.signature(function).parameters for name, function in FUNCTIONS.items()}
 OF_A_LENS = [name for name, parameters in PARAMETERS.items() if "lens" in parameters]
-OF_SEVERAL = [(verb, name) for verb, names in PARAMETERS.items() for name in names if name in public._SEVERAL]
-#: A verb, keywords as a person may give them, and the same in full.
+OF_SEVERAL = [(function, name) for function, names in PARAMETERS.items() for name in names if name in public._SEVERAL]
+#: A function, keywords as a person may give them, and the same in full.
 ALIKE = [
     ("first_order", {}, {}),
     ("info", {}, {}),
@@ -62,56 +62,56 @@ def path(singlet, tmp_path_factory):
     return found
 
 
-def fill(verb: str, **given) -> dict:
-    """The keywords given, which are read first, and None for what else the verb requires."""
-    required = (name for name, one in PARAMETERS[verb].items() if one.default is one.empty and one.kind < 4)
+def fill(function: str, **given) -> dict:
+    """The keywords given, which are read first, and None for what else the function requires."""
+    required = (name for name, one in PARAMETERS[function].items() if one.default is one.empty and one.kind < 4)
     return given | {name: None for name in required if name not in given}
 
 
-def refused(kind, verb: str, said: str, **given) -> None:
+def refused(kind, function: str, said: str, **given) -> None:
     with pytest.raises(kind, match=re.escape(said)) as found:
-        VERBS[verb](**fill(verb, **given))
-    assert str(found.value).startswith(verb)
+        FUNCTIONS[function](**fill(function, **given))
+    assert str(found.value).startswith(function)
 
 
-@pytest.mark.parametrize(("verb", "short", "full"), ALIKE, ids=lambda value: str(value)[:30])
-def test_a_path_and_a_lens_and_one_number_and_several_are_alike(verb, short, full, path):
-    found, expected = VERBS[verb](str(path), **short), VERBS[verb](rt.read_lens(path), **full)
+@pytest.mark.parametrize(("function", "short", "full"), ALIKE, ids=lambda value: str(value)[:30])
+def test_a_path_and_a_lens_and_one_number_and_several_are_alike(function, short, full, path):
+    found, expected = FUNCTIONS[function](str(path), **short), FUNCTIONS[function](rt.read_lens(path), **full)
     assert str(found) == str(expected)
 
 
-@pytest.mark.parametrize("verb", OF_A_LENS)
-def test_arguments_that_are_not_lenses_are_refused(verb, singlet):
+@pytest.mark.parametrize("function", OF_A_LENS)
+def test_arguments_that_are_not_lenses_are_refused(function, singlet):
     for wrong, said in ((None, "None"), (5, "5"), ([singlet], "a list"), (rt.info(singlet), "as its `lens`")):
-        refused(TypeError, verb, said, lens=wrong)
+        refused(TypeError, function, said, lens=wrong)
     with pytest.raises((OSError, ValueError), match="no_such_lens"):
-        VERBS[verb](**fill(verb, lens="no_such_lens"))
+        FUNCTIONS[function](**fill(function, lens="no_such_lens"))
 
 
-@pytest.mark.parametrize(("verb", "name"), OF_SEVERAL, ids=lambda value: str(value))
-def test_arguments_that_are_not_numbers_are_refused(verb, name, singlet):
-    lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
-    refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: NAN})
-    refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: [1, NAN]})
-    refused(ValueError, verb, f"`{name}` is empty; expected a number or several", **lens, **{name: []})
-    refused(ValueError, verb, f"`{name}` is empty", **lens, **{name: torch.zeros(0)})
-    refused(TypeError, verb, f"`{name}` is 'five'; expected a number", **lens, **{name: "five"})
-    refused(TypeError, verb, f"`{name}` holds 'five'; expected a number", **lens, **{name: ["five"]})
-    refused(TypeError, verb, f"`{name}` is an object; expected a number", **lens, **{name: object()})
+@pytest.mark.parametrize(("function", "name"), OF_SEVERAL, ids=lambda value: str(value))
+def test_arguments_that_are_not_numbers_are_refused(function, name, singlet):
+    lens = {"lens": singlet} if "lens" in PARAMETERS[function] else {}
+    refused(ValueError, function, f"`{name}` holds nan; expected a number or several", **lens, **{name: NAN})
+    refused(ValueError, function, f"`{name}` holds nan; expected a number or several", **lens, **{name: [1, NAN]})
+    refused(ValueError, function, f"`{name}` is empty; expected a number or several", **lens, **{name: []})
+    refused(ValueError, function, f"`{name}` is empty", **lens, **{name: torch.zeros(0)})
+    refused(TypeError, function, f"`{name}` is 'five'; expected a number", **lens, **{name: "five"})
+    refused(TypeError, function, f"`{name}` holds 'five'; expected a number", **lens, **{name: ["five"]})
+    refused(TypeError, function, f"`{name}` is an object; expected a number", **lens, **{name: object()})
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_other_misuse_is_refused(verb, singlet):
-    lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
-    for name, one in PARAMETERS[verb].items():
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_other_misuse_is_refused(function, singlet):
+    lens = {"lens": singlet} if "lens" in PARAMETERS[function] else {}
+    for name, one in PARAMETERS[function].items():
         reader = public._reader_of_values(one) if name != "lens" else None
         if reader in (public._number, public._count):
-            refused(TypeError, verb, f"`{name}` is 'five'; expected a", **lens, **{name: "five"})
-            refused(ValueError, verb, f"`{name}` is nan; expected a", **lens, **{name: NAN})
+            refused(TypeError, function, f"`{name}` is 'five'; expected a", **lens, **{name: "five"})
+            refused(ValueError, function, f"`{name}` is nan; expected a", **lens, **{name: NAN})
         if isinstance(reader, functools.partial):
-            refused(TypeError, verb, f"`{name}` is an object; expected a", **lens, **{name: object()})
-    if all(one.kind is not one.VAR_KEYWORD for one in PARAMETERS[verb].values()):
-        refused(TypeError, verb, f"{verb} has no option `nothing_like_it` (it has ", **lens, nothing_like_it=1)
+            refused(TypeError, function, f"`{name}` is an object; expected a", **lens, **{name: object()})
+    if all(one.kind is not one.VAR_KEYWORD for one in PARAMETERS[function].values()):
+        refused(TypeError, function, f"{function} has no option `nothing_like_it` (it has ", **lens, nothing_like_it=1)
 
 
 def test_an_unknown_option_names_the_nearest(singlet):
@@ -162,13 +162,13 @@ def varied(lens, curvature):
     return dataclasses.replace(lens, surfaces=(first, changed, *rest))
 
 
-@pytest.mark.parametrize("verb", VMAPPED)
-def test_a_verb_that_reads_numbers_names_itself_under_vmap(verb, singlet):
+@pytest.mark.parametrize("function", VMAPPED)
+def test_a_verb_that_reads_numbers_names_itself_under_vmap(function, singlet):
     curvatures = torch.tensor([0.02, 0.021], dtype=torch.float64)
     with pytest.raises(
-        RuntimeError, match=f"^{verb} does not work under torch.func.vmap.* first_order, rays, base_ray"
+        RuntimeError, match=f"^{function} does not work under torch.func.vmap.* first_order, rays, base_ray"
     ):
-        torch.func.vmap(lambda c: VERBS[verb](varied(singlet, c), **VMAPPED[verb]))(curvatures)
+        torch.func.vmap(lambda c: FUNCTIONS[function](varied(singlet, c), **VMAPPED[function]))(curvatures)
 
 
 @pytest.mark.parametrize(
@@ -202,10 +202,10 @@ def test_one_number_serves_as_a_wavelength(path):
 
 
 def test_the_verbs_are_those_of_the_modules():
-    for name, verb in VERBS.items():
-        assert verb is getattr(rt, name)
-        assert verb.__doc__ == verb.__wrapped__.__doc__
-        assert pickle.loads(pickle.dumps(verb)) is verb
+    for name, function in FUNCTIONS.items():
+        assert function is getattr(rt, name)
+        assert function.__doc__ == function.__wrapped__.__doc__
+        assert pickle.loads(pickle.dumps(function)) is function
 
 
 @pytest.mark.parametrize("warned", ["spot", "read_lens"])

@@ -17,6 +17,8 @@ PYTHON = [
     ROOT / "README.md",
     *(ROOT / "docs" / "reference" / f"{name}.md" for name in ("lens_files", "rays", "psf", "learning")),
 ]
+#: Pages of every public name with an example each.
+API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -108,6 +110,31 @@ def test_python_runs(page, tmp_path, monkeypatch, capsys):
     assert blocks
     for block in blocks:
         exec(compile(block, page.name, "exec"), names)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", API, ids=lambda page: page.stem)
+def test_examples_of_public_names_run(page, tmp_path, monkeypatch):
+    import dataclasses
+    import os
+    import warnings
+
+    import torch
+
+    import raytrace as rt
+
+    monkeypatch.chdir(tmp_path)
+    names = {"dataclasses": dataclasses, "os": os, "warnings": warnings, "torch": torch, "rt": rt}
+    names |= {"lens": rt.read_lens("double_gauss"), "triplet": rt.read_lens("cooke_triplet")}
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
+        exec(compile(block, page.name, "exec"), names)
+
+
+def test_every_public_name_has_an_example():
+    import raytrace as rt
+
+    blocks = re.findall(r"^```python\n(.*?)^```", "".join(page.read_text("utf-8") for page in API), re.M | re.S)
+    assert {*rt.PUBLIC} == {*re.findall(r"\brt\.(\w+)", "".join(blocks))}
 
 
 def test_every_command_is_shown():

@@ -67,9 +67,9 @@ def test_numbers_of_16_bits_are_refused(dtype):
     with pytest.raises(ValueError, match="float32 or"):
         rt.to(lens, dtype=dtype)
     coarse = dataclasses.replace(lens, wavelengths=lens.wavelengths.to(dtype))
-    for verb in (rt.spot, rt.info, rt.layout):
+    for function in (rt.spot, rt.info, rt.layout):
         with pytest.raises(ValueError, match=f"dtype {dtype}"):
-            verb(coarse)
+            function(coarse)
 
 
 def test_air_is_not_changed_by_moving_a_lens():

@@ -13,11 +13,17 @@
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
-| distortion_grid                             | image of a square grid of object points            |
+| distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
 | compare, abilities                          | PSF models, and the properties that each can represent         |
 
-Fields are y or (x, y), wavelengths in µm.
+`result` has what their results share (a lens, fields, a summary), `setting` their fields and wavelengths, `panels`
+their figures of curves. Fields are y or (x, y), wavelengths in µm.
+
+To add an analysis: a file with a function, whose docstring has an entry for each parameter, and a subclass of
+`Analysis` with `columns`, and `draw` for a figure; a row of `PUBLIC` in `raytrace/__init__.py` and of `COMMANDS` in
+`cli/commands.py`. The text, CSV, JSON and the options of the command follow from those. Tests: `test_analysis` (all of
+them), `test_plot_analysis` (figures), `test_result` (units) and `test_NAME` (each by itself).
 """
 
 from raytrace.analysis.compare import Abilities as Abilities

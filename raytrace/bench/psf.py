@@ -321,24 +321,20 @@ def errors_of(truth: Truth, against: str, result: Kernels | Psf) -> dict[str, fl
     errors = {"l1_error": relative_l1(kernel, truth.kernels[against])}
     if "wave" in truth.kernels:
         errors["model_error"] = relative_l1(kernel, truth.kernels["wave"])
-    if isinstance(result, Psf):
-        errors["estimate"], errors["own_error"] = float(result.error), own_error(truth, against, result)
+    if isinstance(result, Psf):  # with an estimate: of the kernel, or of the variances and the energy of a Gaussian
+        errors["estimate"] = float(result.error)
+        errors["own_error"] = relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
+        if against == "gaussian":
+            variance, energy = truth.sigma**2, float(truth.kernels["gaussian"].sum())
+            excess = result.covariance.detach().double().reshape(3)[::2] - variance
+            width = float(0.5 * excess.abs().sum() / variance.sum())
+            errors["own_error"] = max(width, abs(float(kernel.sum()) / energy - 1))
     if result.covariance is not None and float(truth.sigma.min()) > 0:
         parts = result.ray_moments if isinstance(result, Kernels) else (result.ray_centroid, result.ray_covariance)
         centroid, covariance = (moment.detach().double().flatten() for moment in parts)
         errors["sigma_error"] = float((torch.sqrt(covariance[::2]) / truth.sigma - 1).abs().max())
         errors["centroid_error"] = float((centroid - truth.centroid).norm() / truth.sigma.norm())
     return errors
-
-
-def own_error(truth: Truth, against: str, result: Psf) -> float:
-    """The error that `psf` estimates: of the kernel, or of the variances and the energy of a Gaussian."""
-    kernel = result.kernel.detach().double().reshape(result.kernel.shape[-2:])
-    if against != "gaussian":
-        return relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
-    variance = truth.sigma**2
-    width = 0.5 * (result.covariance.detach().double().reshape(3)[::2] - variance).abs().sum() / variance.sum()
-    return max(float(width), abs(float(kernel.sum()) / float(truth.kernels["gaussian"].sum()) - 1))
 
 
 def relative_l1(kernel: Tensor, reference: Tensor) -> float:

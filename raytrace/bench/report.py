@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -11,7 +10,7 @@ import torch
 
 from raytrace.cli.run import open_lens
 from raytrace.files import write_text
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, plain
 from raytrace.pages import machine, table, write_page
 from raytrace.plotting.style import save
 from raytrace.system.lens import Lens
@@ -49,7 +48,7 @@ class Measured(Result):
     place: tuple[str, str] | None = None
 
     def document(self) -> dict:
-        return self.about | {"rows": [finite(dataclasses.asdict(row)) for row in self.rows]}
+        return self.about | {"rows": [plain(dataclasses.asdict(row)) for row in self.rows]}
 
     def __str__(self) -> str:
         return "\n".join(self.lines)
@@ -75,13 +74,6 @@ class Measured(Result):
         self.save_table(stem.with_suffix(".csv"))
         self.plot(stem.with_suffix(".png"))
         write_page(path, [str(self)])
-
-
-def finite(value):
-    """For JSON: None for infinite and undefined numbers."""
-    if isinstance(value, dict):
-        return {name: finite(part) for name, part in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def in_words(about: Mapping[str, str | int], sign: str = ": ", between: str = "; ") -> str:

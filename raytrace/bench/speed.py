@@ -28,10 +28,11 @@ from raytrace.bench.measure import (
     squared_radius,
     with_leaves,
 )
-from raytrace.bench.report import Measured, Request, clock_of, finite, in_words
+from raytrace.bench.report import Measured, Request, clock_of, in_words
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
+from raytrace.maths.result import plain
 from raytrace.maths.sampling import sobol
 from raytrace.pages import listing, significant
 from raytrace.shards import torch_threads
@@ -288,15 +289,12 @@ _TASKS = {
 
 
 def sizes_in_words(sizes: Sizes) -> dict[str, str]:
-    """Numbers of rays as powers of two, by the name of the field."""
-
-    def power(count: int) -> str:
-        exponent = str(count.bit_length() - 1).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
-        return f"2{exponent}" if count & (count - 1) == 0 else f"{count:,}"
-
-    return {name: power(getattr(sizes, name)) for name in ("rays", "sensor")} | {
-        name: str(getattr(sizes, name)) for name in ("small", "distances")
-    }
+    """Numbers of rays, powers of two as such, by the name of the field."""
+    words = {name: f"{count:,}" for name, count in dataclasses.asdict(sizes).items() if name != "counts"}
+    for name, count in {"rays": sizes.rays, "sensor": sizes.sensor}.items():
+        if count.bit_count() == 1:
+            words[name] = "2" + str(count.bit_length() - 1).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return words
 
 
 def document(rows: Sequence[Row], ratios: Mapping[str, Mapping[str, float | None]]) -> dict:
@@ -306,7 +304,7 @@ def document(rows: Sequence[Row], ratios: Mapping[str, Mapping[str, float | None
         speeds: dict[str, dict[str, dict[str, float]]] = {}
         for row in (row for row in rows if row.dtype == dtype):
             speeds.setdefault(row.what, {}).setdefault(row.tracer, {})[str(row.rays)] = row.speed / 1e6
-        documents[dtype] = finite({**values}) | {"millions_per_second": speeds}
+        documents[dtype] = plain({**values}) | {"millions_per_second": speeds}
     return documents
 
 

@@ -34,7 +34,7 @@ from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import read_json, read_log
 from raytrace.io import FORMATS, read_lens, write_lens
-from raytrace.maths.result import Result, plain
+from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.plotting.style import FIELD_COLOURS, new_figure, styled
 from raytrace.settings import CodesignSettings
 from raytrace.settings import read as read_settings
@@ -268,7 +268,7 @@ class CodesignResult(Result):
         settings, limits = (dataclasses.asdict(values) for values in (self.experiment.settings, limits))
         return plain({"settings": settings, **self.experiment.about, "limits": limits, **self.lens.document()})
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         result = self.lens
         if isinstance(result, Outcome):
             lines = [
@@ -278,19 +278,18 @@ class CodesignResult(Result):
                 f"  after step 1, with its own PSFs  {result.l1_joint:.5f}",
                 f"  the same network with DRT PSFs   {result.l1_before:.5f}",
                 f"  after step 2, with DRT PSFs      {result.l1_drt:.5f}",
-                f"{'object at':>12} {'L1 with DRT PSFs':>18}",
-                *(f"{float(z) / 1e3:>10g} m {loss:>18.5f}" for z, loss in result.by_distance.items()),
             ]
-        else:
-            evaluations = enumerate(zip(result.course, result.penalties, strict=True), 1)
-            lines = [
-                f"{result.model} PSFs, mean square error of a pixel behind the best linear filter",
-                f"{'evaluation':>12} {'error':>12} {'penalty, mm²':>13}",
-                *(f"{number:>12} {error:>12.8f} {penalty:>13.6g}" for number, (error, penalty) in evaluations),
-                *self._lens_lines(),
-                f"error of this lens: {result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs",
-            ]
-        return "\n".join(lines)
+            distances = [float(z) / 1e3 for z in result.by_distance]
+            losses = Column("L1 with DRT PSFs", form=".5f")
+            return [Table({Column("object at", "m", "g"): distances, losses: [*result.by_distance.values()]}, lines)]
+        course = {
+            Column("evaluation"): range(1, len(result.course) + 1),
+            Column("error", form=".8f"): result.course,
+            Column("penalty", "mm²"): result.penalties,
+        }
+        errors = f"{result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs"
+        title = f"{result.model} PSFs, mean square error of a pixel behind the best linear filter"
+        return [Table(course, [title], [*self._lens_lines(), f"error of this lens: {errors}"])]
 
     def _lens_lines(self) -> Iterator[str]:
         result = self.lens

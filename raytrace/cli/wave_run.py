@@ -26,7 +26,7 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.imaging.wave_design import WaveCamera, begin, learn_element
 from raytrace.io.pictures import read_channels, write_picture
-from raytrace.maths.result import Result, plain
+from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.compute import elements
 from raytrace.wave_optics.element import Element
@@ -68,20 +68,19 @@ class DesignedElement(ElementReport):
         inputs = {"settings": dataclasses.asdict(self.settings), "world": dataclasses.asdict(self.config)}
         return plain(inputs | dataclasses.asdict(self.quality))
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         result = self.quality
-        depths = [depth_text(depth) for depth in self.config.depths]
-        rows = [*zip(depths, *result.by_depth.values(), strict=True)]
-        rows += [("mean", *result.mean.values()), ("spread", *result.spread.values())]
+        both = zip(*result.by_depth.values(), strict=True), (result.mean.values(), result.spread.values())
+        wiener, invariant = zip(*(row for rows in both for row in rows), strict=True)
         lowest = min(min(row) for row in result.energy)
-        return "\n".join(
-            [
-                f"{'object at':>12} {'Wiener':>9} {'invariant':>9}   PSNR of restored pictures, dB; invariant: the "
-                "depth-invariant filter",
-                *(f"{name:>12} {wiener:>9.2f} {invariant:>9.2f}" for name, wiener, invariant in rows),
-                f"light inside the window of {self.config.size} × {self.config.size} pixels: {lowest:.3f} or more",
-            ]
-        )
+        columns = {
+            Column("object at"): [*map(depth_text, self.config.depths), "mean", "spread"],
+            Column("Wiener", "dB", ".2f"): wiener,
+            Column("invariant", "dB", ".2f"): invariant,
+        }
+        title = "PSNR of restored pictures; invariant: the depth-invariant filter"
+        size = f"{self.config.size} × {self.config.size} pixels"
+        return [Table(columns, [title], [f"light inside the window of {size}: {lowest:.3f} or more"])]
 
 
 def design(arguments: argparse.Namespace) -> DesignedElement:
@@ -153,14 +152,19 @@ class RestoredImages(Result):
     def document(self) -> dict:
         return {"images": list(self.records)}
 
-    def __str__(self) -> str:
-        lines = []
-        for record in self.records:
-            line = f"{record['file']}: {record['restored']}"
-            if "psnr_image" in record:
-                line += f", PSNR of the image {record['psnr_image']:.2f} dB, restored {record['psnr_restored']:.2f} dB"
-            lines.append(line)
-        return "\n".join(lines)
+    def tables(self) -> list[Table]:
+        names = {
+            "file": ("<", ""),
+            "restored": ("<", ""),
+            "psnr_image": (".2f", "PSNR\nimage"),
+            "psnr_restored": (".2f", "PSNR\nrestored"),
+        }
+        columns = {
+            Column(name, "dB" if heading else "", form, heading): [record[name] for record in self.records]
+            for name, (form, heading) in names.items()
+            if self.records and name in self.records[0]
+        }
+        return [Table(columns)]
 
 
 @torch.no_grad()

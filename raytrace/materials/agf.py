@@ -17,6 +17,8 @@ from raytrace.words import calling_level
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
 _NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
+#: An unknown thermal coefficient is 0 in AGF, and its temperature 20 °C; any other unknown figure is -1.
+_UNKNOWN = {"TD": (*"000000", "20", "0")}
 _KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _LARGEST_FILE = 16 * 2**20
@@ -205,7 +207,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     if len(words) < 5:
         raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
     name = words[0]
-    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
+    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=("-1",))
     formula = BY_NUMBER.get(number)
     if formula is None:
         raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
@@ -235,7 +237,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         listed_name=name,
         comment=comment,
         records=tuple(
-            (keyword, _numbers(_with_known(keyword, text.split()), path, line, blanks=True))
+            (keyword, _numbers(text.split(), path, line, blanks=_UNKNOWN.get(keyword, ("-1",))))
             for line, keyword, text in block
             if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
@@ -256,19 +258,12 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
     return records[0]
 
 
-def _with_known(keyword: str, words: list[str]) -> list[str]:
-    """The words of a record; a thermal coefficient that is not known is 0, as AGF has it, and its temperature 20 °C."""
-    if keyword != "TD":
-        return words
-    return [("20" if k == 6 else "0") if word in ("-", "_") else word for k, word in enumerate(words)]
-
-
-def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
-    """Numbers of a record; where `blanks`, "-" and "_" stand for a figure that is not known, which AGF writes as -1."""
+def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: Sequence[str] = ()) -> tuple[float, ...]:
+    """Numbers of a record; blanks: the figures in place of "-" and "_", the last for all further words."""
     numbers = []
-    for word in words:
+    for k, word in enumerate(words):
         if blanks and word in ("-", "_"):
-            word = "-1"
+            word = blanks[min(k, len(blanks) - 1)]
         try:
             number = float(word if "D" not in word else word.replace("D", "E"))  # Fortran writes 1.0D-03
         except ValueError:

@@ -17,7 +17,7 @@ import difflib
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -145,9 +145,7 @@ def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5)
 
 def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[str, str], ...]:
     spellings: dict[str, list[tuple[str, str]]] = {}
-    listed = [(glass, catalog.name) for catalog in own for glass in catalog.glasses]
-    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
-    for glass, catalog in listed + shipped:
+    for glass, catalog in _listed_names(own):
         spellings.setdefault(_bare(glass), []).append((glass, catalog))
     near = difflib.get_close_matches(_bare(name), spellings, n=count, cutoff=0.6)
     return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
@@ -160,11 +158,14 @@ def plain_names(
 
     came: catalogs that came with a lens; user: further AGF files.
     """
-    bare = _bare(name)
-    own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
-    own += [(glass, catalog.name) for catalog in came for glass in catalog.glasses]
-    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
-    return tuple((glass, catalog) for glass, catalog in own + shipped if _bare(glass) == bare)
+    listed = _listed_names([*(load(path) for path in user_catalogs(user)), *came])
+    return tuple((glass, catalog) for glass, catalog in listed if _bare(glass) == _bare(name))
+
+
+def _listed_names(first: Sequence[Catalog]) -> Iterator[tuple[str, str]]:
+    """(glass, catalog) of every glass of these catalogs, then of the shipped ones."""
+    yield from ((glass, catalog.name) for catalog in first for glass in catalog.glasses)
+    yield from ((glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values())
 
 
 def same_catalog(one: str, other: str) -> bool:

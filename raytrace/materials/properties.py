@@ -30,7 +30,7 @@ from raytrace.materials.glass import (
     refractive_index,
 )
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Result, number
+from raytrace.maths.result import Column, Result, Table, number
 from raytrace.words import calling_level
 
 
@@ -41,6 +41,11 @@ class GlassFigures(Result):
     environment: that whose air the indices and wavelengths refer to, None for the catalog's reference air; dn_dt,
     dn_dt_absolute: (W,) 1/K, relative to air at the glass's temperature and relative to vacuum.
     """
+
+    COLUMNS = (
+        Column("wavelength", "µm", "g"), Column("index", "", ".10f"), Column("dn_dt", "1/K", ".3e", "dn/dT, air"),
+        Column("dn_dt_absolute", "1/K", ".3e", "dn/dT, vacuum"),
+    )  # fmt: skip
 
     glass: Glass
     wavelengths: Tensor
@@ -77,7 +82,7 @@ class GlassFigures(Result):
             }
         )
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         glass, span = self.glass, self.glass.wavelength_range
         source = "MIL code" if glass.formula == "model" else "no catalog"
         lines = [
@@ -88,17 +93,11 @@ class GlassFigures(Result):
             f"  range    {span[0]:g} to {span[1]:g} µm" if span else "  range    not listed",
             *(f"  edition  {sentence}" for sentence in edition(glass)),
         ]
-        shown = [
-            f"  n({w:g} µm) = {n:.10f}" for w, n in zip(self.wavelengths.tolist(), self.indices.tolist(), strict=True)
-        ]
         if self.environment is not None:
             lines.append(
                 f"  at       {in_words(self.environment)}, relative to air; dn/dT relative to air, and to vacuum"
             )
-            changes = torch.stack([self.dn_dt, self.dn_dt_absolute], -1).mul(1e6).round(decimals=3).tolist()
-            slopes = (f"   {relative:8.3f}e-6/K {absolute + 0.0:8.3f}e-6/K" for relative, absolute in changes)
-            shown = [line + slope for line, slope in zip(shown, slopes, strict=True)]
-        return "\n".join([*lines, *shown])
+        return [Table(self.columns(), [*lines, ""])]
 
 
 def glass(

@@ -14,7 +14,7 @@ search            `search`: minima found globally; `search_tasks`, `saddle_point
 file_check        `check`: what was read of a lens file, and which operands are evaluated
 
 A new operand is a function of an `EvaluationContext` and a row of the table at the end of its family's file; its test
-compares it with the analysis of the same quantity (`tests/test_merit_*.py`). A number of a surface that
-`system.parameter_paths` lists is a variable. Tests of the descent: `tests/test_optimize.py`, `test_hold.py`,
-`test_bounds.py`, `test_checkpoint.py`; of search: `tests/test_search.py`.
+compares it with the analysis of the same quantity (`tests/test_operands_FAMILY.py`). Every number of a surface that
+`system.parameter_paths` lists can vary. Tests of variables and constraints: `tests/test_variable_syntax.py`,
+`test_constraints.py`; of the descent: `test_optimize.py`, `test_attained.py`, `test_checkpoint.py`; `test_search.py`.
 """

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Result, cell, rows
+from raytrace.maths.result import Column, Result, Table, rows
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import Model
@@ -85,7 +85,8 @@ class MeritResult(Result):
         head = {"merit": float(self.merit), "unit": self.unit, "skipped": [*self.skipped]}
         return {"analysis": "merit", **head, "results": results}
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
+        """A line for every row; in long tables for the rays of one field."""
         counted, unit = int((self.weights != 0).sum()), "" if self.unit == 1 else f", lengths in {self.unit:g} mm"
         lines = [f"merit {float(self.merit):.10g}: {len(self.row)} rows, {counted} with a weight{unit}"]
         if self.skipped:
@@ -93,14 +94,37 @@ class MeritResult(Result):
             lines.append(f"left out, unknown: rows {left}")
         if lost := int(self.lost.sum()):
             lines.append(f"{lost} rows have lost their ray")
-        several, valued, groups = len({*self.configurations.tolist()}) > 1, self.valued(), [*self._groups()]
-        width = max(18, *(len(arguments(valued[group[0]])) + 2 for group in groups))
-        head = f"{'row':>9}  {'operand':<8}{'arguments':<{width}}{'target':>12}{'weight':>12}{'value':>14}{'part':>9}"
-        lines.append((f"{'conf.':>5}" if several else "") + head)
-        for group in groups:
-            number = f"{int(self.configurations[group[0]]):>5}" if several else ""
-            lines.append(number + self._line(valued[group[0]], group, width))
-        return "\n".join(lines)
+        groups, valued = [*self._groups()], self.valued()
+        first = [group[0] for group in groups]
+        columns = {
+            Column("conf."): self.configurations[first],
+            Column("row"): [self._numbers(group) for group in groups],
+            Column("operand", form="<"): [valued[k].name for k in first],
+            Column("arguments", form="<"): [self._arguments(group) for group in groups],
+            Column("target"): self.targets[first],
+            Column("weight"): torch.stack([self.weights[group].sum() for group in groups]) if groups else [],
+            Column("value"): [self._value(group) for group in groups],
+            Column("part", "%", ".2f"): [100 * float(self.contributions[group].sum()) for group in groups],
+            Column("lost", form="<", heading=" "): ["lost" if bool(self.lost[g].any()) else "" for g in groups],
+        }
+        if len({*self.configurations.tolist()}) < 2:
+            del columns[Column("conf.")]
+        return [Table(columns, lines)]
+
+    def _numbers(self, group: list[int]) -> str:
+        first, last = (int(self.row[k]) for k in (group[0], group[-1]))
+        return str(first) if len(group) == 1 else f"{first}-{last}"
+
+    def _arguments(self, group: list[int]) -> str:
+        row = self.valued()[group[0]]
+        return (
+            arguments(row) if len(group) == 1 else f"field {row.numbers[0]:.4g} {row.numbers[1]:.4g}, {len(group)} rays"
+        )
+
+    def _value(self, group: list[int]) -> float:
+        """Of a row, or the root mean square of the rays of a field."""
+        weight, v = self.weights[group], self.values[group]
+        return float(v) if len(group) == 1 else float((weight * v**2).sum().div(weight.sum()).sqrt())
 
     def _groups(self) -> Iterator[list[int]]:
         """Places of the rows that share a line of the text: in long tables rays of one field."""
@@ -117,18 +141,6 @@ class MeritResult(Result):
         for _, together in groupby(range(len(valued)), shared):
             alike = [*together]
             yield from [alike] if len(alike) >= _TOGETHER else ([k] for k in alike)
-
-    def _line(self, row: Row, group: list[int], width: int) -> str:
-        weight, v, first = self.weights[group], self.values[group], int(self.row[group[0]])
-        if len(group) == 1:
-            name, words, number = str(first), arguments(row), float(v)
-        else:
-            name = f"{first}-{int(self.row[group[-1]])}"
-            words = f"field {row.numbers[0]:.4g} {row.numbers[1]:.4g}, {len(group)} rays"
-            number = float((weight * v**2).sum().div(weight.sum()).sqrt())
-        part, lost = float(self.contributions[group].sum()), "  lost" if bool(self.lost[group].any()) else ""
-        numbers = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{cell(number, '>14.6g')}{100 * part:>8.2f}%{lost}"
-        return f"{name:>9}  {row.name:<8}{words:<{width}}{numbers}"
 
     @styled
     def draw(self):
@@ -181,7 +193,6 @@ def evaluate(
         k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
     evaluated, like = evaluation(np.zeros(0)), torch.float64
-    squares = np.bincount(evaluated.of_row, evaluated.residuals**2, minlength=len(function))[shown]
     return MeritResult(
         lens=lens,
         merit=torch.tensor(evaluated.merit, dtype=like),
@@ -190,7 +201,7 @@ def evaluate(
         values=torch.as_tensor(evaluated.values[shown], dtype=like),
         targets=torch.as_tensor(evaluation.targets[shown], dtype=like),
         weights=torch.as_tensor(evaluation.weights[shown], dtype=like),
-        contributions=torch.as_tensor(squares / max(squares.sum(), 1e-300), dtype=like),
+        contributions=torch.as_tensor(evaluated.contributions(shown), dtype=like),
         lost=torch.as_tensor(evaluated.lost[shown]),
         configurations=torch.tensor([of_rows[k] for k in shown], dtype=torch.int64),
         unit=function.unit,

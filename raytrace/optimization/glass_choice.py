@@ -197,12 +197,12 @@ class GlassStep:
         more = {**named, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
         return {"step": self.kind, **more, "reached": self.reached, "seconds": round(self.seconds, 3)}
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
         if not self.surface:
-            return f"{WORDS[self.kind]:<52} {'':>14} {self.reached:>14.6g} {self.seconds:>8.1f}"
+            return WORDS[self.kind]
         instead = f" for {self.replaced}" if self.replaced else ""
-        words = f"{WORDS[self.kind]} {self.surface}: {self.name} ({self.catalog}){instead}"
-        return f"{words:<52} {self.predicted:>14.6g} {self.reached:>14.6g} {self.seconds:>8.1f}"
+        return f"{WORDS[self.kind]} {self.surface}: {self.name} ({self.catalog}){instead}"
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ _CONVERGED = 1e-15  # relative
 
 
 class LensState:
-    """view: `lens_model.View`; variables: (n,) numbers, or a Dual of them."""
+    """view: `variables.View`; variables: (n,) numbers, or a Dual of them."""
 
     def __init__(self, view, variables):
         self.view, self.lens, self.variables = view, view.lens, variables
@@ -188,6 +188,18 @@ class LensState:
         if self.view.is_plain:
             return [c + bend for c, bend in zip(self.curvature, self.view.further_power[0], strict=True)]
         return self.through_torch(lambda lens: [vertex_curvature(surface).reshape(()) for surface in lens.surfaces])
+
+    def of_surfaces(self, quantity: str):
+        """A number (S,) of all surfaces, of `View.of_surfaces`; 0 where a surface has none."""
+        stored = self.view.of_surfaces
+        values, slopes = (stored[quantity] if quantity in stored else 0.0 * stored["conic"]).copy(), None
+        for (surface, name), number in self.numbers.items():
+            if name == quantity:
+                values[surface] = value_of(number)
+                if isinstance(number, Dual):
+                    slopes = np.zeros((self.count, len(values))) if slopes is None else slopes
+                    slopes[:, surface] = number.slope
+        return values if slopes is None else Dual(values, slopes)
 
     def _listed(self, quantity: str, stored: list[float]) -> list:
         numbers = list(stored)
@@ -338,7 +350,7 @@ class LensState:
             self.__dict__.pop(name, None)
         self._kept.clear()
 
-    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles (`ray_bundle`) -----------
+    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles of rays ---------------
 
     def through_torch(
         self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False, only: Sequence | None = None
@@ -744,7 +756,10 @@ class Bundle:
         count = state.count or max((len(part.slope) for part in moving), default=0)
         if not count:
             return surfaces, task, torch.from_numpy(changes), None, None
-        start = self._start(count, position, direction, opl) if moving else None
+        start = None
+        if moving:
+            slopes = torch.from_numpy(np.stack([slope_of(part, count) for part in (*position, *direction, opl)]))
+            start = slopes[:3], slopes[3:6], slopes[6]
         changes = changes if state.count else np.zeros((count, *table.shape))
         return surfaces, task, torch.from_numpy(changes), start, count
 
@@ -756,10 +771,6 @@ class Bundle:
     def _as_hits(self, state: LensState, parts, valid: np.ndarray) -> Hits:
         slopes = [slope_of(part, state.count) for part in parts] if state.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
-
-    def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
-        slopes = torch.from_numpy(np.stack([slope_of(part, count) for part in (*position, *direction, opl)]))
-        return slopes[:3], slopes[3:6], slopes[6]
 
     def _hits(self, end, count: int | None) -> Hits:
         """The rays of `ask`, from the table of a trace."""
@@ -803,7 +814,8 @@ class Bundle:
     def launched(self, state: LensState):
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
-            return self._launched_by_torch(state)
+            parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
+            return parts[:3], parts[3:6], parts[6], valid
         if not self._aims:
             return self._through(state, self.pupil)
         pupil, found = self._aimed(state)
@@ -853,10 +865,6 @@ class Bundle:
         height = hits.position[1][np.array([0])]
         real = np.abs(height) * np.sign(value_of(paraxial))
         return real[0] if hits.valid[0] else paraxial
-
-    def _launched_by_torch(self, state: LensState):
-        parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
-        return parts[:3], parts[3:6], parts[6], valid
 
     def _start_by_torch(self, lens: Lens) -> Rays:
         field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)

@@ -463,6 +463,11 @@ class Evaluated:
     def merit(self) -> float:
         return float(np.sqrt(self.residuals @ self.residuals))
 
+    def contributions(self, rows: Sequence[int]) -> np.ndarray:
+        """Parts (K,) of some rows, from 0, in the sum of their squares."""
+        squares = np.bincount(self.of_row, self.residuals**2, minlength=len(self.values))[rows]
+        return squares / max(squares.sum(), 1e-300)
+
 
 class Circle(ValueError):
     """Rows that take values of one another in a circle."""

@@ -33,7 +33,7 @@ from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, fiel
 from raytrace.files import check_output
 from raytrace.io import write_lens
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Result, cell, number, plain
+from raytrace.maths.result import Column, Result, Table, number, plain, text_table
 from raytrace.optimization.checkpoint import STOPPED, BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.glass_choice import Choice, GlassStep, catalogs_of, pool_of
 from raytrace.optimization.least_squares import (
@@ -521,6 +521,16 @@ def _groups(found) -> list[tuple[int, str]]:
 _SHOWN = 12  # rows of the merit function in the text, those of largest contribution
 
 
+def _glass_table(steps: Sequence[GlassStep]) -> Table:
+    columns = {
+        Column("glass", form="<"): [step.words for step in steps],
+        Column("predicted"): [step.predicted if step.surface else "" for step in steps],
+        Column("merit"): [step.reached for step in steps],
+        Column("seconds", form=".1f", heading="s"): [step.seconds for step in steps],
+    }
+    return Table(columns, [""])
+
+
 @value
 class Optimized(Result):
     """The lens at the lowest merit reached, and the initial one.
@@ -619,58 +629,77 @@ class Optimized(Result):
             }
         )
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
+        """Variables, chosen glasses, configurations and the largest rows of the merit function, then the conditions."""
         ratio = self.merit_before / self.merit_after if self.merit_after > 0 else np.inf
-        lines = [
+        head = [
             self.lens.name,
             f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
-            f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}\n",
-            f"  {'variable':<18} {'before':>16} {'after':>16}",
+            f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            "",
         ]
-        for name, *ends in zip(self.names, self.variables_before.tolist(), self.variables_after.tolist(), strict=True):
-            lines.append(f"  {name:<18} {ends[0]:>16.8g} {ends[1]:>16.8g}")
-        if self.glasses:
-            lines.append(f"\n  {'glass':<52} {'predicted':>14} {'merit':>14} {'s':>8}")
-            lines += [f"  {step}" for step in self.glasses]
-        if self.has_configurations:
-            lines.append(f"\n  {'configuration':<18} {'EFL before, mm':>16} {'EFL after, mm':>16} {'left':>7}")
-            pairs = zip(self.before.configurations, self.lens.configurations, strict=True)
-            for k, pair in enumerate(pairs, 1):
-                lengths = " ".join(cell(float(first_order(one).effective_focal_length), "16.8g") for one in pair)
-                of = zip(self.configurations, self.contributions.tolist(), strict=False)
-                lines.append(f"  {k:<18} {lengths} {sum(part for at, part in of if at == k):>7.1%}")
+        variables = {
+            Column("variable", form="<"): self.names,
+            Column("before", form=".8g"): self.variables_before,
+            Column("after", form=".8g"): self.variables_after,
+        }
+        conditions = self.conditions_in_words()
+        rows = self._largest_rows()
+        rows = rows._replace(notes=[*rows.notes, *(["", *conditions] if conditions else [])])
+        glasses = [_glass_table(self.glasses)] if self.glasses else []
+        return [Table(variables, head), *glasses, *([self._lengths()] if self.has_configurations else []), rows]
+
+    def _lengths(self) -> Table:
+        """Focal lengths of every configuration, and its part of the merit that is left."""
+        focal = {
+            name: [float(first_order(one).effective_focal_length) for one in lens.configurations]
+            for name, lens in (("before", self.before), ("after", self.lens))
+        }
+        numbers, parts = range(1, len(focal["after"]) + 1), self.contributions.tolist()
+        left = [100 * sum(p for at, p in zip(self.configurations, parts, strict=False) if at == k) for k in numbers]
+        lengths = {Column(f"EFL {name}", "mm", ".8g"): values for name, values in focal.items()}
+        return Table({Column("configuration"): numbers, **lengths, Column("left", "%", ".1f"): left}, [""])
+
+    def _largest_rows(self) -> Table:
+        """The rows of the largest contributions that are left."""
         left = sorted(self.rows, key=lambda i: -float(self.contributions[i - 1]))
         left = [i for i in left if self.merit[i - 1].weight != 0]
-        head = f"{'conf.':>5} " if self.has_configurations else ""
-        ends = f"{'before':>14} {'after':>14} {'left':>7}"
-        lines.append(f"\n  {head}{'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends}")
-        for i in left[:_SHOWN]:
-            row, share = self.merit[i - 1], float(self.contributions[i - 1])
-            both = (float(values[i - 1]) for values in (self.values_before, self.values_after))
-            ends = " ".join(f"{'lost':>14}" if np.isnan(one) else f"{one:>14.6g}" for one in both)
-            of = f"{self.configurations[i - 1]:>5} " if self.has_configurations else ""
-            lines.append(f"  {of}{i:>5} {row.name:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
-        if len(left) > _SHOWN:
-            rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
-            lines.append(f"  and {len(left) - _SHOWN} more rows, {rest:.1%}")
-        table = self.conditions_in_words()
-        return "\n".join([*lines, *(["", *(f"  {line}" for line in table)] if table else [])])
+        shown = [self.merit[i - 1] for i in left[:_SHOWN]]
+        at = [i - 1 for i in left[:_SHOWN]]
+        ends = {
+            Column(name, form=".6g"): ["lost" if np.isnan(value) else value for value in values[at].tolist()]
+            for name, values in (("before", self.values_before), ("after", self.values_after))
+        }
+        columns = {
+            **({Column("conf."): [self.configurations[k] for k in at]} if self.has_configurations else {}),
+            Column("row"): left[:_SHOWN],
+            Column("operand", form="<"): [row.name for row in shown],
+            Column("target"): [row.target for row in shown],
+            Column("weight", form=".4g"): [row.weight for row in shown],
+            **ends,
+            Column("left", "%", ".1f"): 100 * self.contributions[at],
+        }
+        rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
+        more = [f"and {len(left) - _SHOWN} more rows, {rest:.1%}"] if len(left) > _SHOWN else []
+        return Table(columns, [""], more)
 
     def conditions_in_words(self) -> list[str]:
         """The table of targets and attained values; of boundaries that are met only the first few."""
         shown = self.shown_conditions()
         if not shown:
             return []
-        width = max(24, *(len(one.name) for one in shown))
-        lines = [f"{'condition':<{width}} {'asked':>15} {'reached':>14}"]
-        for one in shown:
-            target, attained = f"{one.relation} {one.asked:.6g}", cell(one.reached, "14.6g")
-            remark = ", ".join(filter(None, ["" if one.met else "not met", one.place]))
-            lines.append(f"{one.name:<{width}} {target:>15} {attained:>14}  {remark}".rstrip())
-        if len(shown) < len(self.conditions):
-            lines.append(f"and {len(self.conditions) - len(shown)} more boundaries, met")
-        return lines
+        remarks = [", ".join(filter(None, ["" if one.met else "not met", one.place])) for one in shown]
+        lines = text_table(
+            {
+                Column("condition", form="<"): [one.name for one in shown],
+                Column("asked"): [f"{one.relation} {one.asked:.6g}" for one in shown],
+                Column("reached"): [one.reached for one in shown],
+                Column("remark", form="<", heading=" "): remarks,
+            }
+        )
+        more = len(self.conditions) - len(shown)
+        return [*lines, f"and {more} more boundaries, met"] if more else lines
 
     def shown_conditions(self) -> list[Reached]:
         """Those of tables: all but boundaries that are met, of which there are the first few."""
@@ -875,7 +904,7 @@ def optimize(
     result = _optimized(
         lens, problem.model, names, x, descent, started, rows=problem.rows, unit=problem.unit,
         merits=(problem.merit(before), problem.merit(after)), values=(before.values[:count], after.values[:count]),
-        contributions=(_contributions(before, count), _contributions(after, count)),
+        contributions=tuple(end.contributions(np.arange(count)) for end in (before, after)),
         glasses=tuple(choice.steps) if choice else (), conditions=reached(problem, x, lower=lower, upper=upper),
     )  # fmt: skip
     ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
@@ -987,9 +1016,3 @@ def _warned(result: Optimized) -> Optimized:
     for lens in result.lens.configurations:
         warn_of_defects(lens)
     return result
-
-
-def _contributions(evaluated: Evaluated, rows: int) -> np.ndarray:
-    """The part (R,) of every row in the square of the merit."""
-    squares = np.bincount(evaluated.of_row, evaluated.residuals**2, minlength=rows)[:rows]
-    return squares / max(squares.sum(), 1e-300)

@@ -22,7 +22,7 @@ from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Result, cell
+from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
 from raytrace.optimization.optimize import drawn_fields, opened, refuse_contradictions
@@ -102,23 +102,23 @@ class Searched(Result):
         counts = {"starts": self.starts, "descents": self.descents, "seconds": round(self.seconds, 3)}
         return {**counts, "stopped": self.stopped, **Result.document(self)}
 
-    def __str__(self) -> str:
-        width = max(8 * self.spots.shape[1], 8)
+    def tables(self) -> list[Table]:
         count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
-        lines = [
+        title = [
             self.before.name,
             f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
-            f"  found: by how many of the {self.descents} descents that were followed to their end\n",
-            f"  {'':>7} {'':>12} {'EFL':>10} {'RMS spots':>{width}}\n  {'minimum':>7} {'merit':>12} {'mm':>10} "
-            f"{'µm, by field':>{width}} {'found':>6}",
+            f"  found: by how many of the {self.descents} descents that were followed to their end",
+            "",
         ]
-        radii = [column for name, column in self.columns().items() if name.startswith("rms_")]
-        for k in range(len(self.lenses)):
-            spots = "".join(cell(float(spots[k]), "8.2f") for spots in radii)
-            length = cell(float(self.focal_length[k]), "10.4f")
-            merit, found = float(self.merit[k]), int(self.found[k])
-            lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")
-        return "\n".join(lines)
+        columns = self.columns()
+        spots = {
+            Column(name, "µm", ".2f", f"RMS\nfield {name.split('_')[1]}"): columns[name]
+            for name in columns
+            if name.startswith("rms_")
+        }
+        shown = {Column("minimum"): columns["minimum"], Column("merit"): self.merit}
+        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.found}
+        return [Table(shown, title)]
 
     @style.styled
     def draw(self):

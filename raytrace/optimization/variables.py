@@ -18,7 +18,7 @@ variables.
 import dataclasses
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,7 +36,7 @@ from raytrace.materials.glass import (
     refractive_index,
 )
 from raytrace.optimization.lens_state import LensState, unbent
-from raytrace.system.configurations import same
+from raytrace.system.configurations import Operand, ScaledPath, same
 from raytrace.system.lens import Lens, is_round_about_axis, media
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
@@ -52,6 +52,7 @@ from raytrace.system.parameter_paths import (
     with_number,
 )
 from raytrace.system.phases import power_of
+from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
@@ -333,13 +334,19 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
     """A number of a surface, or where it differs between the configurations one for each of them."""
     for position, operand in enumerate(lens.operands):
-        for place in operand.paths if operand.numbers is not None else ():
-            if place.path[:2] == ("surfaces", k) and quantity in names_at(lens.surfaces[k], place.path[2:]):
-                own = operand.paths[0].path  # which other places of the operand follow
-                first = names_at(lens.surfaces[own[1]], own[2:])[0] if own[0] == "surfaces" else ""
-                at = (own[1], first) if first else (k, quantity)
-                return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]
+        addresses = [at for at, _ in _addresses_of(lens, operand)] if operand.numbers is not None else []
+        if (k, quantity) in addresses:
+            at = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # which the others follow
+            return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]
     return [Vary(k, quantity)]
+
+
+def _addresses_of(lens: Lens, operand: Operand) -> Iterator[tuple[Address, ScaledPath]]:
+    """The numbers of surfaces that an operand of the configurations sets, each with its place."""
+    for place in operand.paths:
+        if place.path[0] == "surfaces":
+            surface = place.path[1]
+            yield from (((surface, name), place) for name in names_at(lens.surfaces[surface], place.path[2:]))
 
 
 # -- glasses that vary ------------------------------------------------------------------------------------------------
@@ -355,7 +362,8 @@ def without_glass(free: Freedom, vary: str | Sequence | None) -> tuple[Freedom, 
     if not chosen:
         return free, ()
     chosen = _marked(free.lens, vary, chosen) - set(followers(free.lens))
-    differing = [k for k in sorted(chosen) if _differs(free.lens, k)]
+    paths = [place.path for operand in free.lens.operands for place in operand.paths]
+    differing = [k for k in sorted(chosen) if any(path[:3] == ("surfaces", k, "glass") for path in paths)]
     if differing or not chosen:
         which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
         raise BadVariables(f"`vary=glass`: the glass {which}")
@@ -391,10 +399,6 @@ def followers(lens: Lens) -> dict[int, int]:
         for one in rules
         if (one.quantity, one.kind) == ("glass", "pickup") and one.operand is None
     }
-
-
-def _differs(lens: Lens, surface: int) -> bool:
-    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.paths)
 
 
 # -- what follows ------------------------------------------------------------------------------------------------------
@@ -512,16 +516,15 @@ class Model:
     @cached_property
     def start(self) -> np.ndarray:
         """The variables (n,) as they stand."""
-        return np.array([self._standing(one) for one in self.variables])
-
-    def _standing(self, one: Vary) -> float:
-        if one.operand is not None:
-            return float(self.lens.operands[one.operand].numbers[one.configuration - 1])
-        held = number_at(self.lens.surfaces[one.surface], self._place(one))
-        return 0.0 if held is None else float(held)
-
-    def _place(self, one: Vary | Solve) -> ParameterPath:
-        return path_of(self.lens.surfaces[one.surface], one.quantity, f"surface {one.surface}: ")
+        numbers = []
+        for one in self.variables:
+            if one.operand is not None:
+                numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
+                continue
+            surface = self.lens.surfaces[one.surface]
+            stored = number_at(surface, path_of(surface, one.quantity, f"surface {one.surface}: "))
+            numbers.append(0.0 if stored is None else float(stored))
+        return np.array(numbers)
 
     def lens_at(self, variables: np.ndarray) -> Lens:
         """The lens with its variables there, and with all that follows from them."""
@@ -547,8 +550,12 @@ class View:
         """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
         self.model, self.configuration = model, configuration
         lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
-        lens = lens if clips else _open(lens)
-        overridden = _overridden(lens)
+        if not clips:
+            surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
+            lens = dataclasses.replace(lens, surfaces=surfaces)
+        #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
+        operands = (operand for operand in lens.operands if operand.numbers is not None)
+        overridden = {at for operand in operands for at, _ in _addresses_of(lens, operand)}
         #: By address which variable a number is, by what factor, and what is added.
         self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
         for number, one in enumerate(model.variables):
@@ -639,6 +646,17 @@ class View:
         ]
 
     @cached_property
+    def of_surfaces(self) -> dict[str, np.ndarray]:
+        """Thickness, curvature, conic and even terms a2, a4 … (S,) of all surfaces, 0 where a surface has none."""
+        surfaces = self.lens.surfaces
+        conics = [0.0 if surface.conic is None else float(surface.conic.detach()) for surface in surfaces]
+        numbers = {name: np.array(n) for name, n in (("thickness", self.thickness), ("curvature", self.curvature))}
+        terms = [s.coefficients.tolist() if s.coefficients is not None and s.kind == EVEN else [] for s in surfaces]
+        for j in range(max(map(len, terms))):
+            numbers[f"a{2 * j + 2}"] = np.array([even[j] if j < len(even) else 0.0 for even in terms])
+        return numbers | {"conic": np.array(conics)}
+
+    @cached_property
     def further_power(self) -> tuple[np.ndarray, np.ndarray]:
         """What bends light beside the curvature: the vertex by terms of r² (S,) in 1/mm, phases (W, S) in 1/mm."""
         bend, phase = np.zeros(len(self.lens.surfaces)), np.zeros_like(self.indices)
@@ -707,14 +725,11 @@ class View:
 def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, float, float]]:
     """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
     operands that pick up the number of another configuration."""
-    found = {}
-    for operand, (number, scale, offset) in followed(model, configuration).items():
-        for place in model.lens.operands[operand].paths:
-            if place.path[0] == "surfaces":
-                surface = model.lens.surfaces[place.path[1]]
-                linear = number, place.factor * scale, place.factor * offset + place.offset
-                found |= {(place.path[1], name): linear for name in names_at(surface, place.path[2:])}
-    return found
+    return {
+        at: (number, place.factor * scale, place.factor * offset + place.offset)
+        for operand, (number, scale, offset) in followed(model, configuration).items()
+        for at, place in _addresses_of(model.lens, model.lens.operands[operand])
+    }
 
 
 def followed(model: Model, configuration: int) -> dict[int, tuple[int, float, float]]:
@@ -765,21 +780,6 @@ def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
         moved |= {(one.surface, name) for name in names}
         found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
     return found
-
-
-def _overridden(lens: Lens) -> set[Address]:
-    """What operands of the configurations hold: there the surface's own variable or solve is void."""
-    found = set()
-    for operand in lens.operands:
-        for place in operand.paths:
-            if place.path[0] == "surfaces" and operand.numbers is not None:
-                found |= {(place.path[1], name) for name in names_at(lens.surfaces[place.path[1]], place.path[2:])}
-    return found
-
-
-def _open(lens: Lens) -> Lens:
-    """The lens without apertures: a ray that a merit function names counts also where it is clipped."""
-    return dataclasses.replace(lens, surfaces=tuple(dataclasses.replace(s, apertures=()) for s in lens.surfaces))
 
 
 def _modelled(lens: Lens, moved: Sequence[Address]) -> Lens:

@@ -520,11 +520,8 @@ def _estimate(model: Model, changes: list[Tensor], psfs: Psf, rounding: Tensor) 
 
 
 def _rounding(batch: Scene, pixels: Grid, psfs: Psf, model: Model) -> Tensor:
-    """Error (D, F) by rounding, at least the model's floor.
-
-    Of rays: the rounding of directions over a focal length, in units of σ or of a pixel; inf if σ itself is rounding.
-    Waves are summed in float64: the lens data round, which defocuses the image by ε f and so blurs it by ε f/2N.
-    """
+    """Error (D, F) by rounding of directions over a focal length, in σ or pixels; inf if σ itself is rounding."""
+    # Waves are summed in float64: the lens data round, which defocuses the image by ε f and so blurs it by ε f/2N.
     data = first_order(batch.lens)
     numbers = data.effective_focal_length, data.paraxial_working_f_number
     focal, f_number = (t.abs().reshape(-1)[:1] for t in numbers)

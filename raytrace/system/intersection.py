@@ -384,10 +384,7 @@ def _searched(rays: "_Rays", t: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _reads_are_free(tensor: Tensor) -> bool:
-    """Whether the host may read a tensor without waiting for a device.
-
-    Elsewhere every ray takes all steps and the bracketed search, with bit-identical results: converged rays are frozen.
-    """
+    """Whether the host may read a tensor without waiting for a device; else every ray takes all steps."""
     return tensor.device.type == "cpu"
 
 

@@ -498,11 +498,8 @@ def _check_kinds(surface: Surface, where: str) -> None:
 
 
 def _check_cone(lens: Lens) -> None:
-    """Refuse a cone of light at the object whose rim lies in the plane of the object, or that is none.
-
-    Of one beyond a right angle, whose rim runs back to a reflector around the object, rays leave on the same lines
-    forwards, within 180 degrees less the angle: the part of the reflector behind its equator is not traced.
-    """
+    """Refuse a cone at the object of a right angle, of 180° and more, or of an NA that is not below the index."""
+    # Of a cone beyond a right angle rays leave on the same lines forwards, within 180 degrees less the angle.
     kind, number = lens.aperture.kind, float(lens.aperture.value)
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")

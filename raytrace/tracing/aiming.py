@@ -101,11 +101,7 @@ def aim_at_image(
 def _root(
     residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor], given: object
 ) -> tuple[Tensor, Tensor]:
-    """Unknowns (n, ...) where the residuals (n, ...) of the full field vanish, and whether found (...).
-
-    origin: from the initial point to the root on axis; given: a tree of the tensors that the residual depends on. If a
-    derivative by one of them may be requested, the last step is attached: first derivatives are exact.
-    """
+    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); origin: axial roots."""
     with torch.no_grad():
         first = start[..., :1] if start.dim() > 1 else start  # one ray of the last axis shows the others
         batch = broadcast_shape(start.shape[1:], residual(first, 1.0)[0].shape[1:])
@@ -122,7 +118,7 @@ def _root(
         if bool(found.all()):
             break
     root = root - last_step
-    if not any(map(varies, pytree.tree_leaves(given))):
+    if not any(map(varies, pytree.tree_leaves(given))):  # else the last step is attached: first derivatives are exact
         return root, found
     return root - _solve(_error_and_jacobian(residual, root, 1.0)[1], residual(root, 1.0)[0]), found
 
@@ -130,11 +126,9 @@ def _root(
 def _followed(
     residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The roots at the full field, by continuation from the axis in `stages` steps, their errors, the next Newton step.
-
-    Each stage starts from the extrapolation of the two before it or, if better, from the last root. A Newton step that
-    loses the ray or increases the residual is shortened and rejected; a root within `close` is final.
-    """
+    """The roots at the full field, by continuation from the axis, their errors, and the next Newton step."""
+    # A stage starts from the extrapolation of the two before or, if better, from the last root. A Newton step that
+    # loses the ray or increases the residual is shortened and rejected.
     before, root = origin, origin + (start - origin) / stages
     sought = torch.ones_like(root[0], dtype=torch.bool)
     for stage in range(1, stages + 1):
@@ -187,10 +181,8 @@ def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> t
 
 
 def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
-    """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph.
-
-    `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
-    """
+    """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph."""
+    # `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
     if torch._C._are_functorch_transforms_active():
         value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
         return value.detach(), lambda v: pull(v)[0].detach(), arrives

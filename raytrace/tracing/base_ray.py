@@ -243,11 +243,8 @@ def _axes(launched: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _linearised(function: Callable, at: Tensor, given: object) -> tuple[Tensor, Tensor, tuple]:
-    """f (m, ...) at a point (n, ...), its Jacobian (m, n, ...), and f's second result, of copies of the point.
-
-    One backward pass of m copies: in forward mode, tangents of plain numbers cost four times as much as the trace.
-    Forward mode inside forward differentiation and transforms. given: tree of the tensors that f depends on.
-    """
+    """f (m, ...) at a point (n, ...), its Jacobian (m, n, ...), and f's second result; given: numbers f depends on."""
+    # One backward pass of m copies: in forward mode, tangents of plain numbers cost four times as much as the trace.
 
     def units(count: int) -> Tensor:
         ones = torch.eye(count, dtype=at.dtype, device=at.device)

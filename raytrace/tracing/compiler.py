@@ -279,10 +279,7 @@ def _reason(error: OSError) -> str:
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove earlier files of this installation, and those that nothing on this machine has used for _LONG.
-
-    A process that has loaded such a file keeps it until it ends.
-    """
+    """Remove earlier files of this installation, and those unused for _LONG; a process keeps a file it has loaded."""
     now = time.time()
     for path in folder.glob("trace-*.so"):
         with suppress(OSError):

@@ -10,7 +10,7 @@ from torch import Tensor
 from raytrace.materials.environment import in_words
 from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Result, number, numbers
+from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, is_round_about_axis, media
 from raytrace.system.phases import IdealLens
@@ -140,6 +140,11 @@ BASE_RAY_LINES = (
 class Info(Result):
     """First-order data and prescription of a lens; the table has a row per surface, with the primary index; mm."""
 
+    COLUMNS = (
+        Column("thickness", "mm", ".7g"), Column("glass", form="<"), Column("index", "", ".6f"),
+        Column("semi_diameter", "mm", ".5g", "semi-dia."), Column("note", form="<"),
+    )  # fmt: skip
+
     lens: Lens
 
     def columns(self) -> dict[str, Tensor]:
@@ -199,7 +204,7 @@ class Info(Result):
             **({"geometry": geometry} if geometry else {}),
         }
 
-    def __str__(self) -> str:
+    def tables(self) -> list[Table]:
         lens = detached(self.lens)
         lines = [lens.name or "Lens", ""]
         for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
@@ -220,17 +225,9 @@ class Info(Result):
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
             *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
-            f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
-        for k, (surface, index) in enumerate(zip(lens.surfaces, _indices(lens), strict=True)):
-            size, radius = surface.semi_diameter, _radius(surface)
-            shown = "-" if surface.is_break else "inf" if math.isinf(radius) else f"{radius:.6g}"
-            lines.append(
-                f"  {k:>7} {shown:>13} {float(surface.thickness):>12.7g} "
-                f"{label(surface.glass):<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
-                f"{_remarks(lens, k)}".rstrip()
-            )
-        return "\n".join(lines)
+        shown = {**self.columns(), "radius": ["-" if s.is_break else _radius(s) for s in lens.surfaces]}
+        return [Table(shown, lines)]
 
 
 def info(lens: Lens) -> Info:

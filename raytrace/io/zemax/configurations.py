@@ -55,11 +55,13 @@ from raytrace.io.zemax.surfaces import (
     SWITCH,
     TEXT,
     Sections,
+    SurfaceType,
     ValueRow,
     aperture_keywords,
     in_millimetres,
     inverse,
     is_blank,
+    numbers_of,
 )
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass
@@ -354,6 +356,11 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
         for k in (first.number,) if row.of == "surface" else first.covered or ():
             if not 0 <= k <= last:
                 raise LensFileError(f"{first.name} of surface {k}; expected one from 0 to {last}", first.record.place)
+        if row.keyword == "XDAT" and _is_of_terms(first.parameter, file.surfaces[first.number].row):
+            words = [_terms(cell, file) for cell in cells]
+            names = [name for name in ("coefficients", "sag_terms", "phase") if any(name in each for each in words)]
+            paths = tuple(ScaledPath(("surfaces", first.number, name)) for name in names)
+            return placed(paths=paths, words=tuple(tuple(map(each.get, names)) for each in words))
         paths, like = _paths_of_parameter(first, row, file) if not row.path else _paths(first, row, file)
         if not paths:
             return unplaced
@@ -439,10 +446,6 @@ def _paths_of_parameter(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tupl
     """The paths of PARM or XDAT by the row of the surface's type, with its pickups; and a lens that models them."""
     k, j, lens = cell.number, cell.parameter, file.lens
     kind, numbers = file.surfaces[k].row, file.surfaces[k].numbers
-    if row.keyword == "XDAT" and kind.terms is not None and (j == 1 or (j == 2 and kind.terms_are_coefficients)):
-        quantity = "number of terms" if j == 1 else "radius of normalisation"
-        message = f"the {quantity} of a surface that is {kind.name} is the same in all configurations here"
-        raise LensFileError(message, cell.record.place)
     if any(rule.kind == "PPAR" and rule.quantity == f"PARM {j}" and rule.numbers[:1] == (k,) for rule in _solves(file)):
         raise LensFileError(f"parameter {j} is picked up by a rule that is not followed", cell.record.place)
     factors, like = kind.places(lens.surfaces[k], numbers, row.keyword, j)
@@ -557,6 +560,23 @@ def _medium(cell: Cell, row: ValueRow, file: LensFile) -> Glass:
     if record and record.words and record.words[0].upper() == cell.value.upper():
         return file.lens.surfaces[cell.number].glass  # of the same name, with the indices that the file has for it
     return file.medium(Record("GLAS", (cell.value, "0", "0", "1.5", "40"), "", place)) if cell.value else AIR
+
+
+def _is_of_terms(j: int, row: SurfaceType) -> bool:
+    """Whether XDAT j changes every term: their number, or the radius by which coefficients are normalised."""
+    return row.terms is not None and (j == 1 or (j == 2 and row.terms_are_coefficients))
+
+
+def _terms(cell: Cell, file: LensFile) -> dict:
+    """The fields of a surface whose terms have another number (XDAT 1), or another radius of normalisation (XDAT 2)."""
+    typed, place = file.surfaces[cell.number], cell.record.place
+    changed = Block(typed.block.place)
+    datum = Record("XDAT", (str(cell.parameter), cell.value), "", place)
+    changed.records = {**typed.block.records, "XDAT": [*typed.block.all("XDAT"), datum]}
+    try:
+        return typed.row.fields(numbers_of(changed, typed.row, file.millimetres))
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
 
 
 def _words(cell: Cell, row: ValueRow, file: LensFile, paths: Sequence[ScaledPath]) -> tuple:

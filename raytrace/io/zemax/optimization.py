@@ -48,7 +48,6 @@ from raytrace.io.zemax.surfaces import (
     INVERSE,
     SYSTEM_IGNORED,
     TAIL_REASON,
-    Named,
     Numbers,
     Sections,
     SurfaceType,
@@ -135,8 +134,9 @@ class TypedSurface(NamedTuple):
     def number(self) -> int:
         return self.block.place.surface
 
-    def names(self, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
-        return self.row.names(self.surface, self.numbers, keyword, j)
+    def names(self, keyword: str, j: int) -> dict[str, float]:
+        """The numbers of the lens that PARM j, or XDAT j, gives, by their names, each with its factor."""
+        return self.row.names(self.surface, self.numbers, keyword, j)[0]
 
     def modelled(self, quantity: str) -> Surface:
         """The surface with a quantity of its type modelled, where it was 0."""
@@ -262,10 +262,10 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
 def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
     numbers = _solve_numbers(record, 1)
     source = _source(numbers, typed.number)
-    named, _ = typed.names("PARM", j)
-    there, _ = surfaces[source].names("PARM", j) if source is not None else ((), None)
-    power = typed.row.parameters[j].power if j in typed.row.parameters else 0
-    is_linear = named and there and named[0].factor == there[0].factor == 1
+    names, names_there = typed.names("PARM", j), {} if source is None else surfaces[source].names("PARM", j)
+    name, there = next(iter(names), ""), next(iter(names_there), "")
+    power = typed.row.power("PARM", j)
+    is_linear = name and there and names[name] == names_there[there] == 1
     if power is INVERSE:  # the lens holds the reciprocals of lengths, which are proportional without an offset
         is_linear = is_linear and len(numbers) > 1 and numbers[1] and not any(numbers[2:])
     if not is_linear or any(numbers[3:]) or len(numbers) < 2:
@@ -273,22 +273,21 @@ def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Seq
         return
     offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power or 0, typed.millimetres)
     scale = inverse(record.words[2], 1.0) if power is INVERSE else numbers[1]
-    other = there[0].name if there[0].name != named[0].name else ""
-    yield typed.pickup(named[0].name, source, scale, offset, other)
-    yield from _followers(typed, named)
+    yield typed.pickup(name, source, scale, offset, there if there != name else "")
+    yield from _followers(typed, names)
 
 
 def _parameter_variable(typed: TypedSurface, keyword: str, j: int) -> list[Vary | Solve]:
-    named, _ = typed.names(keyword, j)
-    if not named:
+    names = typed.names(keyword, j)
+    if not names:
         return [typed.solve(f"{keyword} {j}", "variable")]
-    return [Vary(typed.number, named[0].name), *_followers(typed, named)]
+    return [Vary(typed.number, next(iter(names))), *_followers(typed, names)]
 
 
-def _followers(typed: TypedSurface, named: tuple[Named, ...]) -> list[Solve]:
+def _followers(typed: TypedSurface, names: dict[str, float]) -> list[Solve]:
     """The further numbers of the lens that a number of the file gives, as pickups of the first."""
-    first, *others = named
-    return [typed.pickup(n.name, typed.number, n.factor / first.factor, other=first.name) for n in others]
+    first, *others = names
+    return [typed.pickup(name, typed.number, names[name] / names[first], other=first) for name in others]
 
 
 # -- the optimisation data of a file, read ----------------------------------------------------------------------------

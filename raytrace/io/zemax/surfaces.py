@@ -1,12 +1,14 @@
-"""Surfaces of a .zmx file: the types that are modelled, a row each, and a surface read from its records.
+"""Tables of a .zmx file: keywords, values and types of surface; and a surface read from its records.
 
-A row lists where the lens holds every number of the type, and the power of length in it:
+A row of `ROWS` gives the path of a value in the lens, its power of length, and the operand of configurations that sets
+it. A type of surface lists the path and the power of length of every number of its own:
 
     PARM j value        a number of the type
     XDAT 1 count, XDAT 2 radius, XDAT 3 …       further terms, and the radius that normalises them
     SCBD w o p dx dy tx ty tz       decentre and tilt before (w = 1) and after (w = 2) the surface, o the order
 
-Reader, writer, unit conversion, variables and pickups use the same row. Lengths are in the file's unit and become mm.
+Reader, writer, unit conversion, configurations, variables and pickups use the same row. Lengths are in the file's unit
+and become mm.
 """
 
 import dataclasses
@@ -389,12 +391,18 @@ ROWS = {
     "LTTL": ValueRow("", "NAME", 1, "name", kind=TEXT),
 }
 
-#: Powers of length of the words of a line, from 1, by its keyword: those of the rows, and those without an operand.
-#: Apertures have their sizes first.
-POWERS: dict[str, dict[int, int]] = {"SDMA": {3: 1}, "VDSZ": {1: 1, 2: 1}, "PZUP": {3: 1}, "UDAD": {2: 1, 3: 1}}
-for _row in ROWS.values():
-    if _row.power and _row.of != "field":
-        POWERS.setdefault(_row.keyword, {})[_row.word] = _row.power
+
+def _powers() -> dict[str, dict[int, int]]:
+    """The powers of length of the rows, and those of words without an operand."""
+    powers: dict[str, dict[int, int]] = {"SDMA": {3: 1}, "VDSZ": {1: 1, 2: 1}, "PZUP": {3: 1}, "UDAD": {2: 1, 3: 1}}
+    for row in ROWS.values():
+        if row.power and row.of != "field":
+            powers.setdefault(row.keyword, {})[row.word] = row.power
+    return powers
+
+
+#: Powers of length of the words of a line, from 1, by its keyword; others have none. Apertures have their sizes first.
+POWERS = _powers()
 
 
 def measured(record: Record, position: int, quantity: str, millimetres: float, default: float | None = None) -> float:
@@ -440,13 +448,6 @@ class Parameter(NamedTuple):
     power: int | None = 0
     is_integer: bool = False
     followers: Mapping[ParameterPath, float] = {}
-
-
-class Named(NamedTuple):
-    """A number of the lens by its name in `parameter_paths`: factor times the number of the file in mm."""
-
-    name: str
-    factor: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -587,12 +588,12 @@ class SurfaceType:
         held = parameter_paths(like).values()
         return {place: factor for place, factor in factors.items() if place in held}, like
 
-    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
+    def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[dict[str, float], Surface]:
         """`places` by the names of the numbers; without the radius that normalises terms, which is no variable."""
         factors, like = self.places(surface, numbers, keyword, j)
         names = {place: name for name, place in parameter_paths(like).items()}
         is_number = keyword == "PARM" or j >= FIRST_TERM
-        return tuple(Named(names[place], factor) for place, factor in factors.items() if is_number), like
+        return {names[place]: factor for place, factor in factors.items() if is_number}, like
 
     def named(self, surface: Surface, numbers: Numbers) -> dict[str, tuple[str, int, Surface]]:
         """PARM or XDAT of every number of the lens that the type gives, by its name, and a surface that models it."""
@@ -600,8 +601,8 @@ class SurfaceType:
         by_name: dict[str, tuple[str, int, Surface]] = {}
         for keyword, j in (*(("PARM", j) for j in self.parameters), *(("XDAT", FIRST_TERM + k) for k in range(terms))):
             names, like = self.names(surface, numbers, keyword, j)
-            for number in names:
-                by_name.setdefault(number.name, (keyword, j, like))
+            for name in names:
+                by_name.setdefault(name, (keyword, j, like))
         return by_name
 
     def power(self, keyword: str, j: int) -> int | None:

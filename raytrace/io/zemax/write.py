@@ -417,6 +417,8 @@ def _value(operand: Operand, k: int, lens: Lens, place: Place) -> str:
         text = exact(number, str(operand), place)
         return text if row is None else _in_file_unit(text, operand, row, lens)
     content = operand.values()[k]
+    if row is not None and row.keyword == "XDAT":
+        raise LensFileError(f"{operand}: terms of another number or radius in each configuration, not written", place)
     if row is None:
         return one_line(str(content), str(operand), place).replace('"', "'")
     if row.kind == GLASS:

@@ -5,6 +5,7 @@ in `analysis.chief`.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,15 +22,15 @@ from raytrace.optimization.operands.operand import (
     Operand,
     Planner,
     RowValues,
+    known,
+    per_row,
 )
 from raytrace.optimization.operands.paraxial import (
     along,
     chief_ray_of,
     field_of,
     paraxial_image_distance,
-    per_row,
 )
-from raytrace.optimization.operands.rays import known
 from raytrace.system.surface import is_even, ynu
 from raytrace.tracing.launch import vignette
 from raytrace.tracing.trace import is_bent
@@ -111,7 +112,7 @@ def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
 # -- Seidel ------------------------------------------------------------------------------------------------------------
 
 
-def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
+def _seidel(state: LensState, wavelength: int):
     """S1 to S5 in mm, (K,) each, of surfaces 1 to the last before the image."""
     n, c = state.index(wavelength), state.vertex_curvature
     surfaces = range(1, len(c) - 1)
@@ -124,57 +125,33 @@ def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
     vertex = listed(c[1:-1], state.count)
     indices = [listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0)]
     invariant = omega_bar * y - omega * y_bar
-    return third_order(marginal, chief, vertex, indices, shapes.departures(state, vertex), invariant)
+    curvature, conic, a4 = (state.of_surfaces(name)[1:-1] for name in ("curvature", "conic", "a4"))
+    departure = departure_from_sphere(curvature, 1 + conic, a4, vertex)
+    return third_order(marginal, chief, vertex, indices, departure, invariant)
 
 
-class _Shapes:
-    """The difference of surfaces from the spheres of their vertex curvatures, in r⁴."""
-
-    def __init__(self, planner: Planner):
-        surfaces = [*enumerate(planner.lens.surfaces)][1:-1]
-        number = planner.view.number
-        self.conics = [(k, number((k, "conic"))) for k, surface in surfaces if surface.conic is not None]
-        even = [k for k, surface in surfaces if surface.coefficients is not None and len(surface.coefficients) > 1]
-        self.terms = [(k, number((k, "a4"))) for k in even]
-
-    def departures(self, state: LensState, vertex):
-        """G (K,) in 1/mm³."""
-        c, count = listed(state.curvature[1:-1], state.count), state.count
-        shape, terms = [1.0] * len(value_of(c)), [0.0] * len(value_of(c))
-        for k, stored in self.conics:
-            shape[k - 1] = 1 + state.numbers.get((k, "conic"), stored)
-        for k, stored in self.terms:
-            terms[k - 1] = state.numbers.get((k, "a4"), stored)
-        return departure_from_sphere(c, listed(shape, count), listed(terms, count), vertex)
-
-
-def _seidel_sum(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _seidel_sum(lines: Sequence[Line], planner: Planner, *, which: int) -> Evaluate:
     """A sum in waves of the row's wavelength, of a surface or of all."""
+    if is_bent(planner.lens):
+        raise BadRow(lines[0], "is of a straight axis: tilts and decentres bend this one")
+    for k, surface in enumerate(planner.lens.surfaces):
+        if not is_even(surface):
+            raise BadRow(lines[0], f"is of even powers of r: surface {k} has other terms, added sag or a phase")
+    share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        if is_bent(planner.lens):
-            raise BadRow(lines[0], "is of a straight axis: tilts and decentres bend this one")
-        for k, surface in enumerate(planner.lens.surfaces):
-            if not is_even(surface):
-                raise BadRow(lines[0], f"is of even powers of r: surface {k} has other terms, added sag or a phase")
-        shapes = planner.shared(_Shapes)
-        share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
+    def number(context: EvaluationContext, line: Line):
+        sums, surface = context.state.kept(_seidel, line.wavelength)[which], line.row.integers[0]
+        total = sums[surface - 1] if surface else sums.sum()
+        return total / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
 
-        def number(context: EvaluationContext, line: Line):
-            sums, surface = context.state.kept(_seidel, line.wavelength, shapes)[which], line.row.integers[0]
-            total = sums[surface - 1] if surface else sums.sum()
-            return total / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
-
-        return lambda context: RowValues(listed([number(context, line) for line in lines], context.state.count))
-
-    return plan
+    return lambda context: RowValues(listed([number(context, line) for line in lines], context.state.count))
 
 
 def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """S5 in waves of the surfaces of the rows; of surface 0 the real distortion of the largest field."""
     of_lens = [line for line in lines if line.row.integers[0] == 0]
     of_surface = [line for line in lines if line.row.integers[0] != 0]
-    plans = ((of_lens, _distortion), (of_surface, _seidel_sum(4)))
+    plans = ((of_lens, _distortion), (of_surface, partial(_seidel_sum, which=4)))
     planned = [(rows, plan(rows, planner)) for rows, plan in plans if rows]
 
     def evaluate(context: EvaluationContext) -> RowValues:
@@ -255,37 +232,32 @@ def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     return per_row(map(row, lines))
 
 
-def _field_curvature(across: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _field_curvature(lines: Sequence[Line], planner: Planner, *, across: bool) -> Evaluate:
     """mm from the image along z to the focus of close rays about the chief ray, in the plane of the field or across."""
+    meridians = [along(line.field) for line in lines]
+    sections = [(y, -x) if across else (x, y) for x, y in meridians]
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        meridians = [along(line.field) for line in lines]
-        sections = [(y, -x) if across else (x, y) for x, y in meridians]
+    def rays(side: float) -> np.ndarray:
+        points = [
+            unvignetted(planner, line.field, (side * x, side * y)) for line, (x, y) in zip(lines, sections, strict=True)
+        ]
+        return np.array([planner.ray(line, pupil=point) for line, point in zip(lines, points, strict=True)])
 
-        def rays(side: float) -> np.ndarray:
-            points = [
-                unvignetted(planner, line.field, (side * x, side * y))
-                for line, (x, y) in zip(lines, sections, strict=True)
-            ]
-            return np.array([planner.ray(line, pupil=point) for line, point in zip(lines, points, strict=True)])
+    first, second, section = rays(NEAR_CHIEF), rays(-NEAR_CHIEF), np.array(sections).T
 
-        first, second, section = rays(NEAR_CHIEF), rays(-NEAR_CHIEF), np.array(sections).T
+    def evaluate(context: EvaluationContext) -> RowValues:
+        a, b = context.hits(first), context.hits(second)
+        apart = [a.position[k] - b.position[k] for k in range(2)]
+        opening = [a.direction[k] / a.direction[2] - b.direction[k] / b.direction[2] for k in range(2)]
+        focus = focus_of_close_rays(dot_2(apart, section), dot_2(opening, section))
+        return RowValues(known(a.valid & b.valid, focus))
 
-        def evaluate(context: EvaluationContext) -> RowValues:
-            a, b = context.hits(first), context.hits(second)
-            apart = [a.position[k] - b.position[k] for k in range(2)]
-            opening = [a.direction[k] / a.direction[2] - b.direction[k] / b.direction[2] for k in range(2)]
-            focus = focus_of_close_rays(dot_2(apart, section), dot_2(opening, section))
-            return RowValues(known(a.valid & b.valid, focus))
-
-        return evaluate
-
-    return plan
+    return evaluate
 
 
 def _sum_row(which: int, word: str, share: int) -> Operand:
     return Operand(
-        _seidel_sum(which - 1),
+        partial(_seidel_sum, which=which - 1),
         f"{word} S{which} in waves: of a surface (0: all of them), at a wavelength",
         convention=f"Seidel's coefficient S{which} itself over the wavelength; `seidel` wavefront: S{which}/{share}",
         takes=_CONTRIBUTION,
@@ -341,7 +313,7 @@ ABERRATIONS = {
     ),
     **{
         name: Operand(
-            _field_curvature(across),
+            partial(_field_curvature, across=across),
             f"{word} field curvature of a field Hx Hy: from the image to the focus of close rays",
             length=1,
             convention=_CLOSE,

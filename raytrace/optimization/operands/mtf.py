@@ -7,6 +7,7 @@ with their derivatives by torch.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +19,17 @@ from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.lens_state import largest_field
-from raytrace.optimization.operands.operand import BadRow, Evaluate, EvaluationContext, Line, Operand, OrLost, Planner
-from raytrace.optimization.operands.paraxial import image_index, per_row
+from raytrace.optimization.operands.operand import (
+    BadRow,
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    OrLost,
+    Planner,
+    per_row,
+)
+from raytrace.optimization.operands.paraxial import image_index
 from raytrace.optimization.operands.wavefront import beam_of, colours_of, rings, sphere_of
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
@@ -300,18 +310,15 @@ def _mean(section: str, modulation: Callable[[int], object]):
     return sum(share * modulation(axis) for axis, share in zip((1, 0), _SHARES[section], strict=True) if share)
 
 
-def _by_waves(section: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _by_waves(lines: Sequence[Line], planner: Planner, *, section: str) -> Evaluate:
     """The MTF of diffraction along one section of the pupil, or the mean of both."""
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        def row(line: Line) -> Callable[[EvaluationContext], object]:
-            _check(line)
-            wave = planner.shared(AllWaves).of(line)
-            return _entry(wave, wave.ask(line.row.numbers[1], section))
+    def row(line: Line) -> Callable[[EvaluationContext], object]:
+        _check(line)
+        wave = planner.shared(AllWaves).of(line)
+        return _entry(wave, wave.ask(line.row.numbers[1], section))
 
-        return per_row(map(row, lines))
-
-    return plan
+    return per_row(map(row, lines))
 
 
 def _entry(numbers: Callable[[EvaluationContext], Sequence | None], place: int = 0) -> Callable:
@@ -400,7 +407,9 @@ _SECTIONS = {"T": "along y", "S": "along x", "A": "mean of both sections"}
 
 MODULATION = {
     **{
-        f"MTF{s}": Operand(_by_waves(s), f"diffraction MTF {text}; {_COLUMNS}", convention=_WAVES, takes=_TAKES)
+        f"MTF{s}": Operand(
+            partial(_by_waves, section=s), f"diffraction MTF {text}; {_COLUMNS}", convention=_WAVES, takes=_TAKES
+        )
         for s, text in _SECTIONS.items()
     },
     **{

@@ -6,12 +6,14 @@ variables.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from raytrace.maths.numerics import Dual, value_of
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, listed
 from raytrace.optimization.variables import View
 from raytrace.system.lens import Lens
@@ -137,6 +139,9 @@ class RowValues(NamedTuple):
 #: Values of rows at a state; rows of arithmetic take those of earlier rows, by their number.
 Evaluate = Callable[["EvaluationContext"], RowValues]
 
+#: The evaluation of rows of one operand in one configuration.
+Plan = Callable[[Sequence[Line], "Planner"], Evaluate]
+
 
 @dataclasses.dataclass(frozen=True)
 class Operand:
@@ -145,12 +150,12 @@ class Operand:
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: description, with its arguments.
     length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
     convention: the convention chosen where the field's own program leaves the meaning open.
-    takes: the two integers of its rows, keys of `arguments.ARGUMENTS`; "" for one that is not read.
+    takes: the two integers of its rows, keys of `ARGUMENTS`; "" for one that is not read.
     refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """
 
-    plan: Callable[[Sequence[Line], "Planner"], Evaluate]
+    plan: Plan
     text: str
     length: int = 0
     convention: str = ""
@@ -233,6 +238,32 @@ class EvaluationContext:
     def starts(self, rays: np.ndarray, surface: int) -> Hits:
         """Rays behind a surface at their launch, before surface 1 and in its axes."""
         return self.planner.bundles[surface, False].starts(self.state).at(rays)
+
+
+def once_a_context(method: Callable) -> Callable:
+    """A method of a context and further arguments, computed once in each context."""
+
+    def call(context: EvaluationContext, instance, *arguments):
+        return method(instance, context, *arguments)
+
+    @functools.wraps(method)
+    def cached(instance, context: EvaluationContext, *arguments):
+        return context.once(call, instance, *arguments)
+
+    return cached
+
+
+def known(valid: np.ndarray, number):
+    """nan where a ray is lost."""
+    if isinstance(number, Dual):
+        return Dual(np.where(valid, value_of(number), np.nan), number.slope)
+    return np.where(valid, number, np.nan)
+
+
+def per_row(numbers: Iterable[Callable[[EvaluationContext], object]]) -> Evaluate:
+    """The values of rows that share nothing, by a function of the context each."""
+    numbers = [*numbers]
+    return lambda context: RowValues(listed([number(context) for number in numbers], context.state.count))
 
 
 # -- arguments ---------------------------------------------------------------------------------------------------------

@@ -3,43 +3,33 @@
 At the primary wavelength, or that of the row. Signs and formulas are those of `tracing.paraxial`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from raytrace.maths.numerics import Dual, quotient, value_of
 from raytrace.optimization.lens_state import LensState, largest_field, listed
-from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues, need
-from raytrace.optimization.operands.rays import known
+from raytrace.optimization.operands.operand import (
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Plan,
+    Planner,
+    RowValues,
+    known,
+    need,
+    per_row,
+)
 from raytrace.tracing.paraxial import chief_ray, petzval_sum
 
 _RIM = 32  # rays of the outline of a cone
 
-Plan = Callable[[Sequence[Line], Planner], Evaluate]
 
-
-def per_row(numbers: Iterable[Callable[[EvaluationContext], object]]) -> Evaluate:
-    """The values of rows that share nothing, by a function of the context each."""
-    numbers = [*numbers]
-    return lambda context: RowValues(listed([number(context) for number in numbers], context.state.count))
-
-
-def one_by_one(number: Callable[[EvaluationContext, Line], object]) -> Plan:
+def _one_by_one(number: Callable[[EvaluationContext, Line], object]) -> Plan:
     """The plan of rows whose values are a function of the context and the row."""
     return lambda lines, planner: per_row(lambda context, line=line: number(context, line) for line in lines)
-
-
-def of_state(number: Callable[[LensState], object]) -> Plan:
-    """A number of the lens, whatever the row."""
-    return one_by_one(lambda context, line: number(context.state))
-
-
-def at_wavelength(number: Callable[[LensState, int], object]) -> Plan:
-    """A number of the lens at the wavelength of the row."""
-    return one_by_one(lambda context, line: number(context.state, line.wavelength))
-
-
-# -- focal length, pupils and conjugates -------------------------------------------------------------------------------
 
 
 def _focal_length(context: EvaluationContext, line: Line):
@@ -64,20 +54,9 @@ def _object_na(state: LensState):
     return np.abs(n * np.sin(np.arctan(state.marginal_height / state.object_distance)))
 
 
-def _f_number(state: LensState):
-    return np.abs(state.gaussian(state.primary).effective_focal_length) / state.entrance_pupil_diameter
-
-
-def _exit_pupil_diameter(state: LensState):
-    return state.entrance_pupil_diameter * state.gaussian(state.primary).pupil_magnification
-
-
 def paraxial_image_distance(state: LensState, wavelength: int):
     """mm from the last surface before the image."""
     return state.gaussian(wavelength).image_distance(state.vergence_at(wavelength))
-
-
-# -- the chief ray of the largest field --------------------------------------------------------------------------------
 
 
 def _largest_extent(state: LensState):
@@ -88,14 +67,11 @@ def _largest_extent(state: LensState):
 
 def chief_ray_of(state: LensState) -> tuple:
     """(ȳ, ū) in front of surface 1 of the chief ray of the largest field, upwards, at every wavelength."""
-    pupil, distance = state.gaussian(state.primary).entrance_pupil_position, state.thickness[0]
+    pupil = state.gaussian(state.primary).entrance_pupil_position
     return chief_ray(
-        _largest_extent(state),
-        at_infinity=state.is_at_infinity,
-        distance=distance,
-        entrance_pupil=pupil,
+        _largest_extent(state), at_infinity=state.is_at_infinity, distance=state.thickness[0], entrance_pupil=pupil,
         parallel=state.lens.fields.telecentric or not np.isfinite(value_of(pupil)),
-    )
+    )  # fmt: skip
 
 
 def _image_height(state: LensState, wavelength: int):
@@ -104,9 +80,6 @@ def _image_height(state: LensState, wavelength: int):
     if state.is_at_infinity:
         return quotient(-data.n_object * extent, data.C)
     return _magnification(state, wavelength) * extent
-
-
-# -- lengths -----------------------------------------------------------------------------------------------------------
 
 
 def _total_thickness(context: EvaluationContext, line: Line):
@@ -155,35 +128,30 @@ def along(field: tuple[float, float]) -> tuple[float, float]:
     return (field[0] / length, field[1] / length) if length else (0.0, 1.0)
 
 
-def across_rims(section: str) -> Plan:
+def _across_rims(lines: Sequence[Line], planner: Planner, *, section: str) -> Evaluate:
     """1/(n′ |d₊ - d₋|) of the directions d of two rays through opposite rims of the pupil, 1/(2 n′ sin θ′) on the axis.
 
     section: "axial", at the primary wavelength; or "tangential", "sagittal" of the field and wavelength of the row.
     """
+    axial = section == "axial"
+    waves = [planner.primary if axial else line.wavelength for line in lines]
+    fields = [(0.0, 0.0) if axial else field_of(planner, line.row.integers[0]) for line in lines]
+    rims = [(y, -x) if section == "sagittal" else (x, y) for x, y in map(along, fields)]
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        axial = section == "axial"
-        waves = [planner.primary if axial else line.wavelength for line in lines]
-        fields = [(0.0, 0.0) if axial else field_of(planner, line.row.integers[0]) for line in lines]
-        rims = [(y, -x) if section == "sagittal" else (x, y) for x, y in map(along, fields)]
-        ahead, back = (
-            np.array(
-                [
-                    planner.ray(line, field=field, pupil=(side * x, side * y), wavelength=wave)
-                    for line, field, (x, y), wave in zip(lines, fields, rims, waves, strict=True)
-                ]
-            )
-            for side in (1, -1)
+    def through(side: int) -> np.ndarray:
+        each = zip(lines, fields, rims, waves, strict=True)
+        return np.array(
+            [planner.ray(at, field=h, pupil=(side * x, side * y), wavelength=w) for at, h, (x, y), w in each]
         )
 
-        def evaluate(context: EvaluationContext) -> RowValues:
-            a, b = context.hits(ahead), context.hits(back)
-            squares = sum((p - q) ** 2 for p, q in zip(a.direction, b.direction, strict=True))
-            return RowValues(known(a.valid & b.valid, 1 / (image_index(context, waves) * np.sqrt(squares))))
+    ahead, back = through(1), through(-1)
 
-        return evaluate
+    def evaluate(context: EvaluationContext) -> RowValues:
+        a, b = context.hits(ahead), context.hits(back)
+        squares = sum((p - q) ** 2 for p, q in zip(a.direction, b.direction, strict=True))
+        return RowValues(known(a.valid & b.valid, 1 / (image_index(context, waves) * np.sqrt(squares))))
 
-    return plan
+    return evaluate
 
 
 def _effective_f_number(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -211,94 +179,107 @@ def _effective_f_number(lines: Sequence[Line], planner: Planner) -> Evaluate:
     return per_row(map(row, lines))
 
 
-_WAVE = "", "wavelength"
+_NA = "numerical aperture {}, by the paraxial marginal ray"
+_WORKING = "1/(n′ |d₊ - d₋|) of the directions of the rays through the {} rim"
+_OF_A_FIELD = "working F-number, of a field (0: the largest) and wavelength"
+
+#: Numbers of the lens: name, function of the state, text, power of length.
+_OF_STATE = (
+    ("ISNA", _image_na, _NA.format("n′ sin u′ behind the lens"), 0),
+    ("OBSN", _object_na, _NA.format("n sin u in front of the lens"), 0),
+    (
+        "ISFN",
+        lambda state: np.abs(state.gaussian(state.primary).effective_focal_length) / state.entrance_pupil_diameter,
+        "F-number: focal length / entrance pupil diameter",
+        0,
+    ),
+    ("ENPP", lambda state: state.gaussian(state.primary).entrance_pupil_position, "entrance pupil, from surface 1", 1),
+    ("EPDI", lambda state: state.entrance_pupil_diameter, "entrance pupil diameter", 1),
+    (
+        "EXPP",
+        lambda state: state.gaussian(state.primary).exit_pupil_distance - state.thickness[-2],
+        "exit pupil, from the image",
+        1,
+    ),
+    (
+        "EXPD",
+        lambda state: state.entrance_pupil_diameter * state.gaussian(state.primary).pupil_magnification,
+        "exit pupil diameter",
+        1,
+    ),
+)
+
+#: Numbers of the lens at the wavelength of the row, which ends each text.
+_AT_WAVELENGTH = (
+    ("PMAG", _magnification, "paraxial magnification", 0),
+    (
+        "AMAG",
+        lambda state, wavelength: state.gaussian(wavelength).angular_magnification,
+        "angular magnification ū′/ū of the paraxial chief ray",
+        0,
+    ),
+    ("PIMH", _image_height, "height of the largest field in the paraxial image", 1),
+    ("PETZ", lambda *at: quotient(1.0, _petzval_curvature(*at)), "radius of the Petzval surface", 1),
+    ("PETC", _petzval_curvature, "curvature of the Petzval surface", -1),
+)
 
 PARAXIAL = {
     "EFFL": Operand(
-        one_by_one(_focal_length),
+        _one_by_one(_focal_length),
         "effective focal length at a wavelength",
         length=1,
         convention="n′/power, as of the slope behind the lens, where that is not air; `focal_length` in air: 1/power",
-        takes=_WAVE,
+        takes=("", "wavelength"),
     ),
-    "PMAG": Operand(at_wavelength(_magnification), "paraxial magnification at a wavelength", takes=_WAVE),
-    "AMAG": Operand(
-        at_wavelength(lambda state, wavelength: state.gaussian(wavelength).angular_magnification),
-        "angular magnification ū′/ū of the paraxial chief ray at a wavelength",
-        takes=_WAVE,
-    ),
-    "PIMH": Operand(
-        at_wavelength(_image_height),
-        "height of the largest field in the paraxial image at a wavelength",
-        length=1,
-        takes=_WAVE,
-    ),
-    "ISNA": Operand(of_state(_image_na), "numerical aperture n′ sin u′ behind the lens, by the paraxial marginal ray"),
-    "OBSN": Operand(
-        of_state(_object_na),
-        "numerical aperture n sin u in front of the lens, by the paraxial marginal ray",
-    ),
-    "ISFN": Operand(of_state(_f_number), "F-number: focal length / entrance pupil diameter"),
+    **{
+        name: Operand(_one_by_one(lambda context, line, number=number: number(context.state)), text, length)
+        for name, number, text, length in _OF_STATE
+    },
+    **{
+        name: Operand(
+            _one_by_one(lambda context, line, number=number: number(context.state, line.wavelength)),
+            f"{text} at a wavelength",
+            length,
+            takes=("", "wavelength"),
+        )
+        for name, number, text, length in _AT_WAVELENGTH
+    },
     "WFNO": Operand(
-        across_rims("axial"),
+        partial(_across_rims, section="axial"),
         "working F-number 1/(2 n′ sin θ′) of the axis by the real marginal rays",
         convention="of the rays that the vignetting factors of the axis leave",
     ),
-    "TFNO": Operand(
-        across_rims("tangential"),
-        "tangential working F-number, of a field (0: the largest) and wavelength",
-        convention="1/(n′ |d₊ - d₋|) of the directions of the rays through the upper and the lower rim",
-        takes=("field", "wavelength"),
-    ),
-    "SFNO": Operand(
-        across_rims("sagittal"),
-        "sagittal working F-number, of a field (0: the largest) and wavelength",
-        convention="1/(n′ |d₊ - d₋|) of the directions of the rays through the left and the right rim",
-        takes=("field", "wavelength"),
-    ),
+    **{
+        name: Operand(
+            partial(_across_rims, section=section),
+            f"{section} {_OF_A_FIELD}",
+            convention=_WORKING.format(rims),
+            takes=("field", "wavelength"),
+        )
+        for name, section, rims in (
+            ("TFNO", "tangential", "upper and the lower"),
+            ("SFNO", "sagittal", "left and the right"),
+        )
+    },
     "EFNO": Operand(
         _effective_f_number,
         "effective F-number √(π/Ω)/(2 n′) by the projected solid angle Ω of a cone: wavelength, in the column of Hx a "
         "field (0: the largest)",
         convention="Ω inside the outline of 32 rays through the rim as vignetting factors leave; the first integer, "
         "a sampling, is not looked at",
-        takes=_WAVE,
+        takes=("", "wavelength"),
     ),
-    "ENPP": Operand(
-        of_state(lambda state: state.gaussian(state.primary).entrance_pupil_position),
-        "entrance pupil, from surface 1",
-        length=1,
-    ),
-    "EPDI": Operand(of_state(lambda state: state.entrance_pupil_diameter), "entrance pupil diameter", length=1),
-    "EXPP": Operand(
-        of_state(lambda state: state.gaussian(state.primary).exit_pupil_distance - state.thickness[-2]),
-        "exit pupil, from the image",
-        length=1,
-    ),
-    "EXPD": Operand(of_state(_exit_pupil_diameter), "exit pupil diameter", length=1),
     "TOTR": Operand(
-        one_by_one(_total_track),
+        _one_by_one(_total_track),
         "total track, surface 1 to image",
         length=1,
         convention="from the leftmost to the rightmost vertex on a straight axis; `total_track` sum: of the "
         "thicknesses, which differs where some are negative",
     ),
     "TTHI": Operand(
-        one_by_one(_total_thickness),
+        _one_by_one(_total_thickness),
         "sum of the thicknesses of surfaces a to b, both counted",
         length=1,
         takes=("surface", "surface"),
-    ),
-    "PETZ": Operand(
-        at_wavelength(lambda state, wavelength: quotient(1.0, _petzval_curvature(state, wavelength))),
-        "radius of the Petzval surface at a wavelength",
-        length=1,
-        takes=_WAVE,
-    ),
-    "PETC": Operand(
-        at_wavelength(_petzval_curvature),
-        "curvature of the Petzval surface at a wavelength",
-        length=-1,
-        takes=_WAVE,
     ),
 }

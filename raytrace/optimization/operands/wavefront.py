@@ -8,6 +8,7 @@ the solver uses: smooth where the RMS is 0, and no second derivative is lost.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +24,10 @@ from raytrace.optimization.operands.operand import (
     Operand,
     Planner,
     RowValues,
+    known,
+    per_row,
 )
-from raytrace.optimization.operands.paraxial import image_index, per_row
-from raytrace.optimization.operands.rays import known
+from raytrace.optimization.operands.paraxial import image_index
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere
@@ -101,24 +103,20 @@ def opd_of(
     return opd
 
 
-def _opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _opd_less(lines: Sequence[Line], planner: Planner, *, terms: Callable) -> Evaluate:
     """OPD in waves less the best fit of some terms (R, K) of rows, by the weights of the rows; K = 0: the OPD."""
+    opd = opd_of(planner.rays(lines), [(line.wavelength, line.field) for line in lines], planner)
+    weights = np.array([max(line.row.weight, 0.0) for line in lines])
+    for places in _groups(lines):
+        if not weights[places].any():
+            weights[places] = 1.0
+    fit = Fit(terms(lines, planner), weights)
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        opd = opd_of(planner.rays(lines), [(line.wavelength, line.field) for line in lines], planner)
-        weights = np.array([max(line.row.weight, 0.0) for line in lines])
-        for places in _groups(lines):
-            if not weights[places].any():
-                weights[places] = 1.0
-        fit = Fit(terms(lines, planner), weights)
+    def evaluate(context: EvaluationContext) -> RowValues:
+        valid, values = opd(context)
+        return RowValues(known(valid, fit.less(values, valid)))
 
-        def evaluate(context: EvaluationContext) -> RowValues:
-            valid, values = opd(context)
-            return RowValues(known(valid, fit.less(values, valid)))
-
-        return evaluate
-
-    return plan
+    return evaluate
 
 
 class Fit:
@@ -226,19 +224,19 @@ _SPHERE = (
 
 PATH = {
     "OPDC": Operand(
-        _opd_less(_nothing),
+        partial(_opd_less, terms=_nothing),
         "optical path difference to the chief ray, waves; Hx Hy Px Py",
         convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDM": Operand(
-        _opd_less(_piston),
+        partial(_opd_less, terms=_piston),
         "the same less its mean over the rows of its field and wavelength, by weight",
         convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDX": Operand(
-        _opd_less(_piston_and_tilt),
+        partial(_opd_less, terms=_piston_and_tilt),
         "the same less the piston and tilt that fit its field and wavelength best, by weight",
         convention=f"{_SPHERE}; a tilt for every wavelength (`opd_tilt`)",
         takes=_WAVELENGTH,
@@ -314,29 +312,25 @@ def colours_of(line: Line, planner: Planner) -> dict[int, float]:
     return {w: weight for w, weight in enumerate(weights) if weight > 0}
 
 
-def _rms_of(vectors: Callable, rule: Callable, *, clips: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _rms_of(lines: Sequence[Line], planner: Planner, *, vectors: Callable, rule: Callable, clips: bool) -> Evaluate:
     """The RMS of rows, each the length of the vector of its beam; vectors: None of a row without a value."""
+    of_beams = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
 
-    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        of_beams = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
+    def evaluate(context: EvaluationContext) -> RowValues:
+        columns, count = of_beams(context), context.state.count
+        longest = max((len(value_of(column)) for column in columns if column is not None), default=1)
+        values, slopes = np.zeros((longest, len(lines))), np.zeros((count, longest, len(lines)))
+        for place, column in enumerate(columns):
+            if column is None:
+                values[:, place] = np.nan
+                continue
+            size = len(value_of(column))
+            values[:size, place] = value_of(column)
+            slopes[:, :size, place] = slope_of(column, count)
+        parts = Dual(values, slopes) if count else values
+        return RowValues(np.sqrt((parts * parts).sum(0)), (parts,))
 
-        def evaluate(context: EvaluationContext) -> RowValues:
-            columns, count = of_beams(context), context.state.count
-            longest = max((len(value_of(column)) for column in columns if column is not None), default=1)
-            values, slopes = np.zeros((longest, len(lines))), np.zeros((count, longest, len(lines)))
-            for place, column in enumerate(columns):
-                if column is None:
-                    values[:, place] = np.nan
-                    continue
-                size = len(value_of(column))
-                values[:size, place] = value_of(column)
-                slopes[:, :size, place] = slope_of(column, count)
-            parts = Dual(values, slopes) if count else values
-            return RowValues(np.sqrt((parts * parts).sum(0)), (parts,))
-
-        return evaluate
-
-    return plan
+    return evaluate
 
 
 def _spot(*, about_chief: bool):
@@ -408,7 +402,7 @@ _VECTORS = {
 #: RSCE to RWRH; the third letter: C rings, R grid.
 QUALITY = {
     f"R{quantity}{rule}{about}": Operand(
-        _rms_of(vector, points, clips=clips),
+        partial(_rms_of, vectors=vector, rule=points, clips=clips),
         f"{text}; int1 rays, int2 wavelength (0: all by weight), Hx Hy",
         length=int(quantity == "S"),
         convention=convention,
