@@ -10,7 +10,7 @@ const KINDS = {
   image_f_number: "F-number", entrance_pupil_diameter: "entrance pupil, mm", object_na: "object NA",
   paraxial_working_f_number: "working F-number", object_cone_angle: "object cone, °", float_by_stop: "stop radius, mm",
 };
-const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF" };
+const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF, ¼ and ½ of range" };
 
 // -- small parts ------------------------------------------------------------------------------------------------------
 
@@ -315,6 +315,8 @@ class Viewer {
     if (!(e.ctrlKey || e.metaKey)) return;
     const key = e.key.toLowerCase();
     if (key === "z" || key === "y") {
+      const { dataset, value } = e.target;
+      if (dataset.shown !== undefined && dataset.shown !== value) return; // the text that is being typed
       e.preventDefault();
       this.event({ type: key === "y" || e.shiftKey ? "redo" : "undo" });
     } else if (key === "enter") {
@@ -335,6 +337,7 @@ class Viewer {
 
   async run(event) {
     this.busy = true;
+    this.root.setAttribute("aria-busy", "true");
     clearTimeout(this.settling);
     const started = performance.now();
     try {
@@ -345,6 +348,7 @@ class Viewer {
     }
     this.busy = false;
     if (this.queue && this.queue.length) this.run(this.queue.shift());
+    else this.root.setAttribute("aria-busy", "false");
   }
 
   receive(reply, event, waited) {
@@ -447,7 +451,9 @@ class Viewer {
 
   // A text field shows its number, unless something else is typed into it at the moment.
   show(input, text, refused = false) {
-    if (document.activeElement !== input || input.dataset.sent || refused) input.value = text;
+    const isTyping = document.activeElement === input && input.value !== input.dataset.shown && !input.dataset.sent && !refused;
+    if (!isTyping) input.value = text;
+    input.dataset.shown = text;
     delete input.dataset.sent;
   }
 
@@ -507,7 +513,8 @@ class Viewer {
     this.controls.push((lens, refused) => {
       const value = lens.rows[surface].cells[name];
       this.show(input, shownAs(value), refused);
-      vary.checked = lens.rows[surface].vary.includes(name);
+      const waits = (this.queue || []).some((one) => one.type === "vary" && one.surface === surface && one.quantity === name);
+      if (!waits) vary.checked = lens.rows[surface].vary.includes(name);
       slider.hidden = value === null;
       vary.hidden = value === null || surface === lens.rows.length - 1;
       if (value === null || slider.dataset.held) return;
