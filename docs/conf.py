@@ -61,8 +61,8 @@ def paragraphs(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def setup(app):
-    """Write the pages that follow from tables of the package before the build reads them, and compile the trace once for
-    this machine, outside the time limits of the cells."""
+    """Write the pages that follow from tables of the package before the build reads them, and compile the trace once,
+    outside the time limits of the cells."""
     from generate import write
 
     raytrace.prepare()
