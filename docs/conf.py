@@ -19,6 +19,8 @@ nitpicky = False
 
 html_theme = "furo"
 html_title = "raytrace"
+html_static_path = ["_static"]
+html_css_files = ["book.css"]
 html_show_copyright = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
