@@ -133,7 +133,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
     if browser:
         webbrowser.open(address)
     torch.set_num_threads(1)  # of small batches of rays more threads wait for each other: measured in docs/viewer.md
-    settings = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    settings = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(settings).run(sockets=[listener])
     print("the viewer has ended", file=sys.stderr)
