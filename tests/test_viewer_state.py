@@ -73,6 +73,7 @@ def test_a_drag_is_one_step(state):
         ({"quantity": "thicknes", "surface": 2, "value": 1}, "no 'thicknes'; it has thickness"),
         ({"quantity": "glass", "surface": 1, "value": "NO-GLASS"}, "NO-GLASS"),
         ({"quantity": "thickness", "surface": 2}, "'value' is missing"),
+        ({"quantity": "thickness", "surface": None, "value": 1}, "NoneType"),
         ({"type": "fields", "values": "0, x"}, "fields: 'x' is not a number"),
         ({"type": "fields", "values": ""}, "at least one number"),
         ({"type": "fields", "values": "95"}, "90 degrees"),

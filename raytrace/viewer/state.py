@@ -18,7 +18,7 @@ from raytrace.optimization.merit import KINDS, DefaultMerit
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
-from raytrace.system.lens import APERTURE_KINDS, Lens, SystemAperture, check, field_points
+from raytrace.system.lens import Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import modelled, with_number
 from raytrace.system.prescription import medium
@@ -75,7 +75,7 @@ def reduce(state: State, event: Mapping) -> State:
         return dataclasses.replace(state, message=f"unknown event {event.get('type')!r}")
     try:
         return change(dataclasses.replace(state, message=""), event)
-    except (ValueError, RuntimeError, LookupError) as error:
+    except (ValueError, TypeError, RuntimeError, LookupError) as error:
         words = f"{error.args[0]!r} is missing" if type(error) is KeyError else str(error)
         return dataclasses.replace(state, message=words)
 
@@ -160,20 +160,11 @@ def solved(lens: Lens) -> Lens:
     return Model(free.lens, (), free.solves).lens_at(torch.zeros(0).numpy())
 
 
-def aperture_value(lens: Lens, kind: str) -> float:
-    """The number of a system aperture of another kind for the same paraxial beam."""
-    paraxial = first_order(lens)
-    numbers = {
-        "image_f_number": paraxial.f_number,
-        "entrance_pupil_diameter": paraxial.entrance_pupil_diameter,
-        "paraxial_working_f_number": paraxial.paraxial_working_f_number,
-        "float_by_stop": paraxial.stop_height.abs(),
-        "object_na": paraxial.object_na,
-        lens.aperture.kind: lens.aperture.value,
-    }
-    if kind not in numbers:
-        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(numbers)}")
-    return float(numbers[kind])
+def aperture_sizes(lens: Lens) -> dict[str, float]:
+    """The paraxial beam by the kinds of system aperture that the viewer offers, the lens's own first."""
+    own, paraxial = {lens.aperture.kind: float(lens.aperture.value)}, first_order(lens)
+    sizes = {"image_f_number": paraxial.f_number, "entrance_pupil_diameter": paraxial.entrance_pupil_diameter}
+    return own | {kind: float(size) for kind, size in sizes.items() if kind not in own}
 
 
 # -- events
@@ -243,11 +234,10 @@ def _primary(state: State, event: Mapping) -> State:
 
 
 def _aperture(state: State, event: Mapping) -> State:
-    kind = str(event.get("kind") or state.lens.aperture.kind)
-    if kind not in APERTURE_KINDS:
-        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(APERTURE_KINDS)}")
-    given = event.get("value")
-    size = aperture_value(state.lens, kind) if given is None else number(given, "aperture")
+    kind, sizes = str(event.get("kind") or state.lens.aperture.kind), aperture_sizes(state.lens)
+    if kind not in sizes:
+        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(sizes)}")
+    size = sizes[kind] if event.get("value") is None else number(event["value"], "aperture")
     lens = freed(state.lens, f_number=size)
     lens = dataclasses.replace(lens, aperture=SystemAperture(kind, lens.wavelengths.new_tensor(size)))
     check(lens)
