@@ -252,22 +252,25 @@ def test_the_definitions_of_the_tests_are_those_of_the_oracle(name):
 
 _PAGE = """# Corpus of real lens files
 
-{right} of {count} real `.zmx` files are read and agree with independent figures; {refused} is refused by name and line, {wrong} is wrong.
+{right} of {count} real `.zmx` files are read and agree with independent figures; {refused} is refused by
+name and line, {wrong} is wrong.
 
     python tests/test_corpus_types.py docs
 
-Nearly all files were collected from public repositories. The figures are those of two other programs, of an independent tracer, or values that
-OpticStudio stored in the file. "Loaded and right" means: every index marked certain agrees to 1e-6; every first-order quantity to
-1e-8 relative; every ray to 1e-9 mm (of the distance from the vertex beyond 1 m). Largest differences of all files: index {index:.0e}, first
-order {first:.0e}, rays {rays:.0e} mm. Every file: [corpus.csv](corpus.csv). The files are not part of this repository; the tests
-are skipped without them.
+Nearly all files were collected from public repositories. The figures are those of two other programs, of
+an independent tracer, or values that OpticStudio stored in the file. "Loaded and right" means: every
+index marked certain agrees to 1e-6; every first-order quantity to 1e-8 relative; every ray to 1e-9 mm
+(of the distance from the vertex beyond 1 m). Largest differences of all files: index {index:.0e}, first
+order {first:.0e}, rays {rays:.0e} mm. Every file: [corpus.csv](corpus.csv). The files are not part of
+this repository; the tests are skipped without them.
 
-Surface types that are read and written: {types}. Every other type, and a glass that is not shipped, is refused by name, surface and line.
+Surface types that are read and written: {types}. Every other type, and a glass that is not shipped, is
+refused by name, surface and line.
 
 ## Surface types
 
-Files with a surface beyond conics and even aspheres. An automatic semi-diameter is the largest height of a few rays at the rim, which
-OpticStudio traced and stored.
+Files with a surface beyond conics and even aspheres. An automatic semi-diameter is the largest height of
+a few rays at the rim, which OpticStudio traced and stored.
 
 {table}
 
