@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import json
 import math
+import re
 import statistics
 import sys
 import time
@@ -162,6 +163,13 @@ def _of_files(files: Sequence[FileRow]) -> list[str]:
     ]  # fmt: skip
 
 
+def short_name(file: str) -> str:
+    """A file name in words, without its collection: `A__sc_cooke2.ZMX` is "cooke 2"."""
+    words = Path(file).stem.rpartition("__")[2].removeprefix("sc_").partition("_320_")[0]
+    words = re.sub(r"(?<=[a-z])(?=[A-Z0-9])|_", " ", words)
+    return words[:1].upper() + words[1:28].strip()
+
+
 @style.styled
 def optimise_figure(rows: Sequence[Mapping]) -> Figure:
     """Merit of every file at its moved start and at its end."""
@@ -170,18 +178,18 @@ def optimise_figure(rows: Sequence[Mapping]) -> Figure:
     for place, row in enumerate(rows):
         ends = [max(row[name], ROUNDING) for name in ("start_moved", "end_moved")]
         panel.plot(ends, [place, place], color=style.FAINT, linewidth=3, zorder=1)
-        panel.plot(ends[0], place, "o", color=style.GREY, label="moved start" if place == 0 else None)
-        panel.plot(ends[1], place, "o", color=style.FIELD_COLOURS[0], label="end" if place == 0 else None)
+        panel.plot(ends[0], place, "o", color=style.GREY, label="perturbed start" if place == 0 else None)
+        panel.plot(ends[1], place, "o", color=style.FIELD_COLOURS[0], label="optimised" if place == 0 else None)
         if row["best_of_oracle"] > ROUNDING:
-            label = "best known" if place == 0 else None
+            label = "independent least squares, best" if place == 0 else None
             panel.plot(row["best_of_oracle"], place, "|", color=style.FIELD_COLOURS[2], markersize=11, label=label)
         words = f"{row['seconds_moved']:.2g} s"
         panel.annotate(words, (ends[0], place), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    panel.set_yticks(range(len(rows)), [Path(row["file"]).stem[:44] for row in rows])
+    panel.set_yticks(range(len(rows)), [short_name(row["file"]) for row in rows])
     panel.invert_yaxis()
     panel.set_xscale("log")
     panel.set_xlim(0.5 * ROUNDING, 2e3)
-    panel.set_xlabel("merit (10⁻⁶: at most that)")
+    panel.set_xlabel("merit, in the units of the file (lower merits are drawn at 10⁻⁶)")
     panel.grid(axis="x", alpha=0.25)
     if rows:
         figure.legend(loc="outside lower center", ncols=3)
