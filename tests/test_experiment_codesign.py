@@ -398,7 +398,7 @@ def test_the_page_names_settings_that_are_not_usual():
         is_of_paper=True,
     )
     page = markdown(report.parts(), "By hand.")
-    command = page.splitlines()[2].strip()
+    command = page.splitlines()[4].strip()
     assert command.startswith("python docs/experiments/codesign.py double_gauss --data DIR -o FOLDER --docs docs ")
     for option in ("--f-number 4.0", "--field 0 10", "--vary sensor thickness:5", "--seeds 0 1 2", "--patch 16"):
         assert option in command
@@ -407,13 +407,13 @@ def test_the_page_names_settings_that_are_not_usual():
     assert "**Unfinished: 6 of 7 runs.** Missing, by model and seed: drt 2." in page
     assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
     assert kept_of(page) == "By hand."
-    assert "## The paper's claims" in page
+    assert "[claims.csv](codesign/claims.csv)" in page
     assert "[codesign_sweep.md](codesign_sweep.md)" in page
     other = markdown(dataclasses.replace(report, is_of_paper=False).parts())
     assert "paper" not in other
     assert "codesign_sweep.md" not in other
     second = markdown(dataclasses.replace(report, folder="second", is_of_paper=False).parts())
-    assert "--page second" in second.splitlines()[2]
+    assert "--page second" in second.splitlines()[4]
     assert "](second/loss.png)" in second
     assert "codesign/" not in second
     begun = dataclasses.replace(report.settings, start="spectral", rho=0.3, bounds="sensor:57,58")

@@ -53,17 +53,23 @@ from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, machine, picture, shown
 from raytrace.settings import GAUSSIAN, MODELS, CodesignSettings
 from raytrace.shards import processes, share
+from raytrace.system.lens import Lens
 
 #: Figures of the page by file name, and their captions.
 CAPTIONS = {
     "loss.png": "Loss in training, mean of every epoch; bands: range over seeds.",
-    "focus.png": "The sensor in training, and the object distance whose paraxial image it is.",
-    "blur.png": "RMS blur of traced rays on the axis, of the learned lenses.",
-    "distance.png": "Loss of test pictures with DRT PSFs after step 2, over object distance.",
-    "examples.png": "A patch of dead leaves as the sensor sees it and restored, with DRT PSFs after step 2.",
+    "focus.png": "The sensor in training, and the object distance whose paraxial image it is; dashed: focus in the "
+    "paper.",
+    "blur.png": "RMS blur of traced rays on the axis, of the learned lenses; dashed: focus in the paper.",
+    "distance.png": "Loss of test pictures with DRT PSFs after step 2, over object distance; dashed: mean losses "
+    "in the paper.",
+    "examples.png": "A patch of dead leaves: sensor image (left half) and restoration (right half), with DRT PSFs "
+    "after step 2; L¹ of the whole restored patch.",
     "scan.png": "Expected error behind the best linear filter, over the sensor distance: without a network, without "
     "drawn noise.",
 }
+_TIME_COLUMNS = ("model", "psf_ms", "image_ms", "network_ms")
+_CLAIM_COLUMNS = ("claim", "answer", "figures", "criterion")
 _COMMAND = "python docs/experiments/codesign.py"
 _PAPER_NOTE = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
 _SWEEP = " At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
@@ -129,25 +135,36 @@ class Report(Result):
 
     def parts(self) -> list[str]:
         """The page."""
-        header = ("claim", "here", "figures", "yes if")
-        answers = [(claim.text, f"**{claim.answer}**", claim.figures, claim.criterion) for claim in self.claims]
         missing, done = ", ".join(f"{row} {seed}" for row, seed in self.missing), len(self.outcomes)
         all_runs = done + len(self.missing)
         unfinished = f"**Unfinished: {done} of {all_runs} runs.** Missing, by model and seed: {missing}."
         return [
             "# Co-design: which PSF model chooses the better lens?",
+            _answer(self),
             _command(self),
             _experiment(self),
             unfinished if self.missing else "",
             "## Loss and focus",
             _table(self),
-            *(["## The paper's claims", grid(header, answers)] if answers else []),
             *(picture(f"{self.folder}/{name}", CAPTIONS[name]) for name in self.figures),
             "## The best linear filter and training",
             _closed_form(self),
             "## Time of a step",
             _times(self),
         ]
+
+
+def _answer(report: Report) -> str:
+    ranked = sorted(summaries(report.outcomes), key=lambda summary: summary.mean["l1_drt"])
+    losses = ", ".join(f"{NAMES[summary.model]} {summary.mean['l1_drt']:.4f}" for summary in ranked)
+    text = f"**Test loss with DRT PSFs after step 2, by the model that chose the lens: {losses}.**" if ranked else ""
+    if report.is_of_paper:
+        holds = sum(claim.answer == "yes" for claim in report.claims)
+        text += (
+            f" Of the {len(report.claims)} claims of the paper {holds} hold: [claims.csv]({report.folder}/claims.csv); "
+            "all readings: [codesign_readings.md](codesign_readings.md#the-papers-claims)."
+        )
+    return text
 
 
 def _command(report: Report) -> str:
@@ -338,14 +355,16 @@ def _report(
         drawn["loss.png"] = figures.loss_figure(joint, refined, steps_per_epoch)
     sensors = runs.courses(study, results, "sensor")
     if sensors:
-        drawn["focus.png"] = figures.focus_figure(sensors, conjugates(lens, settings), steps_per_epoch)
+        drawn["focus.png"] = figures.focus_figure(
+            sensors, conjugates(lens, settings), steps_per_epoch, _published(lens, 2)
+        )
     distances = np.linspace(settings.near, settings.far, 41)
     blur: dict[str, list[float]] = {}
     if results:
         shown_distances = [settings.near + part * (settings.far - settings.near) for part in (0, 0.25, 0.5, 1)]
         blur, patches = _of_trained_lenses(experiment, study, results, distances, shown_distances)
-        drawn["blur.png"] = figures.blur_figure(distances.tolist(), blur, settings.pixel)
-        drawn["distance.png"] = figures.distance_figure(*runs.losses_by_distance(results))
+        drawn["blur.png"] = figures.blur_figure(distances.tolist(), blur, settings.pixel, _published(lens, 2))
+        drawn["distance.png"] = figures.distance_figure(*runs.losses_by_distance(results), _published(lens, 1))
         drawn["examples.png"] = figures.examples_figure(patches, shown_distances)
     ends = {summary.model: summary.mean["sensor_mm"] for summary in summaries(results)}
     scanned = _scan(experiment, spectrum, optima, list(ends.values()))
@@ -372,11 +391,22 @@ def _report(
         "distance.csv": table(runs.distance_rows(results), runs.DISTANCE_COLUMNS),
         "blur.csv": _curves(("model", "distance_m", "diameter_um"), report.measured.distances, blur, 1e3),
         "spectral.csv": table(optima, OPTIMUM_COLUMNS),
+        "times.csv": table(
+            [dict(zip(_TIME_COLUMNS, (t.model, t.psf, t.image, t.network), strict=True)) for t in times], _TIME_COLUMNS
+        ),
     }
+    if report.claims:
+        texts = [(claim.text, claim.answer, claim.figures, claim.criterion) for claim in report.claims]
+        tables["claims.csv"] = table([dict(zip(_CLAIM_COLUMNS, t, strict=True)) for t in texts], _CLAIM_COLUMNS)
     if scanned:
         tables["scan.csv"] = _curves(("model", "sensor_mm", "error"), *scanned)
     publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
     return report
+
+
+def _published(lens: Lens, column: int) -> dict[str, float]:
+    """A column of the paper's table by model, if the lens is the paper's."""
+    return {model: values[column] for model, values in PAPER.items()} if is_of_paper(lens) else {}
 
 
 def _curves(
