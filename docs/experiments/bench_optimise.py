@@ -148,7 +148,8 @@ def _answer(files: Sequence[FileRow]) -> list[str]:
     seconds = statistics.median(row.seconds_moved for row in known)
     return [
         f"{reached} of {len(known)} files reach the best merit that an independent least squares found, or a lower "
-        f"one, from a start where every variable is moved by up to {FRACTION:.0%}; the median time is {seconds:.2f} s.", "",
+        f"one, from a start where every variable is moved by up to {FRACTION:.0%}; the median time is {seconds:.2f} s.",
+        "",
     ]  # fmt: skip
 
 
