@@ -324,7 +324,7 @@ def document(rows: list[dict[str, str]]) -> str:
     return _PAGE.format(
         count=len(rows), right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
         types=", ".join(f"`{kind}`" for kind in types()), table=by_type(),
-        refusals="\n".join(f"- `{r['file']}`: {r['details']}" for r in rows if r["outcome"] != RIGHT) or "None.",
+        refusals="\n".join(f"- `{r['file']}`: {r['details'].partition('; ')[0]}" for r in rows if r["outcome"] != RIGHT) or "None.",
         **largest,
     )  # fmt: skip
 
