@@ -27,16 +27,19 @@ def commands(page: str) -> list[str]:
 PAGES = sorted(path for path in (*ROOT.glob("docs/*.md"), ROOT / "README.md") if commands(path.read_text("utf-8")))
 
 
-#: Pages whose code has been removed.
-FROZEN = sorted(path for path in ROOT.glob("docs/*.md") if path.read_text("utf-8").startswith("Frozen: "))
+#: Sections whose code has been removed: page, and the line that names what made them.
+FROZEN = [
+    (path.name, line)
+    for path in sorted(ROOT.glob("docs/*.md"))
+    for line in path.read_text("utf-8").splitlines()
+    if line.startswith("Frozen: ")
+]
 
 
-def test_frozen_pages_name_their_commit():
+def test_frozen_sections_name_their_commit():
     assert len(FROZEN) > 10
-    for page in FROZEN:
-        assert re.match(
-            r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", page.read_text("utf-8")
-        ), page
+    for page, line in FROZEN:
+        assert re.match(r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", line), page
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("docs/*.md")), ids=lambda path: path.name)
