@@ -5,6 +5,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import raytrace
+
 root = Path(__file__).parent
 sys.path.insert(0, str(root))
 
@@ -17,6 +19,8 @@ nitpicky = False
 
 html_theme = "furo"
 html_title = "raytrace"
+html_static_path = ["_static"]
+html_css_files = ["book.css"]
 html_show_copyright = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
@@ -59,8 +63,10 @@ def paragraphs(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def setup(app):
-    """Write the pages that follow from tables of the package before the build reads them."""
+    """Write the pages that follow from tables of the package before the build reads them, and compile the trace once,
+    outside the time limits of the cells."""
     from generate import write
 
+    raytrace.prepare()
     app.connect("builder-inited", write)
     app.connect("autodoc-process-docstring", paragraphs)

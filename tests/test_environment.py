@@ -324,11 +324,13 @@ def test_temperature_and_pressure_are_conditions_of_a_command(command):
 def test_the_command_prints_a_glass_at_a_temperature(command):
     code, out, err = command("glass", "N-BK7", "--temperature", 30, "--wavelength", *LINES)
     assert code == 0, err
-    slopes = [line.split()[4:6] for line in out.splitlines() if line.startswith("  n(")]
-    assert [
-        tuple(round(1e6 * float(number.removesuffix("/K")), 1) for number in column)
-        for column in zip(*slopes, strict=True)
-    ] == [*DATA_SHEET[20, 40]]
+    headings, units, *rows = out.splitlines()[-2 - len(LINES) :]
+    assert headings.split() == ["wavelength", "index", "dn/dT,", "air", "dn/dT,", "vacuum"]
+    assert units.split() == ["µm", "1/K", "1/K"]
+    slopes = [line.split()[2:] for line in rows]
+    assert [tuple(round(1e6 * float(number), 1) for number in column) for column in zip(*slopes, strict=True)] == [
+        *DATA_SHEET[20, 40]
+    ]
     found = json.loads(command("glass", "N-BK7", "--pressure", 0, "--json")[1])
     assert found["dn_dt"] == pytest.approx(found["dn_dt_absolute"])
     assert [*json.loads(command("glass", "N-BK7", "--json")[1])][-1] == "indices"

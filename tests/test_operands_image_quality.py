@@ -339,3 +339,11 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
         rt.write_lens(found.lens, tmp_path / "found.zmx")
     row = rt.read_lens(tmp_path / "found.zmx").optimization_data.merit[0]
     assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")
+
+
+def test_a_lens_too_blurred_for_the_mtf_is_nan_where_an_earlier_one_has_it():
+    lens = rt.read_lens("double_gauss")
+    row = Row("MTFA", (1, 0), (1.0, 40.0, 0.0, 0.0), weight=1.0)
+    evaluation = Evaluation(Model(lens, (Vary(11, "thickness"),)), [row])
+    assert 0 < evaluation(np.array([57.3])).values[0] < 1
+    assert np.isnan(evaluation(np.array([90.0])).values[0])

@@ -215,3 +215,9 @@ def test_half_sphere_at_its_edge():
     hit, met = intersect(surface(0.1), vector(10.0 * math.sin(1.5), 0.0, -5.0)[:, None], vector(0.0, 0.0, 1.0)[:, None])
     assert met.all()
     assert abs(hit[2].item() - 10 * (1 - math.cos(1.5))) <= 1e-13
+
+
+def test_radius_is_that_of_the_curvature_and_infinite_of_a_plane():
+    assert surface(0.05).radius == 20
+    assert surface(-0.05).radius == -20
+    assert surface().radius == surface(0.0).radius == math.inf

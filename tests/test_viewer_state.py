@@ -11,7 +11,7 @@ import torch
 import raytrace as rt
 from raytrace.viewer import compute
 from raytrace.viewer.session import Session
-from raytrace.viewer.state import initial, reduce, shown_fields, variables
+from raytrace.viewer.state import initial, merit_of, reduce, shown_fields, variables
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +137,12 @@ def test_variables_are_ticked_and_those_of_the_file_keep_their_bounds(state):
     assert stored.vary == ("curvature:1", "thickness:2")
     assert stored.merit == ""
     assert [one.bounds for one in variables(stored)] == [(), (10.0, 15.0)]
+
+
+@pytest.mark.parametrize("kind", ["spot", "wavefront", "angular", "mtf"])
+def test_every_merit_that_is_offered_has_a_value(state, kind):
+    chosen = reduce(state, {"type": "merit", "kind": kind})
+    assert float(rt.evaluate(chosen.lens, merit=merit_of(chosen)).merit) > 0
 
 
 def test_solves_of_the_file_hold_and_configurations_keep_their_numbers(triplet):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -345,6 +346,17 @@ def test_check_lists_variables_and_evaluated_operands(tmp_path):
 def test_a_table_reports_that_it_holds_no_optimisation_data(tmp_path):
     with pytest.warns(LensFileWarning, match=r"the optimisation data \('12 rows of a merit function'\)"):
         write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")
+
+
+def test_variables_in_any_order_are_written_without_a_warning(tmp_path):
+    data = lens(surface=RULES, tail=MERIT_LINES).optimization_data
+    reversed_order = dataclasses.replace(data, variables=data.variables[::-1], solves=data.solves[::-1])
+    with warnings.catch_warnings(action="error"):
+        write_lens(
+            dataclasses.replace(lens(surface=RULES, tail=MERIT_LINES), optimization_data=reversed_order),
+            tmp_path / "lens.zmx",
+        )
+    assert rt.read_lens(tmp_path / "lens.zmx").optimization_data.variables == data.variables
 
 
 def edge(surfaces, k: int, height: float) -> float:

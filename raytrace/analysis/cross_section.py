@@ -136,10 +136,11 @@ def heights(*radii: float) -> np.ndarray:
     return np.unique(np.concatenate([np.linspace(-max(radii), max(radii), _POINTS), *([-r, r] for r in radii)]))
 
 
-def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor) -> list[float]:
+def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor, stop: float | None = None) -> list[float]:
     """Radius in mm to which every surface is drawn.
 
-    The file's semi-diameter; where it has none, what the rays of all fields need and 4 % more; wavelength: () or (W,).
+    The file's semi-diameter; where it has none, what the rays of all fields need and 4 % more; wavelength: () or (W,);
+    stop: the radius of the stop, where it is known.
     """
     stored = [surface.semi_diameter or 0.0 for surface in lens.surfaces]
     if min(stored[1:]) <= 0:
@@ -152,7 +153,7 @@ def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor) -> list[float]:
                 x, y, _ = crossing.rays.position
                 reach = torch.where(crossing.rays.valid, torch.hypot(x, y), 0.0).max()
                 stored[k] = 1.04 * float(reach)
-    stop = abs(float(stop_radius(lens)))
+    stop = abs(float(stop_radius(lens)) if stop is None else stop)
     if math.isfinite(stop):
         stored[lens.stop] = max(stored[lens.stop], stop)
     largest = max(stored[1:])

@@ -232,7 +232,8 @@ def _drawn(
 ) -> _Drawn:
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
-        places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, wavelengths, fields)
+        stop = float(stop_radius(lens))
+        places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, wavelengths, fields, stop)
         indices = [float(index) for index in media(lens, wavelengths[0])]
         right, up = _extent(lens, places, radii)
         first, last = right
@@ -249,15 +250,15 @@ def _drawn(
         _draw_glass(axes, lens, places, radii, indices)
         _draw_mirrors(axes, lens, places, radii, paths)
         _draw_apertures(axes, lens, places, radii)
-        _draw_stop(axes, lens, places, radii)
+        _draw_stop(axes, lens, places, radii, stop)
         own = [one for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for one in row]
         _draw_rays(axes, paths, own if colour is None else [colour] * len(paths))
         half = _draw_sensor(axes, lens, places[-1], radii, paths)
         if near:
             _draw_object(axes, lens, places[0], paths)
     largest, (low, high) = max(radii[1:-1]), _ray_heights(paths)
-    stop = radii[lens.stop] + 0.18 * largest
-    heights = min(low, -largest, -half, -stop), max(high, largest, half, stop)
+    rim = radii[lens.stop] + 0.18 * largest
+    heights = min(low, -largest, -half, -rim), max(high, largest, half, rim)
     return _Drawn(places, cross_section.is_bent(lens), (min(first, start), last), heights)
 
 
@@ -365,10 +366,9 @@ def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes, lens: Lens, places: list[cross_section.Section], radii: list[float]) -> None:
+def _draw_stop(axes, lens: Lens, places: list[cross_section.Section], radii: list[float], radius: float) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
     surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
-    radius = float(stop_radius(lens))
     on_glass = not surface.is_plane or surface.is_mirror
     radius = radii[lens.stop] if on_glass or not math.isfinite(radius) else radius
     length, half = 0.16 * largest, 0.035 * largest

@@ -21,7 +21,7 @@ from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Table
+from raytrace.maths.result import Column, Table, cell
 from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
@@ -95,7 +95,7 @@ class Seidel(Analysis):
             columns = {name: [*row, row.sum()] for name, row in zip(self.names, self.contributions[:, f], strict=True)}
             if self.kind == "coefficients":
                 columns |= {name: [*values[f], ""] for name, values in heights.items()}
-            invariant = f"optical invariant {abs(float(self.invariant[f])):.6g} mm"
+            invariant = f"optical invariant {cell(abs(float(self.invariant[f])), '.6g')} mm"
             title = f"field {field_words(self.lens, field)}, {invariant}"
             tables.append(Table({Column("surface"): surfaces, **columns}, [title]))
         return tables

@@ -111,39 +111,25 @@ def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
 # -- commands that do more than call their function once
 
 
-def _reading(arguments: argparse.Namespace) -> dict:
-    """Keywords of the functions that read a lens file."""
-    from raytrace.cli.run import catalogs
+def _with_catalogs(arguments: argparse.Namespace, **paths: Path):
+    """The result of a function that takes catalogs, and no lens."""
+    import raytrace
+    from raytrace.cli.run import catalogs, options_of
 
-    names = ("strict", "configuration", "substitute")
-    return {"catalogs": catalogs(arguments), **{name: getattr(arguments, name) for name in names}}
+    options = options_of(arguments) | paths | {"catalogs": catalogs(arguments)}
+    return getattr(raytrace, arguments.run.verb)(**options)
 
 
 def _check(arguments: argparse.Namespace):
-    import raytrace
     from raytrace.cli.run import find_lens
 
-    return raytrace.check(find_lens(arguments.lens), **_reading(arguments))
+    return _with_catalogs(arguments, path=find_lens(arguments.lens))
 
 
 def _convert(arguments: argparse.Namespace):
-    import raytrace
     from raytrace.cli.run import find_lens
 
-    return raytrace.convert(find_lens(arguments.source), arguments.target, **_reading(arguments))
-
-
-def _glass(arguments: argparse.Namespace):
-    import raytrace
-    from raytrace.cli.run import catalogs
-
-    return raytrace.glass(
-        arguments.name,
-        catalogs=catalogs(arguments),
-        wavelengths=arguments.wavelengths,
-        temperature=arguments.temperature,
-        pressure=arguments.pressure,
-    )
+    return _with_catalogs(arguments, source=find_lens(arguments.source))
 
 
 def _bench(arguments: argparse.Namespace):
@@ -577,7 +563,7 @@ COMMANDS = (
         SK16 --wavelength 0.53 --json
         N-BK7 --temperature 40 --pressure 0
         MYGLASS --catalog my_glasses.agf""",
-        catalog, json, run=_glass,
+        catalog, json, run=_with_catalogs,
         name={
             "flags": ("name",), "metavar": "NAME",
             "help": "name of a glass, as in a lens file, or a six-digit MIL code",

@@ -33,6 +33,7 @@ from raytrace.materials.glass import Glass, constant, mil_glass, model_glass
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.poses import Pose, undone
 from raytrace.system.surface import SHAPE, Surface
 
@@ -408,6 +409,18 @@ def _refuse_overflow(lens: Lens, file: str) -> None:
         raise LensFileError("the object distance is too large once converted to mm", Place(file, None, 0))
 
 
+def _in_order(data: OptimizationData | None) -> OptimizationData | None:
+    """Optimisation data with variables and solves by their places; a file does not keep another order."""
+    if data is None:
+        return None
+
+    def place(number: Vary | Solve) -> tuple:
+        return number.surface, number.quantity, number.configuration, number.operand or 0
+
+    variables, solves = (tuple(sorted(numbers, key=place)) for numbers in (data.variables, data.solves))
+    return dataclasses.replace(data, variables=variables, solves=solves)
+
+
 def changes(lens: Lens, again: Lens) -> list[str]:
     """The texts, configurations and optimisation data of a lens that its file does not bring back."""
     pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
@@ -418,7 +431,7 @@ def changes(lens: Lens, again: Lens) -> list[str]:
         pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
-    data, read_again = lens.optimization_data, again.optimization_data
+    data, read_again = _in_order(lens.optimization_data), _in_order(again.optimization_data)
     if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
         if read_again is not None:
             free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]

@@ -45,7 +45,7 @@ from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 
-_SURFACES = ("surface", "place", "met surface", "contribution")  # of `arguments.ARGUMENTS`
+_SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 _NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 

@@ -162,7 +162,8 @@ def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -
     if rings * arms > most:
         raise TooManyPoints(
             f"{what} needs {rings * arms} pupil points, more than {most}: the phase turns {phase / (2 * math.pi):.0f} "
-            "times along a pupil radius. Centre the window where the light lands, make it smaller, or use a ray model"
+            "times along a pupil radius. Centre the window where the light lands (center='chief'), make it smaller, or "
+            "use a ray model"
         )
     return gauss_rings(rings, arms, dtype=like.dtype, device=like.device)
 

@@ -63,6 +63,11 @@ class Surface:
     environment: Environment | None = None
 
     @property
+    def radius(self) -> Tensor:
+        """mm, 1 / curvature; inf of a plane."""
+        return torch.full_like(self.thickness, torch.inf) if self.curvature is None else 1 / self.curvature
+
+    @property
     def is_mirror(self) -> bool:
         return self.glass.formula == "mirror"
 

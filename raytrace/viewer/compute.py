@@ -42,7 +42,6 @@ FIRST_ORDER: tuple[tuple[str, str, Callable[[FirstOrder], Tensor]], ...] = (
     ("F/#", "", lambda one: one.f_number),
     ("working F/#", "", lambda one: one.paraxial_working_f_number),
     ("EPD", "mm", lambda one: one.entrance_pupil_diameter),
-    ("exit pupil", "mm", lambda one: one.exit_pupil_diameter),
     ("m", "", lambda one: one.magnification),
     ("image at", "mm", lambda one: one.paraxial_image_distance),
 )

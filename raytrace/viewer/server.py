@@ -13,6 +13,8 @@ import webbrowser
 from collections import OrderedDict
 from pathlib import Path
 
+import torch
+
 from raytrace.system.lens import Lens
 from raytrace.viewer.session import Session
 
@@ -121,6 +123,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
             listener.bind(("127.0.0.1", port))
         except OSError as error:
             raise OSError(error.errno, f"port {port} cannot be used: {error.strerror}; choose another") from error
+        listener.listen()  # who reads the address may connect at once
         port = listener.getsockname()[1]
         app = application(lens, file, token, port)
     except ModuleNotFoundError as error:
@@ -129,7 +132,8 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
     print(json.dumps({"address": address}) if as_json else f"{address}\nCtrl-C ends the viewer", flush=True)
     if browser:
         webbrowser.open(address)
-    settings = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    torch.set_num_threads(1)  # of small batches of rays more threads wait for each other: measured in docs/viewer.md
+    settings = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(settings).run(sockets=[listener])
     print("the viewer has ended", file=sys.stderr)

@@ -10,7 +10,7 @@ from raytrace.optimization.optimize import Optimized, optimize
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 from raytrace.viewer.compute import mtf_of_field, refresh, remarks
-from raytrace.viewer.state import State, initial, reduce, variables
+from raytrace.viewer.state import State, initial, merit_of, reduce, variables
 
 #: Analyses change the filters of warnings, which all threads share: one event is answered at a time.
 _ONE_AT_A_TIME = threading.Lock()
@@ -29,7 +29,7 @@ class Optimisation:
     def _run(self, state: State) -> None:
         try:
             self.result = optimize(
-                state.lens, merit=state.merit or None, vary=variables(state), progress=lambda work, unit: self
+                state.lens, merit=merit_of(state), vary=variables(state), progress=lambda work, unit: self
             )
         except KeyboardInterrupt:
             self.failure = "stopped before the first cycle"

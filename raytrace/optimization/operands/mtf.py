@@ -265,7 +265,11 @@ class Wave:
     def __call__(self, context: EvaluationContext) -> Sequence | None:
         if self._last[0] is not context:
             numbers = context.once(_by_few_rays, self.planner.shared(AllWaves)).get(self)
-            self._last = context, self._on_grid(context) if numbers is None else numbers
+            if numbers is None:
+                numbers = self._on_grid(context)
+            else:
+                self._on_grid.succeeded = True  # a later lens that is too blurred for the grid is no error
+            self._last = context, numbers
         return self._last[1]
 
 

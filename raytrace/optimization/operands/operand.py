@@ -150,7 +150,7 @@ class Operand:
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: description, with its arguments.
     length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
     convention: the convention chosen where the field's own program leaves the meaning open.
-    takes: the two integers of its rows, keys of `arguments.ARGUMENTS`; "" for one that is not read.
+    takes: the two integers of its rows, keys of `ARGUMENTS`; "" for one that is not read.
     refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """

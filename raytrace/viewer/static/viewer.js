@@ -10,7 +10,7 @@ const KINDS = {
   image_f_number: "F-number", entrance_pupil_diameter: "entrance pupil, mm", object_na: "object NA",
   paraxial_working_f_number: "working F-number", object_cone_angle: "object cone, °", float_by_stop: "stop radius, mm",
 };
-const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF" };
+const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF, ¼ and ½ of range" };
 
 // -- small parts ------------------------------------------------------------------------------------------------------
 
@@ -144,7 +144,7 @@ function drawSpots(target, now, stored) {
   const spots = now.spots;
   if (!spots) return empty(target, "spots", "no spots");
   const count = now.fields.length, width = target.clientWidth || 170;
-  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 26));
+  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 24));
   const half = 1.12 * Math.max(spots.half, Math.min(spots.airy ?? 0, 4 * spots.half), 1e-6);
   target.replaceChildren();
   now.fields.forEach((field, f) => {
@@ -164,36 +164,39 @@ function drawSpots(target, now, stored) {
     });
     picture.append(data);
     const name = make("b", { style: `color:${now.field_colours[f]}`, textContent: field });
-    const value = make("span", { "data-number": `rms-${f}`, "data-value": rms ?? "", textContent: ` ${text}` });
+    const short = before === undefined || rms === null ? text : `${words(rms)} µm`;
+    const value = make("span", { "data-number": `rms-${f}`, "data-value": rms ?? "", textContent: ` ${short}` });
     const caption = make("div", { className: "caption" }, name, value);
     if (before !== undefined) caption.append(make("span", { className: "was", textContent: ` (${words(before, 3)})` }));
     target.append(make("div", { className: "spot" }, caption, picture));
   });
-  const bar = make("div", { className: "caption grey", textContent: `box ${words(2 * half, 3)} µm · Airy radius ${words(spots.airy, 3)} µm` });
-  target.append(bar);
+  const bar = make("div", { className: "caption grey", textContent: `□ ${words(2 * half, 3)}, Airy ○ ${words(2 * spots.airy, 3)} µm` });
+  if (spots.half > 0) target.append(bar);
 }
+
+const LEFT = 40; // of the numbers of an axis
 
 function drawFans(target, now, stored) {
   const fans = now.fans;
   if (!fans) return empty(target, "fans", "no ray fans");
   const width = target.clientWidth || 300, rows = now.fields.length;
   const height = Math.max(54, Math.floor((target.clientHeight || 420) / rows) - 1);
-  const all = [fans.tangential, fans.sagittal].flat(3).filter((one) => one !== null).map(Math.abs);
+  const all = [fans, stored && stored.fans].filter(Boolean).map((one) => [one.tangential, one.sagittal]).flat(4).filter((one) => one !== null).map(Math.abs);
   const top = 1.05 * (Math.max(0, ...all) || 1);
   target.replaceChildren();
   now.fields.forEach((field, f) => {
     const picture = figure(`fan-${f}`, "", width, height, `Ray fans of field ${field}, within ±${words(top, 3)} µm`);
     ["tangential", "sagittal"].forEach((section, s) => {
-      const part = svg("g", { transform: `translate(${s ? 34 + (width - 34) / 2 : 0} 0)` });
+      const part = svg("g", { transform: `translate(${s ? LEFT + (width - LEFT) / 2 : 0} 0)` });
       const last = f === rows - 1;
-      const { at, up, curves } = axes(part, s ? (width - 34) / 2 : 34 + (width - 34) / 2, height, {
-        x: [-1, 1], y: [-top, top], left: s ? 6 : 34, right: 3, top: 14, bottom: last ? 24 : 6,
+      const { at, up, curves } = axes(part, s ? (width - LEFT) / 2 : LEFT + (width - LEFT) / 2, height, {
+        x: [-1, 1], y: [-top, top], left: s ? 6 : LEFT, right: 3, top: 14, bottom: last ? 24 : 6,
         ticksX: 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
       });
       part.append(svg("line", { x1: at(0), x2: at(0), y1: 14, y2: height - (last ? 24 : 6), class: "zero" }), svg("line", { x1: at(-1), x2: at(1), y1: up(0), y2: up(0), class: "zero" }));
       if (stored && stored.fans && stored.fans[section][f]) stored.fans[section][f].forEach((values) => curves.append(line(curve(stored.fans.pupil, values, at, up), "var(--grey)", { "stroke-dasharray": "2 2" })));
       fans[section][f].forEach((values, w) => curves.append(line(curve(fans.pupil, values, at, up), now.wavelength_colours[w], { "stroke-width": 1.3, "data-curve": `${section}-${f}-${w}` })));
-      const title = svg("text", { x: s ? 8 : 36, y: 10, class: "label" });
+      const title = svg("text", { x: s ? 8 : LEFT + 2, y: 10, class: "label" });
       title.textContent = s ? "sagittal" : `${field} tangential`;
       part.append(title);
       picture.append(part);
@@ -315,6 +318,8 @@ class Viewer {
     if (!(e.ctrlKey || e.metaKey)) return;
     const key = e.key.toLowerCase();
     if (key === "z" || key === "y") {
+      const { dataset, value } = e.target;
+      if (dataset.shown !== undefined && dataset.shown !== value) return; // the text that is being typed
       e.preventDefault();
       this.event({ type: key === "y" || e.shiftKey ? "redo" : "undo" });
     } else if (key === "enter") {
@@ -335,6 +340,7 @@ class Viewer {
 
   async run(event) {
     this.busy = true;
+    this.root.setAttribute("aria-busy", "true");
     clearTimeout(this.settling);
     const started = performance.now();
     try {
@@ -345,6 +351,7 @@ class Viewer {
     }
     this.busy = false;
     if (this.queue && this.queue.length) this.run(this.queue.shift());
+    else this.root.setAttribute("aria-busy", "false");
   }
 
   receive(reply, event, waited) {
@@ -377,7 +384,7 @@ class Viewer {
       }
     }
     if (reply.remarks) {
-      this.listProblems(reply.remarks);
+      this.listProblems([...this.last.problems, ...reply.remarks]);
       this.root.dataset.settled = this.root.dataset.count;
       return;
     }
@@ -447,7 +454,9 @@ class Viewer {
 
   // A text field shows its number, unless something else is typed into it at the moment.
   show(input, text, refused = false) {
-    if (document.activeElement !== input || input.dataset.sent || refused) input.value = text;
+    const isTyping = document.activeElement === input && input.value !== input.dataset.shown && !input.dataset.sent && !refused;
+    if (!isTyping) input.value = text;
+    input.dataset.shown = text;
     delete input.dataset.sent;
   }
 
@@ -507,7 +516,8 @@ class Viewer {
     this.controls.push((lens, refused) => {
       const value = lens.rows[surface].cells[name];
       this.show(input, shownAs(value), refused);
-      vary.checked = lens.rows[surface].vary.includes(name);
+      const waits = (this.queue || []).some((one) => one.type === "vary" && one.surface === surface && one.quantity === name);
+      if (!waits) vary.checked = lens.rows[surface].vary.includes(name);
       slider.hidden = value === null;
       vary.hidden = value === null || surface === lens.rows.length - 1;
       if (value === null || slider.dataset.held) return;
@@ -568,7 +578,7 @@ class Viewer {
       primary.replaceChildren(...now.wavelengths.map((one, k) => make("option", { value: k + 1, textContent: words(one, 5), selected: k + 1 === now.primary })));
     });
     const parts = [
-      field(`fields, ${lens.fields.unit}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
+      field(`fields, ${lens.fields.unit.replace("degrees", "°")}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
       field("wavelengths, µm", "wavelengths", { type: "wavelengths" }, (now) => now.wavelengths.map(typed).join(", ")),
       make("div", { className: "pair" }, kind, field("aperture", "aperture", { type: "aperture" }, (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)),
     ];
