@@ -96,8 +96,6 @@ def application(lens: Lens, file: Path | None, token: str, port: int):
             name, happened = str(message["session"])[:64], dict(message["event"])
         except (ValueError, KeyError, TypeError):
             return Response("refused: expected an event as JSON", 400)
-        if happened.get("type") == "lens":  # of an optimisation, not of a page
-            return Response("refused: unknown event", 400)
         if name not in sessions:
             sessions[name] = Session(lens, file)
         sessions.move_to_end(name)
