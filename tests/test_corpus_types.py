@@ -321,10 +321,11 @@ def document(rows: list[dict[str, str]]) -> str:
         key: max(float(row[name]) for row in rows if row[name])
         for key, name in (("index", "index"), ("first", "first order, relative"), ("rays", "rays, mm"))
     }
+    refusals = [f"- `{r['file']}`: {r['details'].partition('; ')[0]}" for r in rows if r["outcome"] != RIGHT]
     return _PAGE.format(
         count=len(rows), right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
         types=", ".join(f"`{kind}`" for kind in types()), table=by_type(),
-        refusals="\n".join(f"- `{r['file']}`: {r['details']}" for r in rows if r["outcome"] != RIGHT) or "None.",
+        refusals="\n".join(refusals) or "None.",
         **largest,
     )  # fmt: skip
 
