@@ -93,7 +93,9 @@ def test_plain_numbers_are_as_good_as_tensors():
         "wavelengths": number([0.5, 0.6]),
         "grid": grid(0.01, 7),
     }
-    one, other = (psf(double_gauss(), Gaussian(order=3), center="axis", **o) for o in ({**numbers, "pixel": 0.01}, tensors))
+    one, other = (
+        psf(double_gauss(), Gaussian(order=3), center="axis", **o) for o in ({**numbers, "pixel": 0.01}, tensors)
+    )
     torch.testing.assert_close(one.kernel, other.kernel, rtol=0, atol=0)
     with pytest.raises(ValueError, match="a grid has a pixel and a size"):
         psf(double_gauss(), "gaussian", grid=grid(0.01, 7), size=7)
