@@ -1,14 +1,20 @@
-"""Pages of the reference that follow from tables of the package: the commands and the operands of merit functions.
+"""Pages of the reference that follow from tables of the package: commands, operands of merit functions, file keywords.
 
 The build calls `write`; the pages are in docs/reference/generated, which is not part of the repository.
 """
 
 import contextlib
 import io
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from raytrace.cli import main
 from raytrace.cli.commands import COMMANDS
+from raytrace.io import FORMATS, oslo, ray_optics
+from raytrace.io.codev import keywords as codev
+from raytrace.io.table import columns
+from raytrace.io.table.text import KEYS
+from raytrace.io.zemax import configurations, optimization, surfaces
 from raytrace.optimization.operands.table import OPERANDS
 
 FOLDER = Path(__file__).parent / "reference" / "generated"
@@ -50,10 +56,148 @@ Python is an operand too: `rt.Measure`.
     return text + "\n".join(rows) + "\n"
 
 
+#: Keywords of .zmx files that are read in old files; a written file has the present keyword of the same number.
+OLD = {"WAVL", "WAVN", "WWGT", "WWGN"} | {
+    keyword for row in surfaces.FIELD_LISTS.values() for keyword in row.keywords[1:]
+}
+
+
+def row_of(treatment: str, words: Iterable[str], reason: str = "") -> str:
+    return f"| {treatment} | {' '.join(f'`{word}`' for word in words)} | {reason} |"
+
+
+def by_reason(treatment: str, reasons: Mapping[str, str]) -> list[str]:
+    """A row for each reason, with its keywords."""
+    rows: dict[str, list[str]] = {}
+    for word, reason in reasons.items():
+        rows.setdefault(reason, []).append(word)
+    return [row_of(treatment, words, reason) for reason, words in rows.items()]
+
+
+def section(title: str, *rows: str, note: str = "") -> str:
+    note = f"{note}\n\n" if note else ""
+    return f"### {title}\n\n{note}| treatment | keywords | remark |\n|---|---|---|\n" + "\n".join(rows) + "\n"
+
+
+def zemax() -> list[str]:
+    """The tables of `raytrace.io.zemax`."""
+    system, surface = list(surfaces.SYSTEM_READ), [*surfaces._SURFACE_READ, *surfaces.aperture_keywords()]
+    solves = [f"{code} ({row.kind})" for code, row in optimization.CURVATURE_SOLVES.items()]
+    followed = [row.kind for row in optimization.CURVATURE_SOLVES.values() if row.followed]
+    thickness = [f"{word} ({row.kind})" for word, row in optimization.THICKNESS_SOLVES.items()]
+    types = surfaces.types()
+    return [
+        section(
+            "System",
+            row_of("read and written", [word for word in system if word not in OLD]),
+            row_of("read only", [word for word in system if word in OLD], "spelling of older files"),
+            *by_reason("reported, ignored", surfaces.SYSTEM_IGNORED),
+        ),
+        section(
+            "Surface",
+            row_of("read and written", dict.fromkeys(word for word in surface if word not in OLD)),
+            *by_reason("reported, ignored", surfaces.SURFACE_IGNORED),
+        ),
+        section(
+            "Surface type (`TYPE`)",
+            *(row_of("read and written", [word], row.name) for word, row in types.items()),
+            *(
+                row_of("refused", [word], name)
+                for word, name in surfaces.TYPE_NAMES.items()
+                if word not in surfaces.types()
+            ),
+        ),
+        section(
+            "Solves",
+            row_of("kept and written", solves, f"`CURV`; evaluated: {', '.join(followed)}"),
+            row_of("kept and written", thickness, "`DISZ`; all are evaluated"),
+        ),
+        section(
+            "Multi-configuration operands (`MNUM`)",
+            row_of("read and written", surfaces.ROWS),
+            row_of("kept and written", configurations.KEPT, "they change no ray"),
+            *by_reason("reported, ignored", configurations._LEFT_OUT),
+            *by_reason("refused where configurations differ", configurations._REFUSED),
+        ),
+        section(
+            "Merit function and tolerances",
+            row_of(
+                "read and written",
+                ["OPERAND"],
+                "operands: see [Operands](operands.md); unknown ones are kept and reported",
+            ),
+            row_of("kept and written", ["TOL", "TCMM"], "tolerances; not evaluated"),
+        ),
+    ]
+
+
+def formats() -> str:
+    """The keywords of each format by their treatment."""
+    parts = [
+        "## OpticStudio (`.zmx`, `.zar`)\n\nA `.zar` archive is read only; its lens file is a `.zmx` file.\n",
+        *zemax(),
+    ]
+    parts += [
+        "## CODE V (`.seq`)\n",
+        section(
+            "Commands",
+            row_of(
+                "read and written",
+                sorted({*codev.SYSTEM_READ, *codev.SURFACE_READ}),
+                "or an equivalent command is written",
+            ),
+            *by_reason("reported, ignored", codev.LEFT_OUT),
+            *by_reason("refused", codev.REFUSED),
+        ),
+        "## OSLO (`.len`)\n\nThe format is read only.\n",
+        section(
+            "System",
+            row_of("read", oslo._SYSTEM_READ),
+            *by_reason("reported, ignored", oslo._SYSTEM_IGNORED),
+            *by_reason("refused", oslo._SYSTEM_REFUSED),
+            *by_reason("refused unless off", oslo._SWITCHES),
+        ),
+        section(
+            "Surface",
+            row_of("read", oslo._SURFACE_READ),
+            *by_reason("reported, ignored", oslo._SURFACE_IGNORED),
+            *by_reason("refused", oslo._SURFACE_REFUSED),
+            row_of("read", oslo._PICKUPS, "pickups from earlier surfaces"),
+        ),
+        "## ray-optics (`.roa`)\n\nThe format is read only.\n",
+        section(
+            "Model",
+            row_of("read", ["seq_model", "optical_spec", "system_spec"]),
+            row_of("read", ray_optics._PROFILES, "profiles"),
+            row_of("read", ray_optics._SHAPES, "apertures"),
+            *by_reason("reported, ignored", ray_optics._LEFT_OUT),
+        ),
+        "## Prescription tables (`.csv`, `.tsv`, `.txt`)\n",
+        section(
+            "Header lines `# key: value`",
+            *(
+                row_of("read and written" if key not in ("ignore", "units") else "read only", [key])
+                for key in dict.fromkeys(KEYS.values())
+            ),
+            note="Lengths are written in mm.",
+        ),
+        section(
+            "Columns",
+            *(row_of("read", [name], spellings) for name, spellings in columns._SPELLINGS.items()),
+            *(row_of("reported, ignored", [], f"{reason}: {names}") for reason, names in columns._OTHERS.items()),
+            note="A heading is recognised in these spellings. `A4`, `r^4` … are coefficients of r⁴; `nF`, `νe` … are "
+            "indices and Abbe numbers at a spectral line. A column of numbers with another heading is refused.",
+        ),
+    ]
+    suffixes = ", ".join(f"`{suffix}`" for suffix, form in FORMATS.items() if form.write)
+    head = f"# Keywords of lens files\n\nFormats that are written: {suffixes}. All are read.\n\n"
+    return head + "\n".join(parts)
+
+
 def write(*_) -> None:
     """Write the pages whose text has changed."""
     FOLDER.mkdir(exist_ok=True)
-    for name, text in (("commands", commands()), ("operands", operands())):
+    for name, text in (("commands", commands()), ("operands", operands()), ("formats", formats())):
         page = FOLDER / f"{name}.md"
         if not page.exists() or page.read_text("utf-8") != text:
             page.write_text(text, "utf-8")

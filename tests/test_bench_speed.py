@@ -295,7 +295,7 @@ def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     about = {"processor": "one", "torch threads": 2}
     others = {"bytes_per_ray": 64.0, "bytes_per_ray_rays": 99, "spot_process_ratio": 1.2, "two_process_gain": 1.9}
     ratios = {dtype: numbers | others | {"asphere_newton_steps": 4} for dtype, numbers in ratios.items()}
-    page = extended.lines(rows, ratios, sizes=TINY, about=about, compiled="cc -O3", repeats=1)
+    page = extended.lines(ratios, sizes=TINY, about=about, compiled="cc -O3", repeats=1)
     found = Measured(rows, page, {}, speed_figure, ("speed.md", "speed"))
     (tmp_path / "speed.md").write_text(f"stale\n{KEPT}\nwords\n")
     found.save_page(tmp_path)

@@ -1,7 +1,7 @@
 """Real lens files against an oracle: each is loaded and right, or refused by name; none is wrong.
 
 Oracle: ../shared/corpus/oracle.json, entries marked `oracle: true` (two independent programs, or numbers OpticStudio
-stored in the file, agree). `python tests/test_corpus_types.py` prints docs/corpus.md.
+stored in the file, agree). `python tests/test_corpus_types.py docs` writes docs/corpus.md and docs/corpus.csv.
 """
 
 import dataclasses
@@ -183,20 +183,21 @@ def media_of(lens: Lens, n_primary: list[float]) -> list[float]:
     return media
 
 
-def table() -> str:
-    """Its table in docs/corpus.md."""
-    results = [compare(name) for name in sorted(oracle())]
-    lines = [
-        "| file | outcome | largest difference: index · first order (relative) · rays (mm) | details |",
-        "|---|---|---|---|",
-    ]
-    for r in results:
-        numbers = f"{r.index:.0e} · {r.first_order:.0e} · {r.rays:.0e}" if r.outcome != REFUSED else ""
+def table() -> list[dict[str, str]]:
+    """Its rows in docs/corpus.csv."""
+    rows = []
+    for r in map(compare, sorted(oracle())):
         editions = [f"{glass} differs from {source} by {d:.1e}" for (glass, source), d in r.editions.items()]
-        details = "; ".join(filter(None, [r.details, *editions])).replace("|", "\\|")
-        lines.append(f"| {r.file} | {r.outcome} | {numbers} | {details} |")
-    counts = [f"{sum(r.outcome == outcome for r in results)} {outcome}" for outcome in (RIGHT, REFUSED, WRONG)]
-    return "\n".join([*lines, "", f"{len(results)} files: {', '.join(counts)}."])
+        details = "; ".join(filter(None, [r.details, *editions]))
+        rows.append({"corpus": "files of all kinds", "file": r.file, "types": "", **numbers(r), "details": details})
+    return rows
+
+
+def numbers(result: Comparison) -> dict[str, str]:
+    """Outcome and largest differences of a file, which a refused one has not."""
+    figures = {"index": result.index, "first order, relative": result.first_order, "rays, mm": result.rays}
+    known = result.outcome != REFUSED
+    return {"outcome": result.outcome} | {name: f"{value:.0e}" if known else "" for name, value in figures.items()}
 
 
 FILES = sorted(oracle()) if (CORPUS / "oracle.json").exists() else []

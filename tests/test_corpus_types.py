@@ -2,17 +2,18 @@
 
 Oracle: ../shared/tier2/oracle_dev.json: rays of an independent tracer, by formulas that are settled by semi-diameters
 which OpticStudio stored in the files; two tables of rays that it listed; and made-up files. The stored ones are
-reproduced here once more. `python tests/test_corpus_types.py > docs/corpus.md` writes the tables of both corpora.
+reproduced here once more. `python tests/test_corpus_types.py docs` writes corpus.md and corpus.csv of both corpora.
 """
 
+import csv
 import dataclasses
 import functools
 import itertools
 import json
 import math
-import re
 import sys
 import warnings
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -41,11 +42,11 @@ FIRST_ORDER_TOLERANCE = 1e-8  # relative: a few hundred roundings of two program
 RAY_TOLERANCE = 1e-9  # mm, or of the distance from the vertex where that is longer than 1 m; and direction cosines
 SEMI_DIAMETER_TOLERANCE = 1e-6  # relative above 1 unit of length: what the digits of all files allow
 
-#: What settled the convention of a type, in words.
+#: Source of the convention of a type.
 SETTLED = {
     "COORDBRK": "stored semi-diameters (the other sign of a tilt fails); order 1 by rays that OpticStudio listed",
     "surface tilts": "stored semi-diameters of a fold mirror, and of a spectrometer (order 1)",
-    "PARAX_XY": "stored semi-diameters of a file kept apart",
+    "PARAX_XY": "stored semi-diameters of a held-out file",
     "PARAXIAL": "stored semi-diameters; its path is a choice of OpticStudio's and not compared",
     "DGRATING": "stored semi-diameters, in transmission and in reflection, on planes and on curved surfaces",
     "TILTSURF": "stored semi-diameters",
@@ -54,10 +55,10 @@ SETTLED = {
     "XASPHERE": "the vendor's documentation, and five programs that write such files",
     "BICONICX": "the vendor's documentation",
     "FZERNPHA": "stored semi-diameters",
-    "FZERNSAG": "the vendor's documentation (the one real file, kept apart, has no term but 0)",
-    "BINARY_1": "stored semi-diameters of a file kept apart",
+    "FZERNSAG": "the vendor's documentation (the one real file, held out, has no term but 0)",
+    "BINARY_1": "stored semi-diameters of a held-out file",
     "BINARY_2": "stored semi-diameters",
-    "FRESNELS": "stored semi-diameters of a file kept apart; its path is not defined and not compared",
+    "FRESNELS": "stored semi-diameters of a held-out file; its path is not defined and not compared",
     "HOLOGRM2": "stored semi-diameters, in transmission and in reflection",
     "XPOLYNOM": "stored semi-diameters (x² and y²); the order of the others by the vendor's documentation",
     "IRREGULA": "stored semi-diameters (all but the angle and the tilt about y)",
@@ -249,18 +250,33 @@ def test_the_definitions_of_the_tests_are_those_of_the_oracle(name):
 
 # -- the document -----------------------------------------------------------------------------------------------------
 
-_HEAD = """# Corpus of real lens files
+_PAGE = """# Corpus of real lens files
 
-{count} `.zmx` files, nearly all collected from public repositories, against independently computed figures: two other
-programs, an independent tracer, or values that OpticStudio stored in the file. "Loaded and right" means: every index
-marked certain agrees to 1e-6; every first-order quantity to 1e-8 relative; every ray to 1e-9 mm (of the distance
-from the vertex beyond 1 m). A surface type that is not modelled, or a glass that is not shipped, is refused by name and
-line. The files themselves are other people's and are not part of this repository; the tests are skipped without them.
+{right} of {count} real `.zmx` files are read and agree with independent figures; {refused} is refused by
+name and line, {wrong} is wrong.
 
-```sh
-python tests/test_corpus_types.py > docs/corpus.md
-```
+    python tests/test_corpus_types.py docs
 
+Nearly all files were collected from public repositories. The figures are those of two other programs, of
+an independent tracer, or values that OpticStudio stored in the file. "Loaded and right" means: every
+index marked certain agrees to 1e-6; every first-order quantity to 1e-8 relative; every ray to 1e-9 mm
+(of the distance from the vertex beyond 1 m). Largest differences of all files: index {index:.0e}, first
+order {first:.0e}, rays {rays:.0e} mm. Every file: [corpus.csv](corpus.csv). The files are not part of
+this repository; the tests are skipped without them.
+
+Surface types that are read and written: {types}. Every other type, and a glass that is not shipped, is
+refused by name, surface and line.
+
+## Surface types
+
+Files with a surface beyond conics and even aspheres. An automatic semi-diameter is the largest height of
+a few rays at the rim, which OpticStudio traced and stored.
+
+{table}
+
+## Refused files
+
+{refusals}
 """
 
 
@@ -271,7 +287,7 @@ def types_of(name: str) -> list[str]:
 
 def by_type() -> str:
     lines = [
-        "| type | files: right · refused · wrong | semi-diameters reproduced | what settled it |",
+        "| type | files: right · refused · wrong | semi-diameters reproduced | source of the convention |",
         "|---|---|---|---|",
     ]
     kinds = dict.fromkeys([*SETTLED, *itertools.chain(*map(types_of, FILES))])
@@ -285,43 +301,40 @@ def by_type() -> str:
     return "\n".join(lines)
 
 
-def by_file() -> str:
-    lines = [
-        "| file | types | outcome | largest difference: index · first order (relative) · rays (mm) "
-        "| semi-diameters reproduced, largest difference |",
-        "|---|---|---|---|---|",
-    ]
+def by_file() -> list[dict[str, str]]:
+    """Its rows in docs/corpus.csv."""
+    rows = []
     for name in sorted(FILES):
         result, details = compare(name), ""
-        numbers = f"{result.index:.0e} · {result.first_order:.0e} · {result.rays:.0e}"
         if FILES[name]["stored_semidiameters"]["matched"]:
-            matched, total, worst = reproduced(name)
-            details = f"{matched} of {total}, {worst:.0e}"
-        if result.outcome != RIGHT:
-            numbers, details = "", result.details.replace("|", "\\|")
-        lines.append(f"| {name} | {', '.join(types_of(name))} | {result.outcome} | {numbers} | {details} |")
-    counts = [f"{sum(compare(name).outcome == o for name in FILES)} {o}" for o in (RIGHT, REFUSED, WRONG)]
-    return "\n".join([*lines, "", f"{len(FILES)} files: {', '.join(counts)}."])
+            details = "{} of {} semi-diameters reproduced, largest difference {:.0e}".format(*reproduced(name))
+        details = details if result.outcome == RIGHT else result.details
+        types_here = ", ".join(types_of(name))
+        here = {"corpus": "surface types", "file": name, "types": types_here}
+        rows.append(here | test_corpus.numbers(result) | {"details": details})
+    return rows
 
 
-def document() -> str:
-    modelled = ", ".join(f"`{kind}`" for kind in types())
-    return "\n".join(
-        [
-            _HEAD.format(count=len(FILES) + len(test_corpus.FILES)),
-            f"Types that are read and written: {modelled}. Every other is refused by name, surface and line.\n",
-            "## Types of surface\n",
-            "Of files with a surface beyond conics and even aspheres. An automatic semi-diameter is the largest height",
-            "of a few rays at the rim, which OpticStudio traced and stored.\n",
-            by_type(),
-            "\n## Files with them\n",
-            by_file(),
-            "\n## Files of all kinds\n",
-            test_corpus.table(),
-        ]
-    )
+def document(rows: list[dict[str, str]]) -> str:
+    outcomes = Counter(row["outcome"] for row in rows)
+    largest = {
+        key: max(float(row[name]) for row in rows if row[name])
+        for key, name in (("index", "index"), ("first", "first order, relative"), ("rays", "rays, mm"))
+    }
+    refusals = [f"- `{r['file']}`: {r['details'].partition('; ')[0]}" for r in rows if r["outcome"] != RIGHT]
+    return _PAGE.format(
+        count=len(rows), right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
+        types=", ".join(f"`{kind}`" for kind in types()), table=by_type(),
+        refusals="\n".join(refusals) or "None.",
+        **largest,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    sys.stdout.write(re.sub(r"\n{3,}", "\n\n", document()) + "\n")
+    every, folder = by_file() + test_corpus.table(), Path(sys.argv[1])
+    (folder / "corpus.md").write_text(document(every), encoding="utf-8")
+    with (folder / "corpus.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, every[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(every)

@@ -419,3 +419,9 @@ def test_wavelength_colours_follow_the_eye():
     assert np.argmax(red) == 0
     infrared = style.wavelength_colours([3.0, 4.0, 5.0])
     assert len(set(infrared)) == 3
+
+
+def test_a_notebook_shows_the_figure():
+    image = rt.layout("singlet").plot()._repr_png_()
+    assert image.startswith(b"\x89PNG")
+    assert len(image) > 10_000

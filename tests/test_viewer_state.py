@@ -73,6 +73,7 @@ def test_a_drag_is_one_step(state):
         ({"quantity": "thicknes", "surface": 2, "value": 1}, "no 'thicknes'; it has thickness"),
         ({"quantity": "glass", "surface": 1, "value": "NO-GLASS"}, "NO-GLASS"),
         ({"quantity": "thickness", "surface": 2}, "'value' is missing"),
+        ({"quantity": "thickness", "surface": None, "value": 1}, "NoneType"),
         ({"type": "fields", "values": "0, x"}, "fields: 'x' is not a number"),
         ({"type": "fields", "values": ""}, "at least one number"),
         ({"type": "fields", "values": "95"}, "90 degrees"),
@@ -188,11 +189,13 @@ def test_numbers_of_a_refresh_are_those_of_the_library(name):
     assert torch.allclose(torch.tensor(slow["sagittal"], dtype=torch.float64), exact.sagittal, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["hubble", "phone", "singlet", "zoom"])
+@pytest.mark.parametrize("name", ["hubble", "phone", "singlet", "zoom", "tilted"])
 def test_every_kind_of_lens_has_a_document(name):
-    lens = rt.read_lens("cooke_triplet" if name == "zoom" else name)
+    lens = rt.read_lens("cooke_triplet" if name in ("zoom", "tilted") else name)
     if name == "zoom":
         lens = lens.with_configurations(thickness={2: [12.0, 13.0]})
+    if name == "tilted":
+        lens = edit(initial(lens), "tilt_x", 3, 1.0).lens
     state = reduce(initial(lens), {"type": "compare", "on": True})
     found = compute.refresh(state)
     text = json.dumps(found, allow_nan=False)

@@ -91,7 +91,7 @@ def bench(request: Request) -> Measured:
             values |= {"two_process_gain": gain, "one_process_speed": one * count, "two_process_speed": two * count}
             bar.update()
     about = {"machine": request.about(), "compiler": compiled, "repeats": repeats, "sizes": dataclasses.asdict(sizes)}
-    page = lines(rows, ratios, sizes=sizes, about=about["machine"], compiled=compiled, repeats=repeats)
+    page = lines(ratios, sizes=sizes, about=about["machine"], compiled=compiled, repeats=repeats)
     return Measured(rows, page, speed.document(rows, ratios) | about, speed_figure, ("speed.md", "speed"))
 
 
@@ -117,9 +117,7 @@ def of_limits(rows: Sequence[Row], dtype: str, sizes: speed.Sizes) -> dict[str, 
     return {key: over(*which) for key, which in (keys | {"asphere_over_limit": ("asphere", "safe")}).items()}
 
 
-def lines(
-    rows: Sequence[Row], ratios: Mapping, *, sizes: speed.Sizes, about: Mapping, compiled: str, repeats: int
-) -> list[str]:
+def lines(ratios: Mapping, *, sizes: speed.Sizes, about: Mapping, compiled: str, repeats: int) -> list[str]:
     """The page. compiled: compiler and flags of the limits, or why there are none."""
     numbers = speed.sizes_in_words(sizes)
     columns = {
@@ -136,7 +134,8 @@ def lines(
         return ", ".join(f"{significant(values[key])}{words} in {dtype}" for dtype, values in ratios.items())
 
     return [
-        *("# Speed: this package, its limits and its peers", ""),
+        *("# Speed of the compiled trace: limits of the machine and peers", ""),
+        *_answer(ratios),
         *(f"    python docs/experiments/bench_speed.py --threads {about['torch threads']} --docs docs", ""),
         *listing(columns, TARGETS),
         "",
@@ -144,8 +143,22 @@ def lines(
         f"{each('asphere_newton_steps')}. Peak memory: of {each('bytes_per_ray_rays', ' rays')}. Gain of a sensor step "
         f"that carries every ray to the sensor (`Memo`) instead of parabolas: {each('sensor_step_gain_of_memo')}.",
         "",
-        *speed.speeds(rows, sizes, about, repeats),
+        *speed.figure_lines(about, repeats),
     ]
+
+
+def _answer(ratios: Mapping) -> list[str]:
+    """The first sentence: speeds over Optiland's, for every dtype; none without Optiland."""
+    keys = ("forward_over_optiland", "backward_over_optiland")
+    known = {dtype: [values[key] for key in keys] for dtype, values in ratios.items()}
+    if not known or any(value is None or not math.isfinite(value) for values in known.values() for value in values):
+        return []
+    words = " and ".join(
+        f"{significant(ahead)} times as fast as Optiland's best back end in {dtype}, {significant(both)} times with "
+        "gradients"
+        for dtype, (ahead, both) in known.items()
+    )
+    return [f"The trace of a double Gauss is {words}.", ""]
 
 
 # -- limits of the machine ---------------------------------------------------------------------------------------------

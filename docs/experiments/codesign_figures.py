@@ -1,5 +1,8 @@
 """Figures of a study of co-design: loss and focus in training, blur and loss over object distance, restored pictures,
-and the error of the closed form over the sensor distance."""
+and the error of the closed form over the sensor distance.
+
+paper: a published value by model, drawn as a dashed line of its colour.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,6 +23,8 @@ LOOKS = {
     "drt": (INK, (0, (6, 1.5, 1, 1.5))),
     "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
 }
+
+_NOTHING: Mapping[str, float] = {}
 
 #: Object distances in m that may be marked on an axis, in order of preference.
 _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 45, 12, 1000, *range(11, 50))
@@ -44,10 +49,15 @@ def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int) -> Figure:
 
 
 @styled
-def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[float]], steps_per_epoch: int) -> Figure:
+def focus_figure(
+    sensors: Curves,
+    conjugates: tuple[Sequence[float], Sequence[float]],
+    steps_per_epoch: int,
+    paper: Mapping[str, float] = _NOTHING,
+) -> Figure:
     """The sensor distance in training; on the right axis the object distance whose paraxial image is there.
 
-    conjugates: sensor distances in mm, ascending, and object distances in m.
+    conjugates: sensor distances in mm, ascending, and object distances in m; paper: focus in m.
     """
     figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
@@ -57,6 +67,15 @@ def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[fl
     panel.set(xlabel="epoch", ylabel="sensor behind the last surface (mm)")
     panel.set_xlim(left=0)
     panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    places, distances = (np.asarray(values) for values in conjugates)
+    order = np.argsort(distances)
+    images = {model: float(np.interp(z, distances[order], places[order])) for model, z in paper.items()}
+    for model, image in images.items():
+        panel.axhline(image, color=_look(model)["color"], linestyle="--", linewidth=0.9)
+        text = f"paper {paper[model]:g} m"
+        offset = -9 if image == min(images.values()) and len(images) > 1 else 2
+        panel.annotate(text, (0.99, image), (0, offset), ("axes fraction", "data"), "offset points", ha="right",
+                       color=_look(model)["color"], fontsize=7)  # fmt: skip
     _legend(figure, panel)
     scale = panel.twinx()
     scale.set_ylim(panel.get_ylim())
@@ -83,8 +102,14 @@ def focus_marks(conjugates: tuple[Sequence[float], Sequence[float]], low: float,
 
 
 @styled
-def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[float]], pixel: float) -> Figure:
-    """RMS blur diameter (mm) of the optimised lenses over object distance (mm), and the width of a pixel."""
+def blur_figure(
+    distances: Sequence[float],
+    diameters: Mapping[str, Sequence[float]],
+    pixel: float,
+    paper: Mapping[str, float] = _NOTHING,
+) -> Figure:
+    """RMS blur diameter (mm) of the optimised lenses over object distance (mm), and the width of a pixel; paper: focus
+    in m."""
     figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
     for model, values in diameters.items():
@@ -92,6 +117,11 @@ def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[flo
     panel.axhline(1e3 * pixel, color=GREY, linewidth=0.7)
     panel.annotate("one pixel", (1, 1e3 * pixel), (-2, 3), ("axes fraction", "data"), "offset points", ha="right",
                    color=GREY, fontsize=7.5)  # fmt: skip
+    highest = 1e3 * max((max(values) for values in diameters.values()), default=0.0)
+    for model, focus in paper.items():
+        panel.axvline(focus, color=_look(model)["color"], linestyle="--", linewidth=0.9)
+        panel.annotate(f"paper's focus {focus:g} m", (focus, highest), (-8, 0), "data", "offset points", rotation=90,
+                       va="top", color=_look(model)["color"], fontsize=7)  # fmt: skip
     panel.set(xlabel="object distance (m)", ylabel="RMS blur diameter, traced rays (µm)")
     panel.set_ylim(bottom=0)
     _legend(figure, panel)
@@ -99,12 +129,22 @@ def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[flo
 
 
 @styled
-def distance_figure(distances: Sequence[float], losses: Curves) -> Figure:
-    """Test loss on DRT PSFs after step 2 over object distance (mm): means over seeds, and their range."""
+def distance_figure(distances: Sequence[float], losses: Curves, paper: Mapping[str, float] = _NOTHING) -> Figure:
+    """Test loss on DRT PSFs after step 2 over object distance (mm): means over seeds, and their range.
+
+    paper: the loss of all distances.
+    """
     figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
     for model, seeds in losses.items():
         _band(panel, np.asarray(distances) / 1e3, seeds, model, marker="o")
+    heights = sorted(paper.values())
+    for model, loss in paper.items():
+        panel.axhline(loss, color=_look(model)["color"], linestyle="--", linewidth=0.9)
+        text = f"paper, mean of all distances: {NAMES[model]} {loss:.4f}"
+        offset = -9 if heights.index(loss) == len(heights) - 2 else 2  # the two highest may be close
+        panel.annotate(text, (0.01, loss), (0, offset), ("axes fraction", "data"), "offset points",
+                       color=_look(model)["color"], fontsize=7)  # fmt: skip
     panel.set(xlabel="object distance (m)", ylabel="test loss with DRT PSFs (mean L¹)")
     _legend(figure, panel)
     return figure
@@ -112,18 +152,23 @@ def distance_figure(distances: Sequence[float], losses: Curves) -> Figure:
 
 @styled
 def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Sequence[float]) -> Figure:
-    """Blurred and noisy images and their restorations, a row for each model, a pair of columns for each distance."""
-    figure = new_figure(1.15 * (2 * len(distances) + 1) + 0.8, 1.3 * len(rows) + 0.5)
-    axes = figure.subplots(len(rows), 2 * len(distances) + 1, squeeze=False)
+    """The object, and its blurred and noisy image (left half of a panel) and restoration (right half): a row for each
+    model, a column for each distance (mm), with the mean absolute error of the whole restored patch."""
+    figure = new_figure(1.45 * (len(distances) + 1) + 0.3, 1.68 * len(rows) + 0.3)
+    axes = figure.subplots(len(rows), len(distances) + 1, squeeze=False)
     for panels, (model, patches) in zip(axes, rows.items(), strict=True):
-        pairs = zip(patches["image"], patches["restored"], strict=True)
-        pictures = [patches["picture"][0], *(picture for pair in pairs for picture in pair)]
-        for panel, picture in zip(panels, pictures, strict=True):
-            show_image(panel, picture)
-        panels[0].set_ylabel(NAMES[model].replace(" from ", "\nfrom "))
-    titles = ["picture", *(title for z in distances for title in (f"{z / 1e3:g} m: image", "restored"))]
-    for panel, title in zip(axes[0], titles, strict=True):
-        panel.set_title(title, fontsize=8)
+        show_image(panels[0], patches["picture"][0])
+        panels[0].set_ylabel(NAMES[model].replace(" from ", "\nfrom "), fontsize=9)
+        for panel, picture, image, restored in zip(
+            panels[1:], patches["picture"], patches["image"], patches["restored"], strict=True
+        ):
+            half = image.shape[-1] // 2
+            show_image(panel, np.concatenate([image[:, :half], restored[:, half:]], 1))
+            panel.axvline(half - 0.5, color="white", linewidth=1.2)
+            panel.set_xlabel(f"L¹ {np.abs(restored - picture).mean():.3f}", fontsize=8, labelpad=2)
+    for panel, title in zip(axes[0], ["object", *(f"{z / 1e3:g} m" for z in distances)], strict=True):
+        panel.set_title(title, fontsize=9)
+    axes[0, 1].set_title(f"{distances[0] / 1e3:g} m\nsensor image | restored", fontsize=8)
     return figure
 
 

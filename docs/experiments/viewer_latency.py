@@ -1,66 +1,63 @@
 """Latency of the viewer by percentile: from an event of a slider to the reply with all new numbers, as JSON.
 
-python docs/experiments/viewer_latency.py [LENS] [EVENTS] [--parts]
-
-Every event moves a curvature or a thickness of the lens. --parts also times the analyses one by one.
+Every event moves a curvature or a thickness of the lens by up to 1 %, as a drag does.
 """
 
+import argparse
 import json
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 
 import raytrace as rt
+from raytrace.system.lens import Lens
 from raytrace.viewer import compute
 from raytrace.viewer.session import Session
 from raytrace.viewer.state import shown_fields
 
 PERCENTILES = 5, 50, 95, 99
+FIRST = 20  # events that are not counted
 
 
-def percentiles(name: str, seconds: list[float]) -> str:
-    figures = " ".join(f"{figure:>8.1f}" for figure in np.percentile(1e3 * np.array(seconds), PERCENTILES))
-    return f"{name:<28} {figures}"
-
-
-def timed(work, count: int) -> list[float]:
+def percentiles(name: str, work: Callable[[int], object], count: int) -> str:
+    """A line of the table: percentiles of the milliseconds that the work takes."""
     found = []
     for k in range(count):
         started = time.perf_counter()
         work(k)
-        found.append(time.perf_counter() - started)
-    return found
+        found.append(1e3 * (time.perf_counter() - started))
+    return f"{name:<28} " + " ".join(f"{figure:>8.1f}" for figure in np.percentile(found, PERCENTILES))
 
 
-def events(lens, count: int):
-    """Drags of all curvatures and thicknesses in turn, each by up to 1 %, and back."""
+def events(lens: Lens, count: int) -> Iterator[dict]:
+    """Drags of all curvatures and thicknesses in turn, of 20 events each."""
     numbers = [(k, "thickness", float(one.thickness)) for k, one in enumerate(lens.surfaces[1:-1], 1)]
-    numbers += [
-        (k, "curvature", float(one.curvature)) for k, one in enumerate(lens.surfaces) if one.curvature is not None
-    ]
+    bent = [(k, one.curvature) for k, one in enumerate(lens.surfaces) if one.curvature is not None]
+    numbers += [(k, "curvature", float(curvature)) for k, curvature in bent]
     for k in range(count):
         surface, quantity, value = numbers[k // 20 % len(numbers)]
         value *= 1 + 0.01 * np.sin(2 * np.pi * (k % 20) / 20)
         yield {"type": "edit", "surface": surface, "quantity": quantity, "value": value, "drag": True}
 
 
-def main(name: str = "cooke_triplet", count: str = "400", *options: str) -> None:
+def measure(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)  # as the server does
-    lens = rt.read_lens(name)
-    session = Session(lens)
-    todo = [*events(lens, int(count) + 20)]
-    for event in todo[:20]:
+    lens = rt.read_lens(arguments.lens)
+    session, todo = Session(lens), [*events(lens, arguments.events + FIRST)]
+    for event in todo[:FIRST]:
         session.answer(event)
-    fields, wavelengths = shown_fields(lens).shape[1], len(lens.wavelengths)
-    print(f"{name}: {fields} fields, {wavelengths} wavelengths, {torch.get_num_threads()} threads")
+    fields = shown_fields(lens)
+    print(f"{arguments.lens}: {fields.shape[1]} fields, {len(lens.wavelengths)} wavelengths")
     print(f"{'':<28} " + " ".join(f"{f'p{p}, ms':>8}" for p in PERCENTILES))
-    print(percentiles("event to new numbers", timed(lambda k: json.dumps(session.answer(todo[20 + k])), int(count))))
-    if "--parts" in options:
-        state, fields = session.state, shown_fields(lens)
+    answer = lambda k: json.dumps(session.answer(todo[FIRST + k]))  # noqa: E731
+    print(percentiles("event to new numbers", answer, arguments.events))
+    if arguments.parts:
+        state = session.state
         with torch.no_grad():
-            for words, work in {
+            for name, work in {
                 "  layout": lambda k: compute.layout_of(lens, fields),
                 "  spots": lambda k: compute.spots_of(lens, fields),
                 "  ray fans": lambda k: compute.fans_of(lens, fields),
@@ -69,9 +66,21 @@ def main(name: str = "cooke_triplet", count: str = "400", *options: str) -> None
                 "  first-order data": lambda k: compute.first_order_of(lens),
                 "  prescription": lambda k: compute.prescription(state),
             }.items():
-                print(percentiles(words, timed(work, 50)))
-        print(percentiles("MTF of diffraction, a field", timed(lambda k: compute.mtf_of_field(session.state, 1), 5)))
+                print(percentiles(name, work, 50))
+        print(percentiles("MTF of diffraction, a field", lambda k: compute.mtf_of_field(session.state, 1), 5))
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("lens", nargs="?", default="cooke_triplet", help="lens file, or the name of a shipped lens")
+    parser.add_argument("--events", type=int, default=300, help="drags that are timed (default 300)")
+    parser.add_argument("--parts", action="store_true", help="time the analyses one by one, too")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
+    measure(parser.parse_args(argv))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    sys.exit(main())

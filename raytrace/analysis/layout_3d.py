@@ -181,8 +181,10 @@ def _frame(axes, points: np.ndarray) -> None:
     axes.set_proj_type("ortho")
     axes.view_init(elev=22, azim=-62)
     axes.set_axis_off()
-    _fill_page(axes, p, span)
     bar = style.round_length(0.25 * size)
-    at = low - 0.02 * size
-    axes.plot([at[0], at[0] + bar], [at[1]] * 2, [at[2]] * 2, color=style.INK, linewidth=1.5)
-    axes.text(at[0] + 0.5 * bar, at[1], at[2] - 0.05 * size, style.round_text(bar), ha="center", va="top", fontsize=8)
+    left, front, bottom = 0.5 * (low[0] + high[0] - bar), low[1] - 0.02 * size, low[2] - 0.02 * size
+    ends = np.array([[left, left + bar], [front] * 2, [bottom - 0.1 * size] * 2])  # with its label
+    _fill_page(axes, np.concatenate([p, ends], axis=1), span)
+    axes.plot(ends[0], ends[1], [bottom] * 2, color=style.INK, linewidth=1.5)
+    label = (left + 0.5 * bar, front, bottom - 0.05 * size)
+    axes.text(*label, style.round_text(bar), ha="center", va="top", fontsize=8)

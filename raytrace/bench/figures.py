@@ -96,9 +96,11 @@ def _speeds(rows: Sequence[Mapping], by: str, titles: Mapping[str, str], names: 
 def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str]) -> Figure:
     """Rows of `bench psf` as mappings: time over error, a panel for each case, samplings from coarse to fine.
 
-    titles: of the panels, by lens and field. Rows driven by a tolerance are left out: they have the same kernels.
+    titles: of the panels, by lens and field. Drawn are float64 rows of a fixed sampling: float32 and rows of a
+    tolerance repeat them.
     """
-    rows = [row for row in rows if row["l1_error"] and row["l1_error"] > _LEAST and row["estimate"] is None]
+    rows = [row for row in rows if row["dtype"] == "float64" and row["estimate"] is None]
+    rows = [row for row in rows if row["l1_error"] and row["l1_error"] > _LEAST]
     columns = 2 if len(titles) > 1 else 1
     lines = -(-len(titles) // columns)
     figure = style.new_figure(3.9 * columns, 3.1 * lines + 0.7)
@@ -117,23 +119,21 @@ def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str])
         panel.remove()
     shown = {row["model"] for row in rows}
     handles = [_key(model, **look(*of_model, hollow=False)) for model, of_model in _MODELS.items() if model in shown]
-    handles += [*dtype_keys(), _key("extrapolated", marker="x", color=style.INK, linestyle="none")]
+    handles.append(_key("extrapolated", marker="x", color=style.INK, linestyle="none"))
     figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
     return figure
 
 
 def _samplings(panel: Axes, rows: Sequence[Mapping], look: dict) -> None:
-    """The samplings of one model: float64 joined in the order of their rays, extrapolated ones dotted."""
-    for dtype in ("float64", "float32"):
-        chosen = sorted((row for row in rows if row["dtype"] == dtype), key=lambda row: row["rays"])
-        run = [(row["l1_error"], row["forward_s"]) for row in chosen if not row["extrapolated"]]
-        far = [(row["l1_error"], row["forward_s"]) for row in chosen if row["extrapolated"]]
-        if run:
-            single = {"linestyle": "none", "markerfacecolor": "white", "alpha": 0.8} if dtype == "float32" else {}
-            panel.plot(*zip(*run, strict=True), **look | single)
-        if far:
-            panel.plot(*zip(*run[-1:], *far, strict=True), ":", color=look["color"], linewidth=1.0)
-            panel.plot(*zip(*far, strict=True), "x", color=look["color"], markersize=5)
+    """The samplings of one model, joined in the order of their rays, extrapolated ones dotted."""
+    chosen = sorted(rows, key=lambda row: row["rays"])
+    run = [(row["l1_error"], row["forward_s"]) for row in chosen if not row["extrapolated"]]
+    far = [(row["l1_error"], row["forward_s"]) for row in chosen if row["extrapolated"]]
+    if run:
+        panel.plot(*zip(*run, strict=True), **look)
+    if far:
+        panel.plot(*zip(*run[-1:], *far, strict=True), ":", color=look["color"], linewidth=1.0)
+        panel.plot(*zip(*far, strict=True), "x", color=look["color"], markersize=5)
 
 
 def look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:

@@ -221,9 +221,8 @@ def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
 def bench(
     request: Request,
     more: Callable[[Truth, int], Sequence[PsfRow]] = lambda truth, threads: (),
-    head: Callable[[Sequence[PsfRow]], Sequence[str]] = lambda rows: (),
 ) -> Measured:
-    """Every method on every case. more: further rows of a case and threads; head: lines above the tables."""
+    """Every method on every case. more: further rows of a case and threads."""
     names = dict.fromkeys(request.arguments.lenses or USUAL)
     chosen = cases([(Path(name).stem, request.open_lens(name)) for name in names])
     repeats, peer_methods = request.arguments.repeats, request.peers.psf_methods if request.peers else lambda truth: ()
@@ -232,7 +231,7 @@ def bench(
         rows = measure(chosen, peer_methods=peer_methods, more=more, **how)
     about = {"repeats": repeats, "machine": request.about()}
     titles = {(case.name, case.field): case.title for case in chosen}
-    lines = report(rows, titles=titles, about=about["machine"], repeats=repeats, head=head(rows))
+    lines = report(rows, titles=titles, about=about["machine"], repeats=repeats)
     return Measured(rows, lines, about, functools.partial(psf_figure, titles=titles))
 
 
@@ -346,14 +345,13 @@ def relative_l1(kernel: Tensor, reference: Tensor) -> float:
 
 
 def report(
-    rows: Sequence[PsfRow], *, titles: Mapping[tuple[str, float], str], about: Mapping, repeats: int,
-    head: Sequence[str] = (),
-) -> list[str]:  # fmt: skip
-    """The page. titles: of the cases, by lens and field; head: further lines above the tables."""
+    rows: Sequence[PsfRow], *, titles: Mapping[tuple[str, float], str], about: Mapping, repeats: int
+) -> list[str]:
+    """The page. titles: of the cases, by lens and field."""
     lines = [
         f"Times of one kernel of {PIXELS} × {PIXELS} pixels, ms: median {clock_of(about)} of up to {repeats} warm "
         "runs.",
-        *("", in_words(about) + ".", "", *head, "## How to read the tables", "", *_LEGEND, ""),
+        *("", in_words(about) + ".", "", "## How to read the tables", "", *_LEGEND, ""),
     ]
     for case, title in titles.items():
         pairs: dict[tuple[str, str], list] = {}  # of dtypes, float64 first

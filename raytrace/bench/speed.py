@@ -313,10 +313,14 @@ def speeds(rows: Sequence[Row], sizes: Sizes, about: Mapping, repeats: int) -> l
     most = {row.tracer: min(sizes.rays, max(r.rays for r in rows if r.tracer == row.tracer)) for row in rows}
     names = ("what", "dtype", "rays", "tracer", "M/s", "position error, nm", "gradient error")
     columns = {name: COLUMNS[name] for name in names} | {"what": lambda row: _TASKS[row.what]}
+    shown = listing(columns, [row for row in rows if row.rays in (sizes.small, most[row.tracer])])
+    return [*figure_lines(about, repeats), "", *shown]
+
+
+def figure_lines(about: Mapping, repeats: int) -> list[str]:
+    """Figure of a page with its caption."""
     return [
         *("![Speed over number of rays](speed.png)", ""),
-        *listing(columns, [row for row in rows if row.rays in (sizes.small, most[row.tracer])]),
-        "",
         f"Medians of {repeats} turns of all tracers, of {clock_of(about)}; {in_words(about, ' ', ', ')}. All figures: "
         "[speed.csv](speed.csv).",
     ]

@@ -1,6 +1,7 @@
 """How the figures look: fonts, colours, the wording of numbers; and how a figure is saved."""
 
 import functools
+import io
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -69,14 +70,22 @@ def styled(function: Callable) -> Callable:
 
 
 def new_figure(width: float, height: float):
-    """A figure of width × height inches on a canvas of its own."""
+    """A figure of width × height inches on a canvas of its own, which a notebook shows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
     figure.get_layout_engine().set(w_pad=0.07, h_pad=0.07)
     FigureCanvasAgg(figure)
+    figure._repr_png_ = functools.partial(_png, figure)  # IPython shows figures of pyplot alone by itself
     return figure
+
+
+@styled
+def _png(figure) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
 
 
 @styled

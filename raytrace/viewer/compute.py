@@ -21,9 +21,11 @@ from raytrace.analysis.setting import field_range
 from raytrace.analysis.spot_diagram import airy_radius, field_spots
 from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached
+from raytrace.maths.result import masked
 from raytrace.maths.sampling import hexapolar
 from raytrace.plotting import style
-from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Lens, field_label, field_points
+from raytrace.system.configurations import count
+from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
@@ -42,7 +44,6 @@ FIRST_ORDER: tuple[tuple[str, str, Callable[[FirstOrder], Tensor]], ...] = (
     ("F/#", "", lambda one: one.f_number),
     ("working F/#", "", lambda one: one.paraxial_working_f_number),
     ("EPD", "mm", lambda one: one.entrance_pupil_diameter),
-    ("exit pupil", "mm", lambda one: one.exit_pupil_diameter),
     ("m", "", lambda one: one.magnification),
     ("image at", "mm", lambda one: one.paraxial_image_distance),
 )
@@ -143,7 +144,6 @@ def spots_of(lens: Lens, fields: Tensor) -> dict:
         listed.append([dot[~np.isnan(dot[:, 0])].round().astype(int).ravel().tolist() for dot in field])
     return {
         "rms": plain(1e3 * whole.rms_radius),
-        "geometric": plain(1e3 * whole.geometric_radius),
         "airy": plain(1e3 * float(airy_radius(lens))),
         "half": 1e3 * half,
         "dots": listed,
@@ -153,22 +153,20 @@ def spots_of(lens: Lens, fields: Tensor) -> dict:
 def fans_of(lens: Lens, fields: Tensor) -> dict:
     """Ray fans in µm, (F, W, P) each; None where no ray arrives."""
     fan = ray_fan_of(lens, fields, FAN)
-    sections = {}
-    for name, curve, valid in (
-        ("tangential", fan.tangential, fan.tangential_valid),
-        ("sagittal", fan.sagittal, fan.sagittal_valid),
-    ):
-        sections[name] = rounded(style.array(torch.where(valid, 1e3 * curve, torch.nan)), 6)
-    return {"pupil": plain(fan.pupil), **sections}
+    tangential, sagittal = masked(fan.tangential, fan.tangential_valid), masked(fan.sagittal, fan.sagittal_valid)
+    return {"pupil": plain(fan.pupil), "tangential": _curves(1e3 * tangential), "sagittal": _curves(1e3 * sagittal)}
+
+
+def _curves(values: Tensor) -> list:
+    return rounded(style.array(values), 6)
 
 
 def curvature_of(lens: Lens) -> dict:
     """Field curvature in mm over fields from the axis to the largest, (W, F) each."""
     fields = field_range(lens, FIELDS)
     found = field_curvature_of(lens, fields)
-    curves = {"tangential": found.tangential, "sagittal": found.sagittal}
-    masked = {name: torch.where(found.valid, curve, torch.nan).T for name, curve in curves.items()}
-    return {"field": plain(fields[1]), **{name: rounded(style.array(curve), 6) for name, curve in masked.items()}}
+    tangential, sagittal = (masked(curve, found.valid).T for curve in (found.tangential, found.sagittal))
+    return {"field": plain(fields[1]), "tangential": _curves(tangential), "sagittal": _curves(sagittal)}
 
 
 def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = False) -> dict:
@@ -177,9 +175,9 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
     found = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
     return {
         "frequency": plain(frequencies),
-        "tangential": rounded(style.array(found.tangential)),
-        "sagittal": rounded(style.array(found.sagittal)),
-        "limit": None if found.limit is None else rounded(style.array(found.limit)),
+        "tangential": _curves(found.tangential),
+        "sagittal": _curves(found.sagittal),
+        "limit": None if found.limit is None else _curves(found.limit),
         "transfer": transfer(found),
     }
 
@@ -193,22 +191,12 @@ def first_order_of(lens: Lens) -> list[dict]:
 
 def refresh(state: State) -> dict:
     """All numbers that follow an edit. Analyses that the lens does not have are None, with reasons in `problems`."""
-    document = {"prescription": prescription(state), "problems": []}
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # `remarks` has them
-        lens, problems = _simple(state.lens), document["problems"]
-        fields = shown_fields(lens)
-        document["analyses"] = _analyses(lens, fields, state.frequency, problems)
-        document["stored"] = None
-        if state.compare:
-            stored = _simple(state.stored)
-            document["stored"] = _analyses(stored, shown_fields(stored), state.frequency, [])
-        spots = document["analyses"]["spots"]
-        dark = [f for f, radius in enumerate(spots["rms"] if spots else ()) if radius is None]
-        if dark:
-            document["problems"] = _lost(lens, fields[:, dark])
-    document["message"] = state.message
-    return document
+        analyses, problems = _analyses(state.lens, state.frequency)
+        stored = _analyses(state.stored, state.frequency)[0] if state.compare else None
+    shown = {"prescription": prescription(state), "analyses": analyses, "stored": stored}
+    return {**shown, "problems": problems, "message": state.message}
 
 
 def _simple(lens: Lens) -> Lens:
@@ -219,16 +207,23 @@ def _simple(lens: Lens) -> Lens:
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
 
 
-def _analyses(lens: Lens, fields: Tensor, highest: float, problems: list[str]) -> dict:
-    found = {"fields": [field_label(lens, point) for point in fields.T.tolist()]}
-    found["wavelengths"] = plain(lens.wavelengths)
-    found["field_colours"] = style.field_colours(fields.shape[1])
-    found["wavelength_colours"] = [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())]
+def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
+    """The analyses by name, and why some are None, or rays are lost."""
+    lens, problems = _simple(lens), []
+    fields = shown_fields(lens)
+    found = {
+        "fields": [field_label(lens, point) for point in fields.T.tolist()],
+        "wavelengths": plain(lens.wavelengths),
+        "field_colours": style.field_colours(fields.shape[1]),
+        "wavelength_colours": [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
+    }
     for name, analysis in {
         "layout": lambda: layout_of(lens, fields),
         "spots": lambda: spots_of(lens, fields),
         "fans": lambda: fans_of(lens, fields),
-        "mtf": lambda: mtf_of(lens, fields, min(highest, least_reach(1e-3 * found["spots"]["half"]))),
+        "mtf": lambda: (
+            found["spots"] and mtf_of(lens, fields, min(highest, least_reach(1e-3 * found["spots"]["half"])))
+        ),
         "curvature": lambda: curvature_of(lens),
         "first_order": lambda: first_order_of(lens),
     }.items():
@@ -237,7 +232,8 @@ def _analyses(lens: Lens, fields: Tensor, highest: float, problems: list[str]) -
         except (ValueError, RuntimeError) as error:
             found[name] = None
             problems.append(str(error))
-    return found
+    dark = [f for f, radius in enumerate(found["spots"]["rms"] if found["spots"] else ()) if radius is None]
+    return found, _lost(lens, fields[:, dark]) if dark else problems
 
 
 def _lost(lens: Lens, fields: Tensor) -> list[str]:
@@ -304,21 +300,19 @@ def prescription(state: State) -> dict:
                 "follows": sorted(here[1]),
             }
         )
-    kinds = [lens.aperture.kind, "image_f_number", "entrance_pupil_diameter"]
     return {
         "name": lens.name,
         "rows": rows,
-        "fields": {"kind": lens.fields.kind, "unit": FIELD_UNITS[lens.fields.kind], "y": plain(lens.fields.y)},
+        "fields": {"unit": lens.fields.unit, "y": plain(lens.fields.y)},
         "wavelengths": plain(lens.wavelengths),
         "primary": lens.primary_wavelength,
         "aperture": {
             "kind": lens.aperture.kind,
             "value": float(lens.aperture.value),
-            "unit": APERTURE_KINDS[lens.aperture.kind],
-            "kinds": [*dict.fromkeys(kinds)],
+            "kinds": [*dict.fromkeys((lens.aperture.kind, "image_f_number", "entrance_pupil_diameter"))],
         },
         "configuration": lens.current_configuration,
-        "configurations": len(lens.configurations) if lens.operands else 1,
+        "configurations": count(lens.operands),
         "undo": len(state.past),
         "redo": len(state.future),
         "frequency": state.frequency,

@@ -96,8 +96,6 @@ def application(lens: Lens, file: Path | None, token: str, port: int):
             name, happened = str(message["session"])[:64], dict(message["event"])
         except (ValueError, KeyError, TypeError):
             return Response("refused: expected an event as JSON", 400)
-        if happened.get("type") == "lens":  # of an optimisation, not of a page
-            return Response("refused: unknown event", 400)
         if name not in sessions:
             sessions[name] = Session(lens, file)
         sessions.move_to_end(name)
@@ -133,7 +131,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
     if browser:
         webbrowser.open(address)
     torch.set_num_threads(1)  # of small batches of rays more threads wait for each other: measured in docs/viewer.md
-    settings = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    settings = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(settings).run(sockets=[listener])
     print("the viewer has ended", file=sys.stderr)

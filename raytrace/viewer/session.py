@@ -10,7 +10,7 @@ from raytrace.optimization.optimize import Optimized, optimize
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 from raytrace.viewer.compute import mtf_of_field, refresh, remarks
-from raytrace.viewer.state import State, initial, merit_of, reduce, variables
+from raytrace.viewer.state import State, edited, initial, merit_of, reduce, variables
 
 #: Analyses change the filters of warnings, which all threads share: one event is answered at a time.
 _ONE_AT_A_TIME = threading.Lock()
@@ -108,7 +108,7 @@ class Session:
         result, self.optimisation = self.optimisation.result, None
         if result is None:
             return {"optimisation": document, "message": document["failure"]}
-        self.state = reduce(self.state, {"type": "lens", "lens": result.lens})
+        self.state = edited(self.state, result.lens)
         document["words"] = f"merit {result.merit_before:.6g} → {result.merit_after:.6g}, {result.stopped}"
         return {"optimisation": document, **refresh(self.state)}
 

@@ -18,7 +18,7 @@ from raytrace.optimization.merit import KINDS, DefaultMerit
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
-from raytrace.system.lens import APERTURE_KINDS, Lens, SystemAperture, check, field_points
+from raytrace.system.lens import Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import modelled, with_number
 from raytrace.system.prescription import medium
@@ -75,7 +75,7 @@ def reduce(state: State, event: Mapping) -> State:
         return dataclasses.replace(state, message=f"unknown event {event.get('type')!r}")
     try:
         return change(dataclasses.replace(state, message=""), event)
-    except (ValueError, RuntimeError, LookupError) as error:
+    except (ValueError, TypeError, RuntimeError, LookupError) as error:
         words = f"{error.args[0]!r} is missing" if type(error) is KeyError else str(error)
         return dataclasses.replace(state, message=words)
 
@@ -160,26 +160,17 @@ def solved(lens: Lens) -> Lens:
     return Model(free.lens, (), free.solves).lens_at(torch.zeros(0).numpy())
 
 
-def aperture_value(lens: Lens, kind: str) -> float:
-    """The number of a system aperture of another kind for the same paraxial beam."""
-    paraxial = first_order(lens)
-    numbers = {
-        "image_f_number": paraxial.f_number,
-        "entrance_pupil_diameter": paraxial.entrance_pupil_diameter,
-        "paraxial_working_f_number": paraxial.paraxial_working_f_number,
-        "float_by_stop": paraxial.stop_height.abs(),
-        "object_na": paraxial.object_na,
-        lens.aperture.kind: lens.aperture.value,
-    }
-    if kind not in numbers:
-        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(numbers)}")
-    return float(numbers[kind])
+def aperture_sizes(lens: Lens) -> dict[str, float]:
+    """The paraxial beam by the kinds of system aperture that the viewer offers, the lens's own first."""
+    own, paraxial = {lens.aperture.kind: float(lens.aperture.value)}, first_order(lens)
+    sizes = {"image_f_number": paraxial.f_number, "entrance_pupil_diameter": paraxial.entrance_pupil_diameter}
+    return own | {kind: float(size) for kind, size in sizes.items() if kind not in own}
 
 
 # -- events
 
 
-def _edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag: str = "") -> State:
+def edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag: str = "") -> State:
     """The state with another lens; the one before can be undone. A drag of one number is one step."""
     goes_on = bool(state.dragged) and state.dragged == drag
     past = state.past if goes_on else (*state.past, (state.lens, state.vary))[-DEPTH:]
@@ -187,13 +178,18 @@ def _edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag:
     return dataclasses.replace(state, lens=lens, vary=vary, past=past, future=(), dragged=drag)
 
 
+def _dragged(state: State, event: Mapping, lens: Lens, key: str) -> State:
+    """The lens of an event of the slider `key`, or of the text field beside it, which ends the drag."""
+    drag = bool(event.get("drag"))
+    found = edited(state, lens, drag=key if drag or state.dragged == key else "")
+    return found if drag else dataclasses.replace(found, dragged="")
+
+
 def _edit(state: State, event: Mapping) -> State:
     surface, quantity = int(event["surface"]), str(event["quantity"])
     named = "curvature" if quantity == "radius" else quantity
-    key = f"{named}:{surface}"
     lens = with_value(state.lens, surface, quantity, event["value"])
-    found = _edited(state, lens, drag=key if event.get("drag") or state.dragged == key else "")
-    return found if event.get("drag") else dataclasses.replace(found, dragged="")
+    return _dragged(state, event, lens, f"{named}:{surface}")
 
 
 def _vary(state: State, event: Mapping) -> State:
@@ -202,7 +198,7 @@ def _vary(state: State, event: Mapping) -> State:
     if event.get("on"):
         freedom(state.lens, word)
         chosen = (*chosen, word)
-    return _edited(state, state.lens, chosen)
+    return edited(state, state.lens, chosen)
 
 
 def _fields(state: State, event: Mapping) -> State:
@@ -212,8 +208,8 @@ def _fields(state: State, event: Mapping) -> State:
         fields = dataclasses.replace(lens.fields, y=lens.fields.y.new_tensor(y))
         lens = dataclasses.replace(freed(lens, fields=y), fields=fields)
         check(lens)
-        return _edited(state, solved(lens), drag="")
-    return _edited(state, solved(lens.at(fields=y)))
+        return edited(state, solved(lens), drag="")
+    return edited(state, solved(lens.at(fields=y)))
 
 
 def _wavelengths(state: State, event: Mapping) -> State:
@@ -228,27 +224,24 @@ def _wavelengths(state: State, event: Mapping) -> State:
         wavelength_weights=lens.wavelength_weights.new_tensor([weights.get(one, 1.0) for one in values]),
         primary_wavelength=1 + values.index(primary) if primary in values else 1,
     )
-    return _edited(state, solved(found))
+    return edited(state, solved(found))
 
 
 def _primary(state: State, event: Mapping) -> State:
     lens = dataclasses.replace(state.lens, primary_wavelength=int(event["number"]))
     check(lens)
-    return _edited(state, solved(lens))
+    return edited(state, solved(lens))
 
 
 def _aperture(state: State, event: Mapping) -> State:
-    kind = str(event.get("kind") or state.lens.aperture.kind)
-    if kind not in APERTURE_KINDS:
-        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(APERTURE_KINDS)}")
-    given = event.get("value")
-    size = aperture_value(state.lens, kind) if given is None else number(given, "aperture")
+    kind, sizes = str(event.get("kind") or state.lens.aperture.kind), aperture_sizes(state.lens)
+    if kind not in sizes:
+        raise ValueError(f"aperture {kind!r}: expected one of {', '.join(sizes)}")
+    size = sizes[kind] if event.get("value") is None else number(event["value"], "aperture")
     lens = freed(state.lens, f_number=size)
     lens = dataclasses.replace(lens, aperture=SystemAperture(kind, lens.wavelengths.new_tensor(size)))
     check(lens)
-    drag = "aperture" if event.get("drag") or state.dragged == "aperture" else ""
-    found = _edited(state, solved(lens), drag=drag)
-    return found if event.get("drag") else dataclasses.replace(found, dragged="")
+    return _dragged(state, event, solved(lens), "aperture")
 
 
 def _frequency(state: State, event: Mapping) -> State:
@@ -259,7 +252,7 @@ def _frequency(state: State, event: Mapping) -> State:
 
 
 def _configuration(state: State, event: Mapping) -> State:
-    return _edited(state, state.lens.configuration(int(event["number"])))
+    return edited(state, state.lens.configuration(int(event["number"])))
 
 
 def _step(state: State, source: str) -> State:
@@ -294,6 +287,5 @@ EVENTS: dict[str, Callable[[State, Mapping], State]] = {
     "compare": lambda state, event: dataclasses.replace(state, compare=bool(event.get("on"))),
     "undo": lambda state, event: _step(state, "past"),
     "redo": lambda state, event: _step(state, "future"),
-    "restore": lambda state, event: _edited(state, state.stored, initial(state.stored).vary),
-    "lens": lambda state, event: _edited(state, event["lens"]),
+    "restore": lambda state, event: edited(state, state.stored, initial(state.stored).vary),
 }

@@ -45,9 +45,7 @@ def widget_of(lens: Lens):
             self.on_msg(self._answer)
 
         def _answer(self, widget, content: dict, buffers: list) -> None:
-            event = dict(content["event"])
-            if event.get("type") != "lens":
-                self.send({"number": content["number"], "reply": self.session.answer(event)})
+            self.send({"number": content["number"], "reply": self.session.answer(dict(content["event"]))})
 
         @property
         def state(self):

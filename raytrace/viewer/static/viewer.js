@@ -144,7 +144,7 @@ function drawSpots(target, now, stored) {
   const spots = now.spots;
   if (!spots) return empty(target, "spots", "no spots");
   const count = now.fields.length, width = target.clientWidth || 170;
-  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 26));
+  const size = Math.max(40, Math.min(width - 8, (target.clientHeight || 420) / count - 24));
   const half = 1.12 * Math.max(spots.half, Math.min(spots.airy ?? 0, 4 * spots.half), 1e-6);
   target.replaceChildren();
   now.fields.forEach((field, f) => {
@@ -164,36 +164,39 @@ function drawSpots(target, now, stored) {
     });
     picture.append(data);
     const name = make("b", { style: `color:${now.field_colours[f]}`, textContent: field });
-    const value = make("span", { "data-number": `rms-${f}`, "data-value": rms ?? "", textContent: ` ${text}` });
+    const short = before === undefined || rms === null ? text : `${words(rms)} µm`;
+    const value = make("span", { "data-number": `rms-${f}`, "data-value": rms ?? "", textContent: ` ${short}` });
     const caption = make("div", { className: "caption" }, name, value);
     if (before !== undefined) caption.append(make("span", { className: "was", textContent: ` (${words(before, 3)})` }));
     target.append(make("div", { className: "spot" }, caption, picture));
   });
-  const bar = make("div", { className: "caption grey", textContent: `box ${words(2 * half, 3)} µm · Airy radius ${words(spots.airy, 3)} µm` });
-  target.append(bar);
+  const bar = make("div", { className: "caption grey", textContent: `□ ${words(2 * half, 3)}, Airy ○ ${words(2 * spots.airy, 3)} µm` });
+  if (spots.half > 0) target.append(bar);
 }
+
+const LEFT = 40; // of the numbers of an axis
 
 function drawFans(target, now, stored) {
   const fans = now.fans;
   if (!fans) return empty(target, "fans", "no ray fans");
   const width = target.clientWidth || 300, rows = now.fields.length;
   const height = Math.max(54, Math.floor((target.clientHeight || 420) / rows) - 1);
-  const all = [fans.tangential, fans.sagittal].flat(3).filter((one) => one !== null).map(Math.abs);
+  const all = [fans, stored && stored.fans].filter(Boolean).map((one) => [one.tangential, one.sagittal]).flat(4).filter((one) => one !== null).map(Math.abs);
   const top = 1.05 * (Math.max(0, ...all) || 1);
   target.replaceChildren();
   now.fields.forEach((field, f) => {
     const picture = figure(`fan-${f}`, "", width, height, `Ray fans of field ${field}, within ±${words(top, 3)} µm`);
     ["tangential", "sagittal"].forEach((section, s) => {
-      const part = svg("g", { transform: `translate(${s ? 34 + (width - 34) / 2 : 0} 0)` });
+      const part = svg("g", { transform: `translate(${s ? LEFT + (width - LEFT) / 2 : 0} 0)` });
       const last = f === rows - 1;
-      const { at, up, curves } = axes(part, s ? (width - 34) / 2 : 34 + (width - 34) / 2, height, {
-        x: [-1, 1], y: [-top, top], left: s ? 6 : 34, right: 3, top: 14, bottom: last ? 24 : 6,
+      const { at, up, curves } = axes(part, s ? (width - LEFT) / 2 : LEFT + (width - LEFT) / 2, height, {
+        x: [-1, 1], y: [-top, top], left: s ? 6 : LEFT, right: 3, top: 14, bottom: last ? 24 : 6,
         ticksX: 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
       });
       part.append(svg("line", { x1: at(0), x2: at(0), y1: 14, y2: height - (last ? 24 : 6), class: "zero" }), svg("line", { x1: at(-1), x2: at(1), y1: up(0), y2: up(0), class: "zero" }));
       if (stored && stored.fans && stored.fans[section][f]) stored.fans[section][f].forEach((values) => curves.append(line(curve(stored.fans.pupil, values, at, up), "var(--grey)", { "stroke-dasharray": "2 2" })));
       fans[section][f].forEach((values, w) => curves.append(line(curve(fans.pupil, values, at, up), now.wavelength_colours[w], { "stroke-width": 1.3, "data-curve": `${section}-${f}-${w}` })));
-      const title = svg("text", { x: s ? 8 : 36, y: 10, class: "label" });
+      const title = svg("text", { x: s ? 8 : LEFT + 2, y: 10, class: "label" });
       title.textContent = s ? "sagittal" : `${field} tangential`;
       part.append(title);
       picture.append(part);
@@ -381,7 +384,7 @@ class Viewer {
       }
     }
     if (reply.remarks) {
-      this.listProblems(reply.remarks);
+      this.listProblems([...this.last.problems, ...reply.remarks]);
       this.root.dataset.settled = this.root.dataset.count;
       return;
     }
@@ -575,7 +578,7 @@ class Viewer {
       primary.replaceChildren(...now.wavelengths.map((one, k) => make("option", { value: k + 1, textContent: words(one, 5), selected: k + 1 === now.primary })));
     });
     const parts = [
-      field(`fields, ${lens.fields.unit}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
+      field(`fields, ${lens.fields.unit.replace("degrees", "°")}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
       field("wavelengths, µm", "wavelengths", { type: "wavelengths" }, (now) => now.wavelengths.map(typed).join(", ")),
       make("div", { className: "pair" }, kind, field("aperture", "aperture", { type: "aperture" }, (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)),
     ];
