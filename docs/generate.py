@@ -123,8 +123,8 @@ def zemax() -> list[str]:
             "Merit function and tolerances",
             row_of(
                 "read and written",
-                ["OPERAND"],
-                "operands: see [Operands](operands.md); unknown ones are kept and reported",
+                ["EFFL", "TRAC", "…"],
+                "[Operands](operands.md); unknown ones are kept and reported",
             ),
             row_of("kept and written", ["TOL", "TCMM"], "tolerances; not evaluated"),
         ),

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,53 @@ def test_names_and_commands_of_a_page_exist(page):
     for line in commands(page):
         words = shlex.split(line, comments=True)
         assert build_parser().parse_args(words[1:]).command == words[1], line
+
+
+def failing(folder: Path) -> dict:
+    """Calls that raise, or warn, each by the name of its class."""
+    text = (DOCS.parent / "lenses" / "cooke_triplet.zmx").read_text("utf-8")
+    (folder / "grid.zmx").write_text(text.replace("TYPE STANDARD", "TYPE GRID_SAG", 1), "utf-8")
+    lens, triplet = rt.read_lens("double_gauss"), rt.read_lens("cooke_triplet")
+    row = {"radius": 50, "thickness": 5}
+    return {
+        "LensFileError": lambda: rt.read_lens("lens.xyz"),
+        "UnsupportedSurface": lambda: rt.read_lens("grid.zmx"),
+        "UnknownGlass": lambda: rt.lens([row | {"glass": "N-BK77"}, row], stop=1, f_number=5),
+        "BadPrescription": lambda: rt.lens([row | {"glas": "N-BK7"}, row], stop=1, f_number=5),
+        "BadMerit": lambda: rt.search(triplet),
+        "NoProblem": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0),
+        "OutOfReach": lambda: rt.wavefront(triplet, fields=[80]),
+        "NoFocus": lambda: rt.focus(triplet, fields=[80]),
+        "NothingToShow": lambda: rt.distortion(triplet, fields=[0]),
+        "LostRays": lambda: rt.spot(lens, fields=[80]),
+        "UnfilledStop": lambda: rt.spot(lens),
+    }
+
+
+def test_page_of_errors_shows_the_messages(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (DOCS / "reference" / "errors.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `rt\.(\w+)` \| (.*?) \|", page, re.M))
+    for name, call in failing(tmp_path).items():
+        kind, words = getattr(rt, name), rows[name].removesuffix("…")
+        with warnings.catch_warnings(record=True) as issued:
+            warnings.simplefilter("always")
+            if issubclass(kind, Warning):
+                call()
+                messages = [str(warning.message) for warning in issued if warning.category is kind]
+            else:
+                with pytest.raises(kind) as raised:
+                    call()
+                messages = [str(raised.value)]
+        assert any(message.startswith(words) for message in messages), (name, messages)
+
+
+def test_page_of_errors_lists_every_public_class():
+    page = (DOCS / "reference" / "errors.md").read_text("utf-8")
+    public = [getattr(rt, name) for name in rt.PUBLIC]
+    for kind in public:
+        if isinstance(kind, type) and issubclass(kind, Exception):
+            assert f"| `rt.{kind.__name__}` |" in page
 
 
 @pytest.mark.slow
