@@ -35,7 +35,7 @@ FROZEN = [
 ]
 
 
-def test_frozen_pages_name_their_commit():
+def test_frozen_sections_name_their_commit():
     assert len(FROZEN) > 10
     for page, line in FROZEN:
         assert re.match(r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", line), page

@@ -93,12 +93,24 @@ def test_plain_numbers_are_as_good_as_tensors():
         "wavelengths": number([0.5, 0.6]),
         "grid": grid(0.01, 7),
     }
-    one, other = (psf(double_gauss(), Gaussian(order=3), **o) for o in ({**numbers, "pixel": 0.01}, tensors))
+    one, other = (
+        psf(double_gauss(), Gaussian(order=3), center="axis", **o) for o in ({**numbers, "pixel": 0.01}, tensors)
+    )
     torch.testing.assert_close(one.kernel, other.kernel, rtol=0, atol=0)
     with pytest.raises(ValueError, match="a grid has a pixel and a size"):
         psf(double_gauss(), "gaussian", grid=grid(0.01, 7), size=7)
     with pytest.raises(ValueError, match="below 90 degrees"):
         psf(double_gauss(), "gaussian", fields=[90])
+
+
+def test_a_window_follows_the_chief_ray_unless_the_grid_is_given():
+    """An off-axis kernel has its light; a grid with fields is the pixels of the sensor, about the axis."""
+    lens, order = double_gauss(), Gaussian(order=3)
+    chosen = psf(lens, order, fields=[0, 10])
+    torch.testing.assert_close(chosen.kernel, psf(lens, order, fields=[0, 10], center="chief").kernel, rtol=0, atol=0)
+    assert bool((chosen.energy > 0.05).all())
+    fixed = psf(lens, order, fields=[10], grid=grid(0.005, 21))
+    torch.testing.assert_close(fixed.grid.centre, number([0.0, 0.0]))
 
 
 @pytest.mark.parametrize("per_wavelength", [False, True])

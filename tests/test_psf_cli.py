@@ -190,7 +190,7 @@ def test_wavelengths_are_summed_or_keep_an_axis(tmp_path, capsys):
 
 
 def test_kernels_that_miss_the_light_are_reported(capsys):
-    assert main(["psf", LENS, "--model", "gaussian", "--field", "14"]) == 0
+    assert main(["psf", LENS, "--model", "gaussian", "--field", "14", "--center", "axis"]) == 0
     assert "--center chief" in capsys.readouterr().out
-    assert main(["psf", LENS, "--model", "gaussian", "--field", "14", "--center", "chief"]) == 0
+    assert main(["psf", LENS, "--model", "gaussian", "--field", "14"]) == 0
     assert "--center chief" not in capsys.readouterr().out

@@ -29,7 +29,7 @@ def taken(name: str, words: str) -> argparse.Namespace:
 
 def head(page) -> tuple[str, argparse.Namespace]:
     """The command on top of a page, and its arguments."""
-    line = page.read_text().split("\n\n")[1].strip()
+    line = next(part.strip() for part in page.read_text().split("\n\n") if part.startswith("    python "))
     _, name, words = line.split(" ", 2)
     return line, taken(name.removeprefix("docs/experiments/").removesuffix(".py"), words.removesuffix(" --docs docs"))
 
@@ -79,7 +79,7 @@ def test_the_page_over_noise_names_its_files(tmp_path, monkeypatch):
     names = " ".join(f"docs/wave/elements/{name}" for name in kept)
     assert f"python docs/experiments/wave_noise.py --rows fresnel --elements {names} --noises 0.02\n" in text
     noise._publish(over_noise("fresnel", "own-0.02"), {}, settings, own)
-    assert "to be judged again" not in (tmp_path / "wave_noise.md").read_text()
+    assert "The kept elements" not in (tmp_path / "wave_noise.md").read_text()
     assert line in (tmp_path / "wave_noise.md").read_text()
 
 
@@ -96,7 +96,5 @@ def test_the_table_is_repeated_and_counts_its_pictures():
     text = "\n".join(
         edof._parts(edof.Table({}), given, WaveCameraConfig(), line, [], {"lens": baseline("singlet", aim())[0]})
     )
-    assert (
-        "Judged on 1 pictures of leaves, 3 pictures, expected over noise, none drawn; filters are made for 4, 4" in text
-    )
+    assert "Tested on 1 pictures of leaves, 3 pictures, in closed form over noise; filters are made for 4, 4" in text
     assert "Heights, largest less smallest inside the aperture: lens " in text

@@ -13,6 +13,7 @@ import dataclasses
 import math
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -27,9 +28,10 @@ from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import add_options, defaults_of, documents, picture_options, picture_words, words
+from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
-from raytrace.experiments import publish
+from raytrace.experiments import publish, published
 from raytrace.files import table as csv
 from raytrace.imaging.image import blur_layers, depth_masks
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
@@ -51,10 +53,11 @@ from raytrace.imaging.wave_camera import (
 )
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, picture
-from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, show_image, styled
+from raytrace.plotting.style import FIELD_COLOURS, new_figure, save, show_image, styled
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import Aim, aim, baseline
 from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.element_files import read_element
 from raytrace.wave_optics.fabrication import height_range
 from raytrace.words import did_you_mean
 
@@ -63,13 +66,11 @@ _LEARNED = ("learned", "learned-16", "learned-smooth")
 
 #: Figures of the page, by file name: what each shows.
 CAPTIONS = {
-    "gain.png": "Gains over the Fresnel lens, by content and filter, beside those that Sitzmann et al. published.",
-    "depth.png": "PSNR over depth behind the best linear filter that does not know the depth.",
-    "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (depth-invariant "
-    "filter).",
-    "deep.png": "A scene from 0.5 m (below) to infinity (above) in nine layers, near leaves hiding far ones.",
-    "learned.png": "The learned element: rings of fused silica, its PSFs over depth and colour, its PSNR.",
-    "learned-smooth.png": "The learned smooth element of PMMA.",
+    "depth.png": "PSNR over depth behind the depth-invariant filter.",
+    "scene.png": "Dead leaves at three depths, restored by the depth-invariant filter.",
+    "deep.png": "A scene from 0.5 m (bottom) to infinity (top) in nine layers; near leaves occlude far ones.",
+    "learned.png": "Learned rings of fused silica: height, texture, PSNR on sharp leaves, PSFs.",
+    "learned-smooth.png": "Learned smooth element of PMMA.",
 }
 _SHOWN = ("fresnel", "singlet", "ideal", "cubic-refractive", "learned")  # in the scenes
 
@@ -295,49 +296,22 @@ def depth_figure(found: Mapping[str, Mapping[str, Quality]], config: WaveCameraC
 
 
 @styled
-def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
-    """Gains over the Fresnel lens: of every content and both filters, and those that Sitzmann et al. published."""
-    rows = [name for name in next(iter(found.values())) if name != "fresnel"]
-    figure = new_figure(7.6, 0.42 * len(rows) + 1.1)
-    axes = figure.subplots()
-    place = np.arange(len(rows))[::-1]
-    marks = {"wiener": "o", "blind": "s"}
-    for number, (content, own) in enumerate(found.items()):
-        for filter, mark in marks.items():
-            gain = [own[name].mean[filter] - own["fresnel"].mean[filter] for name in rows]
-            label = f"{content}, {'1 m Wiener' if filter == 'wiener' else 'depth-invariant'} filter"
-            face = FIELD_COLOURS[number] if filter == "blind" else "white"
-            axes.plot(gain, place, mark, ms=5.5, mfc=face, mec=FIELD_COLOURS[number], label=label)
-    published = [
-        (ROWS[name].published - ROWS["fresnel"].published, y)
-        for name, y in zip(rows, place, strict=True)
-        if ROWS[name].published
-    ]
-    axes.plot(*zip(*published, strict=True), "|", ms=15, mew=2, color=INK, label="Sitzmann 2018")
-    axes.set_yticks(place, [ROWS[name].title for name in rows])
-    axes.set_ylim(-0.6, len(rows) - 0.4)
-    axes.axvline(0, color=GREY, lw=0.8)
-    axes.set(xlabel="mean PSNR over that of the Fresnel lens (dB)")
-    figure.legend(loc="outside upper center", ncols=2, fontsize=7.5)
-    return figure
-
-
-@styled
 def scene_figure(columns: Mapping[str, Mapping[str, tuple[np.ndarray, float]]], picture: np.ndarray) -> Figure:
-    """Restored scenes: a column for each row of the table, a line for each depth; the picture itself in front.
+    """Restored scenes: a column for each row of the table, a line for each depth; the picture itself once, in front.
 
     columns: name -> what it shows -> (picture (h, w, 3), its PSNR).
     """
-    shown = list(next(iter(columns.values())))
-    figure = new_figure(1.55 * (len(columns) + 1), 1.62 * len(shown) + 0.3)
-    axes = figure.subplots(len(shown), len(columns) + 1, squeeze=False)
-    for line, name in enumerate(shown):
-        _show(axes[line, 0], picture, "scene" if line == 0 else "")
-        axes[line, 0].set_ylabel(name, fontsize=8)
+    depths = list(next(iter(columns.values())))
+    figure = new_figure(1.55 * (len(columns) + 1), 1.62 * len(depths) + 0.3)
+    axes = figure.subplots(len(depths), len(columns) + 1, squeeze=False)
+    _show(axes[0, 0], picture, "scene")
+    for line, depth in enumerate(depths):
+        axes[line, 0].axis("on" if line == 0 else "off")
         for column, (row, cells) in enumerate(columns.items(), 1):
-            image, ratio = cells[name]
+            image, ratio = cells[depth]
             _show(axes[line, column], image, _title(row) if line == 0 else "")
             axes[line, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
+        axes[line, 1].set_ylabel(f"object at {depth}", fontsize=8)
     return figure
 
 
@@ -368,7 +342,7 @@ def _show(axes: Axes, picture: np.ndarray, title: str) -> None:
 
 
 def _title(name: str) -> str:
-    return ROWS[name].title.replace(", ", ",\n")
+    return textwrap.fill(ROWS[name].title, 18)
 
 
 def look(name: str, rows: Sequence[str]) -> dict:
@@ -420,23 +394,22 @@ class Table(Result):
             text.append(
                 f"{'':>32}" + 2 * f" {'Wiener':>14} {'invariant':>14}" + f" {'spread':>7} {'Sitzmann 2018':>14}"
             )
-            for record, _, *cells, published in self.rows(content):
+            for record, _, *cells, printed in self.rows(content):
                 title, spread = ROWS[record["row"]].title, record["spread_blind"]
                 shown = "".join(f" {cell:>14}" for cell in cells)
-                text.append(f"{title:>32}{shown} {spread:>7.2f} {published:>14}")
+                text.append(f"{title:>32}{shown} {spread:>7.2f} {printed:>14}")
             text.append("")
         return "\n".join(text)
 
     def markdown(self, content: str) -> str:
-        means = ("Wiener, 1 m", "depth-invariant", "Wiener, mean of PSNRs", "depth-invariant, mean of PSNRs")
-        header = ("element", *means, "worst", "spread", "light in window", "Sitzmann 2018")
+        header = ("element", "Wiener, 1 m", "depth-invariant", "Wiener, mean of PSNRs")
+        header += ("worst depth", "spread", "light in window", "Sitzmann 2018")
         lines = []
-        for record, own, *psnrs, published in self.rows(content):
-            base = record["row"] == "fresnel"
-            cells = [cell.partition(" ")[0] if base else cell for cell in psnrs]
+        for record, own, wiener, invariant, mean, _, printed in self.rows(content):
             numbers = (record["worst_blind"], record["spread_blind"], min(min(row) for row in own.energy))
-            cells += [*(f"{number:.2f}" for number in numbers), published or "–"]
-            lines.append([ROWS[record["row"]].title, *cells])
+            cells = (cell.removesuffix(" (+0.00)") for cell in (wiener, invariant, mean))
+            last = (f"{number:.2f}" for number in numbers)
+            lines.append([ROWS[record["row"]].title, *cells, *last, printed or "–"])
         return grid(header, lines)
 
 
@@ -453,8 +426,12 @@ def edof(arguments: argparse.Namespace) -> Table:
     learned = _learned(arguments, rows, config, train)
     elements = elements_of(rows, config, spectrum(contents[0].train), learned=learned)
     found = table_of(contents, elements, config, progress=lambda given: progress(given, "row"))
+    if arguments.figures:
+        Path(arguments.figures).mkdir(parents=True, exist_ok=True)
+        for name, figure in figures(found, elements, config, arguments.seed or 0).items():
+            save(figure, Path(arguments.figures) / name)
     if arguments.docs:
-        drawn = _figures(found, elements, config, arguments.seed or 0)
+        drawn = figures(found, elements, config, arguments.seed or 0)
         named = [name for name in CAPTIONS if name in drawn]
         single = {title_of(name): own[0] for name, own in elements.items() if name in learned and len(own) == 1}
         parts = _parts(Table(found), contents, config, _command(arguments), named, single)
@@ -480,12 +457,16 @@ def _learned(
 ) -> dict[str, tuple[Element, ...]]:
     """The learned ones of the rows."""
     common = {name: getattr(arguments, name) for name in ("steps", "starts", "seed")}
+    stored = {Path(file).stem.rpartition("-")[0]: file for file in arguments.elements}
     asked = {name: row.learning for name, row in ROWS.items() if row.learning and name in rows}
-    if asked and not arguments.folder:
+    if set(asked) - set(stored) and not arguments.folder:
         say("learned elements are not kept: -o FOLDER keeps them")
     found = {}
     with tempfile.TemporaryDirectory() as unkept, torch.no_grad():
         for name, learning in asked.items():
+            if name in stored:
+                found[name] = (read_element(stored[name], aperture=2 * config.radius),)
+                continue
             folder = Path(arguments.folder or unkept) / name
             with torch.enable_grad():
                 camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
@@ -496,25 +477,22 @@ def _learned(
 def _command(arguments: argparse.Namespace) -> str:
     options = [f"--{name} {' '.join(given)}" for name in ("rows", "also") if (given := getattr(arguments, name))]
     own = DesignSettings.of({name: getattr(arguments, name) for name in ("steps", "starts", "seed")})
+    if arguments.elements:
+        options.append("--elements " + " ".join(published(file, arguments.docs) for file in arguments.elements))
     options += [*picture_words(arguments, LIMIT), *words(own, wave_design.ROWS)]
     return " ".join(["python docs/experiments/wave_edof.py", *options, "-o FOLDER --docs docs"])
 
 
-def _figures(found, elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, seed: int) -> dict:
+def figures(found, elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, seed: int) -> dict:
     """Figures of the page, by file name. Only dead leaves are shown."""
-
     first = next(iter(found.values()))
     made = {"depth.png": depth_figure(found, config)}
-    if "fresnel" in first:
-        made["gain.png"] = gain_figure(found)
-    for name in ("learned", "learned-smooth"):
-        if name in elements:
-            made[f"{name}.png"] = ElementReport(
-                elements[name], config, kernels(elements[name], config), first[name]
-            ).plot()
-    shown = {name: elements[name] for name in _SHOWN if name in elements}
-    made["scene.png"] = scene_figure(*flat(shown, config, seed=seed))
-    made["deep.png"] = deep_figure(deep(shown, config, seed=seed))
+    for name in {"learned", "learned-smooth"} & set(elements):
+        report = ElementReport(elements[name], config, kernels(elements[name], config), first[name])
+        made[f"{name}.png"] = report.plot()
+    scene = {name: elements[name] for name in _SHOWN if name in elements}
+    made["scene.png"] = scene_figure(*flat(scene, config, seed=seed))
+    made["deep.png"] = deep_figure(deep(scene, config, seed=seed))
     return made
 
 
@@ -535,26 +513,40 @@ def _parts(
 ) -> list[str]:
     depths = ", ".join(map(depth_text, config.depths))
     colours = ", ".join(f"{1e3 * w:.0f}" for w in config.wavelengths)
-    judged = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
+    tested = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
     others = ", ".join(str(len(one.train)) for one in given)
-    contents = [(f"## {name[0].upper()}{name[1:]}", table.markdown(name)) for name in table.found]
+    shown = [name for name in ("pictures", *table.found) if name in table.found][:1]
     return [
         "# Extended depth of field with one phase element",
+        *_answer(table, shown),
         f"    {command}",
         f"Aperture {2 * config.radius:g} mm, sensor at {config.sensor_distance:g} mm, {colours} nm, objects at "
-        f"{depths}; pixels of {1e3 * config.pixel:g} µm, kernels of {config.size} × {config.size} pixels, light beyond "
-        f"them spread evenly as haze; noise of standard deviation {config.noise:g}. All lenses are made for "
-        f"{config.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
+        f"{depths}. Pixels of {1e3 * config.pixel:g} µm, kernels of {config.size} × {config.size} pixels; light "
+        f"outside them is spread evenly. Noise: standard deviation {config.noise:g}. All baselines are designed for "
+        f"{config.design / 1e3:g} m at 550 nm. Tested on {tested}, in closed form over noise; filters are "
         f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
-        *(part for parts in contents for part in parts),
-        "PSNR in dB, mean over depths, of errors pooled over pictures and as the mean of the PSNRs of single pictures; "
-        "in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the best less the worst, both "
-        "behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et al., SIGGRAPH 2018, of other "
-        "pictures. "
-        "All figures: [table.csv](wave/table.csv).",
+        *(part for name in shown for part in (f"## {name[0].upper()}{name[1:]}", table.markdown(name))),
+        "PSNR in dB, mean over depths, of errors pooled over pictures; *mean of PSNRs*: of single "
+        "pictures. In brackets: gain over the Fresnel lens. Worst depth, and spread (best less worst depth): behind "
+        "the depth-invariant filter. Sitzmann 2018: published figures, other pictures. All contents: "
+        "[table.csv](wave/table.csv).",
         *([heights_of(learned)] if learned else []),
         *(picture(f"wave/{name}", CAPTIONS[name]) for name in figures),
     ]
+
+
+def _answer(table: Table, shown: Sequence[str]) -> Iterator[str]:
+    """Gains of the learned rings and of the best baseline behind the Wiener filter."""
+    for name in shown:
+        gains = {row["row"]: row["gain_wiener"] for row in records({name: table.found[name]})}
+        fixed = {row: gain for row, gain in gains.items() if row not in _LEARNED and gain is not None}
+        if fixed and gains.get("learned") is not None:
+            best = max(fixed, key=fixed.get)
+            yield (
+                f"On {name}, behind the Wiener filter of the PSF at 1 m, the learned rings gain "
+                f"{gains['learned']:+.2f} dB over the Fresnel lens; Sitzmann et al. (SIGGRAPH 2018) report +6.35 dB. "
+                f"The best baseline, {ROWS[best].title}, gains {fixed[best]:+.2f} dB."
+            )
 
 
 def pictures_of(kind: str) -> str:
@@ -571,6 +563,15 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="further rows: learned-images (--loss images --filter towards), learned-adadelta (the same by Adadelta), "
         "learned-zernike (22 polynomials, no symmetry, by Adadelta)",
     )
+    parser.add_argument(
+        "--elements",
+        metavar="FILE",
+        nargs="+",
+        type=file_name,
+        default=(),
+        help="stored elements ROW-NOISE.npy or .json for learned rows, which are not learned again",
+    )
+    parser.add_argument("--figures", metavar="FOLDER", help="write only the figures of the page, into this folder")
     defaults = defaults_of(DesignSettings)
     add_options(parser, defaults, wave_design.ROWS, "steps", "starts")
     add_options(picture_options(parser, PICTURES, limit=LIMIT), defaults, wave_design.ROWS, "seed")

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from wave_edof import ROWS, STRENGTHS, contents_of, heights_of, look, title_of
+from wave_edof import ROWS, STRENGTHS, contents_of, look, title_of
 
 from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
@@ -63,7 +63,7 @@ from raytrace.imaging.wave_design import WaveCamera
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
-from raytrace.plotting.style import INK, new_figure, styled
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings
 from raytrace.wave_optics.designs import aim, baseline
@@ -579,34 +579,34 @@ def _publish(
     given += element_words(arguments)
     given += [*picture_words(arguments, LIMIT), *words(settings, ROWS_OF_SETTINGS)]
     command = " ".join(["python docs/experiments/wave_noise.py", *given, "-o FOLDER --docs docs"])
+    figures = {"noise.png": noise_figure(found), "gain.png": gain_figure(found, _noise_of(found))}
     parts = _parts(found, elements, command)
-    publish(
-        Path(arguments.docs) / "wave_noise.md", "wave", parts, tables=tables, figures={"noise.png": noise_figure(found)}
-    )
+    publish(Path(arguments.docs) / "wave_noise.md", "wave", parts, tables=tables, figures=figures)
+
+
+def _noise_of(found: OverNoise) -> float:
+    """The noise that is shown alone: that of the table of wave_edof.py if it is there."""
+    noises = {one.noise for one in found.scores}
+    return WaveCameraConfig.noise if WaveCameraConfig.noise in noises else min(noises)
 
 
 def _parts(found: OverNoise, elements: Mapping[str, Element], command: str) -> list[str]:
     """elements: those that were kept, by the name of their file."""
-    shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
-    others = [name for name in found.pictures if name != shown]
+    shown = _first(found)
     return [
         "# Extended depth of field over noise",
-        f"    {command}",
-        "Camera, depths and colours of [wave_edof.md](wave_edof.md). For every noise elements are learned, filters "
-        "made and the strength of cubic plates chosen anew; learned elements know only the spectrum of sharp dead "
-        "leaves. Of several random starts that of least expected error is kept. PSNR in dB, mean over depths, of "
-        "errors pooled over pictures and, the usual one, as the mean of the PSNRs of single pictures; gains are over "
-        f"the Fresnel lens on the same pictures, with the {OF_INTERVALS}. Restored: "
-        f"{counted(found.pictures, found.classes)}; filters are made for others.",
         *headline(found, shown),
-        picture(
-            "wave/noise.png",
-            f"Gain over the Fresnel lens on {shown}, errors pooled over pictures; bands: 95 % intervals over classes.",
-        ),
-        *(part for filter in FILTERS for part in _tables(found, shown, filter)),
-        *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
-        "All figures: [noise.csv](wave/noise.csv).",
-        *([heights_of({Path(name).stem: one for name, one in elements.items()})] if elements else []),
+        f"    {command}",
+        "Camera, depths and wavelengths of [wave_edof.md](wave_edof.md). For every noise the elements are learned, the "
+        "filters made and the strength of the cubic plates chosen again; learned elements know only the spectrum of "
+        "sharp dead leaves. Of several random starts the one with the least expected error is kept. PSNR in dB, mean "
+        "over depths. Gains are over the Fresnel lens on the same pictures, of errors pooled over pictures or as mean "
+        f"of the PSNRs of single pictures, with the {OF_INTERVALS}. Restored: "
+        f"{counted(found.pictures, found.classes)}; filters are made for others.",
+        picture("wave/noise.png", f"Gain on {shown}, errors pooled over pictures; bands: 95 % intervals over classes."),
+        picture("wave/gain.png", f"Gain at noise {_noise_of(found):g}; bars: 95 % intervals over classes."),
+        *(part for filter in FILTERS for part in _table(found, shown, filter)),
+        "All contents, both means, PSNR and the range of the random starts: [noise.csv](wave/noise.csv).",
         *_again(found, list(elements)),
     ]
 
@@ -625,90 +625,113 @@ def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
     """The command that judges what was kept at one noise, that of the table if it was asked for."""
     if not files:
         return
-    noises = {one.noise for one in found.scores}
-    noise = WaveCameraConfig.noise if WaveCameraConfig.noise in noises else min(noises)
+    noise = _noise_of(found)
     own = [f"docs/wave/elements/{name}" for name in files if Path(name).stem.endswith(f"-{noise:g}")]
-    yield (
-        "Elements that were kept stand in [wave/elements](wave/elements), to be judged again, on dead leaves or on "
-        "pictures of one's own:"
-    )
+    yield "The kept elements are in `docs/wave/elements`; to evaluate them on dead leaves or on your own pictures:"
     yield f"    python docs/experiments/wave_noise.py --rows fresnel --elements {' '.join(own)} --noises {noise:g}"
 
 
-def _tables(found: OverNoise, content: str, filter: str, *, only_gain: bool = False) -> Iterable[str]:
+def _table(found: OverNoise, content: str, filter: str) -> Iterable[str]:
     yield f"## {content[0].upper()}{content[1:]}, {TITLES[filter]}"
-    for mean, shown in MEANS.items():
-        yield f"Gain over the Fresnel lens, dB, {mean}:"
-        yield grid(*found.lines(content, filter, lambda one, shown=shown: shown(one.gains)[1]))
-    if only_gain:
-        return
-    for mean, shown in MEANS.items():
-        yield f"PSNR, dB, {mean}:"
-        yield grid(*found.lines(content, filter, lambda one, shown=shown: shown(one.gains)[0]))
-    started = {row: own for row, own in found.of(content, filter).items() if any(one.starts for one in own.values())}
-    if started:
-        yield "Gain of every random start, errors pooled over pictures, from the least to the greatest:"
-        header, _ = found.lines(content, filter, str)
-        yield grid(
-            header,
-            (
-                [title_of(row), *(f"{min(one.starts):+.2f} … {max(one.starts):+.2f}" for one in own.values())]
-                for row, own in started.items()
-            ),
-        )
+    yield "Gain over the Fresnel lens, dB, errors pooled over pictures:"
+    header, lines = found.lines(content, filter, lambda one: str(one.gains.pooled))
+    yield grid(header, [line for line in lines if line[0] != ROWS["fresnel"].title])
 
 
 def headline(found: OverNoise, content: str) -> Iterable[str]:
-    """The learned rings in the terms of Sitzmann et al., noise by noise, beside what they report."""
+    """Gain of the learned rings, noise by noise, compared with the gain that Sitzmann et al. report."""
     own = found.of(content, "wiener").get("learned", {})
     if not own:
         return
     yield (
-        f"## Learned rings on {content} behind the Wiener filter, the terms of Sitzmann et al. (2018): "
-        f"they report {_PUBLISHED:+.2f} dB"
+        f"Learned rings on {content} behind the Wiener filter of the PSF at 1 m, compared with the "
+        f"{_PUBLISHED:+.2f} dB that Sitzmann et al. (2018) report:"
     )
     verdicts = [
         [f"{noise:g}", *(cell for gain in (one.gains.pooled, one.gains.mean) for cell in (str(gain), _verdict(gain)))]
         for noise, one in sorted(own.items())
     ]
-    compared = f"compared with {_PUBLISHED:+.2f} dB"
+    compared = f"than {_PUBLISHED:+.2f} dB"
     yield grid(("noise", "gain, dB, pooled", compared, "gain, dB, mean of PSNRs", compared), verdicts)
 
 
 def _verdict(gain: Interval) -> str:
-    return "more" if gain.low > _PUBLISHED else "less" if gain.high < _PUBLISHED else "within the interval"
+    return "more" if gain.low > _PUBLISHED else "less" if gain.high < _PUBLISHED else "equal within the interval"
 
 
 #: Panels of the figure over noise, by filter.
 NOISE_TITLES = {"wiener": "Wiener filter, 1 m", "blind": "depth-invariant filter"}
 
 
+_LABELLED = ("hybrid", "ideal", "cubic-refractive", "learned-smooth", "learned", "learned-16")
+
+
 @styled
 def noise_figure(found) -> Figure:
-    """Gain over the Fresnel lens over noise, a panel for each filter, intervals as bands; found: an `OverNoise`."""
-    content = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
+    """Gain over the Fresnel lens over noise, a panel for each filter, intervals as bands; found: an `OverNoise`.
+
+    Baselines outside `_LABELLED` are thin grey lines; the published gain is drawn for the filter it refers to.
+    """
+    content = _first(found)
     figure = new_figure(9.2, 3.9)
     axes = figure.subplots(1, len(NOISE_TITLES), sharey=True)
     for panel, (filter, title) in zip(axes, NOISE_TITLES.items(), strict=True):
         rows = {row: own for row, own in found.of(content, filter).items() if row != "fresnel"}
+        others = [row for row in rows if row in ROWS and row not in _LABELLED]
+        labelled = [row for row in rows if row not in others]
         for row, own in rows.items():
             noises = sorted(own)
             gains = [own[noise].gains.pooled for noise in noises]
-            style = look(row, list(rows))
+            if row in others:
+                label = "other baselines" if row == others[0] else None
+                panel.plot(noises, [one.value for one in gains], color=GREY, lw=0.7, alpha=0.6, label=label)
+                continue
+            style = look(row, labelled)
             panel.plot(noises, [one.value for one in gains], label=title_of(row), **style)
             low, high = ([getattr(one, end) for one in gains] for end in ("low", "high"))
             panel.fill_between(noises, low, high, color=style["color"], alpha=0.13, lw=0)
-        published = ROWS["learned"].published - ROWS["fresnel"].published
-        panel.axhline(published, color=INK, lw=0.8, ls=(0, (1, 2)))
-        panel.annotate("Sitzmann 2018", (1, published), (-2, 2), xycoords=("axes fraction", "data"),
-                       textcoords="offset points", ha="right", fontsize=7)  # fmt: skip
+        if filter == "wiener":
+            panel.axhline(_PUBLISHED, color=INK, lw=0.8, ls=(0, (1, 2)))
+            panel.annotate("Sitzmann 2018", (1, _PUBLISHED), (-2, 2), xycoords=("axes fraction", "data"),
+                           textcoords="offset points", ha="right", fontsize=7)  # fmt: skip
         panel.set(xscale="log", xlabel="noise, standard deviation", title=f"{content}, {title}")
         panel.set_xticks(noises, [f"{noise:g}" for noise in noises])
         panel.minorticks_off()
-    axes[0].set_ylabel("PSNR over that of the Fresnel lens (dB)")
+    axes[0].set_ylabel("gain over the Fresnel lens (dB)")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
     return figure
+
+
+@styled
+def gain_figure(found, noise: float) -> Figure:
+    """Gains over the Fresnel lens at one noise with intervals, a panel for each content; found: an `OverNoise`."""
+    rows = [row for row in found.of(_first(found), "wiener") if row != "fresnel"]
+    place = np.arange(len(rows))[::-1]
+    figure = new_figure(9.2, 0.36 * len(rows) + 1.1)
+    axes = figure.subplots(1, len(found.pictures), sharey=True, squeeze=False)[0]
+    for panel, content in zip(axes, sorted(found.pictures, key=lambda name: name != _first(found)), strict=True):
+        for filter, shift, colour in (("wiener", 0.17, FIELD_COLOURS[0]), ("blind", -0.17, FIELD_COLOURS[2])):
+            gains = [found.of(content, filter)[row][noise].gains.pooled for row in rows]
+            ends = [[one.value - one.low for one in gains], [one.high - one.value for one in gains]]
+            panel.errorbar([one.value for one in gains], place + shift, xerr=ends, fmt="os"[filter == "blind"],
+                           ms=4, color=colour, elinewidth=1.2, label=NOISE_TITLES[filter])  # fmt: skip
+        if content == _first(found):
+            marks = [(ROWS[row].published - ROWS["fresnel"].published, y + 0.17)
+                     for row, y in zip(rows, place, strict=True) if row in ROWS and ROWS[row].published]  # fmt: skip
+            if marks:
+                panel.plot(*zip(*marks, strict=True), "|", ms=9, mew=2, color=INK, label="Sitzmann 2018 (Wiener)")
+        panel.axvline(0, color=GREY, lw=0.8)
+        panel.set(title=content, xlabel="gain (dB)", ylim=(-0.6, len(rows) - 0.4))
+        panel.grid(True, axis="x", lw=0.4)
+    axes[0].set_yticks(place, [title_of(row) for row in rows])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7.5)
+    return figure
+
+
+def _first(found) -> str:
+    """The content that page and figures show: pictures, if there are any."""
+    return "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -526,8 +526,7 @@ COMMANDS = (
         plot("the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"), log,
         pixel="pixel pitch (default 0.005)",
         size="pixels across the window of the PSF (default 21)",
-        center="centre of the window: the optical axis (default with --field), the chief ray (default of the lens's "
-        "fields) or the centroid of the rays",
+        center="centre of the window: the chief ray (default), the optical axis or the centroid of the rays",
         per_wavelength="a kernel for each wavelength instead of their weighted sum",
     ),
     _command(

@@ -33,6 +33,7 @@ from raytrace.wave_optics.scene import WaveScene, is_round
 FILTERS = ("wiener", "blind")  # of restoration
 WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
 _BLACK = 1e-5  # of the brightest pixel of a row of kernels
+_TALL = 10.0  # µm of height, many waves, beyond which the texture is drawn as a difference
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,17 +275,24 @@ class ElementReport(Result):
 
     @styled
     def draw(self):
-        """Height over the radius, PSNR over depth, kernels over depth and wavelength."""
+        """Height over the radius, and its difference from a fitted paraboloid where it is many waves high; PSNR over
+        depth, kernels over depth and wavelength."""
         figure = new_figure(9.2, 7.0)
         top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
-        profile, psnrs = top.subplots(1, 2)
         radius = self.elements[0].radius
         r = torch.linspace(0, float(radius) * (1 - 1e-9), 4000, dtype=radius.dtype)
-        for number, element in enumerate(self.elements):
-            h = height(element, r, torch.zeros_like(r)).detach()
-            colour, label = FIELD_COLOURS[number % 3], element.glass.name
-            profile.plot(array(r), 1e3 * array(h - h.min()), lw=0.9, color=colour, label=label)
+        heights = [1e3 * array(height(element, r, torch.zeros_like(r)).detach()) for element in self.elements]
+        tall = [h for h in heights if np.ptp(h) > _TALL]
+        profile, *texture, psnrs = top.subplots(1, 3 if tall else 2)
+        r = array(r)
+        for number, (element, h) in enumerate(zip(self.elements, heights, strict=True)):
+            look = {"lw": 0.9, "color": FIELD_COLOURS[number % 3], "label": element.glass.name}
+            profile.plot(r, h - h.min(), **look)
+            if np.ptp(h) > _TALL:
+                texture[0].plot(r, h - np.polyval(np.polyfit(r * r, h, 1), r * r), **look)
         profile.set(xlabel="radius (mm)", ylabel="height (µm)", title="element")
+        for panel in texture:
+            panel.set(xlabel="radius (mm)", ylabel="height (µm)", title="less the fitted paraboloid")
         profile.legend(fontsize=8)
         dioptres = [1e3 / depth for depth in self.config.depths]
         labels = {"wiener": "Wiener, 1 m kernel", "blind": "best depth-invariant filter"}
@@ -292,7 +300,7 @@ class ElementReport(Result):
             psnrs.plot(dioptres, self.quality.by_depth[filter], mark, ms=4, label=labels[filter], color=colour)
         mark_depths(psnrs, self.config)
         psnrs.set(xlabel="object distance", ylabel="PSNR (dB)")
-        psnrs.legend(fontsize=8)
+        psnrs.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1), borderaxespad=0)
         _draw_kernels(bottom, self.kernels)
         return figure
 

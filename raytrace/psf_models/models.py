@@ -233,7 +233,7 @@ def psf(
     pixel, size: pitch in mm, 0.005 by default, and number, one or (rows, columns), 21 by default; grid: instead, pixels
         whose centre is (2,) or (2, D, F).
     center: origin of the grid's centre: "axis", "chief" (the chief ray at the primary wavelength) or "centroid" (of the
-        rays). By default "axis" if fields are specified, "chief" for the lens's fields.
+        rays). By default "chief"; "axis" for a `grid` and fields.
     window: "follows": a window about the chief ray or the centroid moves with it, in the derivatives too, so that a
         shift of the whole image changes no kernel. "fixed": the window has no derivative: the pixels of a sensor that
         does not move. The kernels are the same.
@@ -245,7 +245,7 @@ def psf(
     outside of loops (without an order or a memo), UnfilledStop.
     """
     execution = execution or Execution()
-    center = center or ("chief" if fields is None else "axis")
+    center = center or ("chief" if fields is None or grid is None else "axis")
     name = model if isinstance(model, str) else next(k for k, m in MODELS.items() if isinstance(model, m.parameters))
     for option, (word, words) in {
         "model": (name, ("auto", *MODELS)),
@@ -304,10 +304,12 @@ def psf(
         centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
         batch = scene(lens, fields, distances[chosen], wavelengths, execution.memo)
         origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
-        if center == "centroid" and symmetry(batch) != "round":
+        if center == "axis" or symmetry(batch) == "round":
+            pass
+        elif center == "centroid":
             alone = gaussian.kernels_alone(batch, make_grid(batch.wavelengths.new_tensor(1.0), 1), order=6)
             origin = polychromatic(alone, shares, "").centroid
-        elif center != "axis":
+        else:
             origin = chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
         if origin is not None and window == "fixed":
             origin = origin.detach()

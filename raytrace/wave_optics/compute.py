@@ -199,7 +199,7 @@ COLOURS = (0.46, 0.55, 0.64)
 _DESIGN = 0.55  # µm
 _CHUNK = 1e9  # bytes: beyond, kernels are computed one by one
 _RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
-_PLANES, _RANGE, _ACROSS = 121, (0.8, 1.2), 0.05  # of a caustic: over the sensor distance, and of the aperture
+_PLANES, _RANGE, _ACROSS = 151, (0.75, 1.25), 0.05  # of a caustic: over the sensor distance, and of the aperture
 _COLUMNS = 201
 
 #: Shows the progress of a loop: (its items, their unit) -> the items.
@@ -337,7 +337,7 @@ def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
 @torch.no_grad()
 def caustic(scene: WaveScene, *, progress: Progress = _silent) -> tuple[Tensor, Tensor, float]:
     """The caustic of a scene: light per mm² (D, W, Z, 201), 1 = all through the aperture, on y = 0 from -half to half
-    mm; its distances (Z,) mm from the element, 0.8 to 1.2 of the sensor distance; and half, a tenth of the radius.
+    mm; its distances (Z,) mm from the element, 0.75 to 1.25 of the sensor distance; and half, a tenth of the radius.
 
     Light is the mean over squares 2·half/201 wide.
     """

@@ -109,14 +109,14 @@ def height_figure(elements: Sequence[Element], *, title: str = ""):
 def caustic_figure(psfs, light: Tensor, distances: Tensor, half: float):
     """Light per mm² over the distance behind the element, logarithmic; arguments: of `wave_optics.compute.caustic`.
 
-    A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
+    A row for each depth, a column for each wavelength; one scale for all; a dashed line at the sensor.
     """
     from matplotlib.colors import LogNorm
 
     values, z = array(light), array(distances)
     wavelengths, depths = psfs.wavelengths.tolist(), psfs.depths.tolist()
     colours = style.wavelength_colours(wavelengths)
-    figure = new_figure(2.5 * len(wavelengths) + 0.9, 1.5 * len(depths) + 0.9)
+    figure = new_figure(2.5 * len(wavelengths) + 0.9, 2.0 * len(depths) + 0.9)
     axes = figure.subplots(len(depths), len(wavelengths), squeeze=False, sharex=True, sharey=True)
     extent = (z[0], z[-1], -1e3 * half, 1e3 * half)
     norm = LogNorm(values.max() / 10**_DECADES, values.max(), clip=True)
@@ -127,12 +127,15 @@ def caustic_figure(psfs, light: Tensor, distances: Tensor, half: float):
                 values[row, column].T, origin="lower", extent=extent, aspect="auto", norm=norm, cmap="magma",
                 interpolation="bilinear",
             )  # fmt: skip
-            panel.axvline(float(psfs.scene.sensor_distance), color="white", linewidth=0.8, linestyle=(0, (4, 3)))
+            sensor = float(psfs.scene.sensor_distance)
+            panel.axvline(sensor, color="white", linewidth=0.8, linestyle=(0, (4, 3)))
+            panel.annotate("sensor", (sensor, 1), (-3, -3), xycoords=("data", "axes fraction"),
+                           textcoords="offset points", ha="right", va="top", color="white", fontsize=7)  # fmt: skip
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         axes[row][0].set_ylabel(f"{_depth(depth)}\nx, µm")
-    figure.colorbar(shown, ax=axes, label="share of the light per mm²", shrink=0.9, pad=0.01)
-    figure.supxlabel("distance behind the element, mm; dashes: the sensor", fontsize=8.5)
+    figure.colorbar(shown, ax=axes, label="share of the light per mm²", pad=0.01)
+    figure.supxlabel("distance behind the element, mm", fontsize=8.5)
     figure.suptitle(psfs.title, fontweight="bold", fontsize=10)
     return figure
 
