@@ -131,3 +131,21 @@ def test_every_table_is_compared():
 
     tables = {kind.__name__ for kind in below(Result) - {Result} if "columns" in vars(kind)}
     assert tables == {type(computed(name)).__name__ for name in results()} | _WITHOUT_LENGTHS
+
+
+def test_a_result_is_saved_as_its_suffix_says(tmp_path):
+    import json
+
+    import raytrace as rt
+
+    result = rt.mtf("double_gauss", [10.0], fields=[0], geometric=True)
+    result.save(tmp_path / "mtf.json")
+    assert (
+        json.loads((tmp_path / "mtf.json").read_text())["results"]
+        == json.loads(json.dumps(result.document()))["results"]
+    )
+    result.save(tmp_path / "mtf.csv")
+    assert (tmp_path / "mtf.csv").read_text().count("\n") == 1 + len(result.to_frame())
+    with pytest.raises(ValueError, match=r"mtf\.npz: a result is saved as \.csv or \.json"):
+        result.save(tmp_path / "mtf.npz")
+    assert not (tmp_path / "mtf.npz").exists()

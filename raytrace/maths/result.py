@@ -1,8 +1,11 @@
 """Results of public functions: numbers, a table, a text, a document for JSON and a figure."""
 
+import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -104,8 +107,15 @@ class Result:
         return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in self.words().items()})
 
     def save(self, path: str | PathLike) -> None:
-        """Write the table as .csv, as a whole or not at all."""
-        write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
+        """Write the table as .csv, or the document as .json, as a whole or not at all. Raises ValueError for others."""
+        suffix = Path(path).suffix.lower()
+        if suffix == ".json":
+            text = json.dumps(self.document(), ensure_ascii=False, allow_nan=False, indent=2)
+            write_atomically(path, lambda file: file.write(text.encode()))
+        elif suffix == ".csv":
+            write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
+        else:
+            raise ValueError(f"{os.fspath(path)}: a result is saved as .csv or .json; figures are saved by `plot`")
 
     def document(self) -> dict:
         """The result for JSON: plain numbers, null for undefined ones."""

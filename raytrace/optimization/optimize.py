@@ -801,8 +801,9 @@ def optimize(
     seconds: limits, by default 500 cycles a path; paths: damping strategies to try. catalog: shipped catalogs or
     AGF files for variable glasses, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
-    lens, variables and merit function, from which the descent resumes bit-identically, cycles counted from its start
-    (`checkpoint.py`). Ctrl-C ends with the best lens.
+    lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
+    rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. Ctrl-C ends with
+    the best lens.
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable).
