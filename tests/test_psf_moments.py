@@ -124,10 +124,12 @@ def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
     torch.testing.assert_close(by_window.kernel.sum((-2, -1)), torch.ones(3, 2, 3, dtype=torch.float64))
 
 
-def test_default_fields_are_centred_on_their_chief_rays():
+def test_windows_are_centred_on_chief_rays():
     lens = read_lens("double_gauss")
-    result, asked = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
+    result, off_axis = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
+    about_axis = psf(lens, "gaussian", fields=number([[0.0], [14.0]]), center="axis")
     assert result.kernel.shape[1] == 3
     assert bool((result.energy > 0.05).all())
-    assert float(asked.energy) == 0  # fields that are given count from the axis
-    assert asked.grid.centre.tolist() == [0.0, 0.0]
+    torch.testing.assert_close(off_axis.kernel[:, 0], result.kernel[:, 2], rtol=0, atol=1e-12)
+    assert float(about_axis.energy) == 0
+    assert about_axis.grid.centre.tolist() == [0.0, 0.0]

@@ -10,7 +10,7 @@ import raytrace as rt
 from raytrace.files import shipped
 from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import Dual
-from raytrace.optimization.lens_state import Bundle
+from raytrace.optimization.lens_state import Bundle, rays_by_torch
 from raytrace.optimization.variables import Model
 from raytrace.system.lens import with_field_kind
 from raytrace.system.optimization_data import Solve, Vary
@@ -142,8 +142,9 @@ def test_derivatives_are_those_of_finite_differences(cases, name, engine):
 def test_the_launch_in_numpy_is_that_of_torch(cases, name):
     model, bundle = bundle_of(cases[name], name)
     state = model.views[0].state(Dual(model.start, np.eye(len(model.start))))
-    own, by_torch = bundle.launched(state), bundle._launched_by_torch(state)
-    for one, other in zip((*own[0], *own[1], own[2]), (*by_torch[0], *by_torch[1], by_torch[2]), strict=True):
+    in_numpy = bundle.launched(state)
+    by_torch, _ = rays_by_torch(state, bundle._start_by_torch, bundle.field.shape[1:], backward=bundle._aims_bent)
+    for one, other in zip((*in_numpy[0], *in_numpy[1], in_numpy[2]), by_torch, strict=True):
         one = one if isinstance(one, Dual) else Dual(one, np.zeros_like(other.slope))
         assert np.allclose(one.value, other.value, rtol=1e-9, atol=1e-9)
         assert np.allclose(one.full(), other.full(), rtol=1e-6, atol=1e-7 * (1 + np.abs(other.slope).max()))

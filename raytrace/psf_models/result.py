@@ -236,7 +236,7 @@ def moments_of_rays(points: Tensor, energy: Tensor, fold: str = "none") -> tuple
     lit = energy > 0
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
     x, y = torch.where(lit, points, 0.0)
-    zero = torch.zeros_like(share[..., 0])
+    zero = share.new_zeros(share.shape[:-1])  # also of no rays, the share of a process without work
     if fold == "round":
         # Turned about the axis, a ray at height r is a ring of second moment r²/2 per axis.
         variance = 0.5 * (share * (x * x + y * y)).sum(-1)

@@ -1,13 +1,14 @@
 """`rt.view`: the viewer of a lens as a widget of a notebook or, outside of one, behind a local address."""
 
 import sys
+from typing import Any
 
 from raytrace.system.lens import Lens
 from raytrace.viewer.server import STATIC, missing, serve
 from raytrace.viewer.session import Session
 
 
-def view(lens: Lens, *, port: int | None = None, browser: bool = True):
+def view(lens: Lens, *, port: int | None = None, browser: bool = True) -> Any:
     """Turn the numbers of a lens while its layout, spots, ray fans, MTF and field curves are redrawn.
 
     In a notebook the result is a widget, whose `lens` is the lens as edited, and `state` all of its state. Elsewhere a
