@@ -60,6 +60,7 @@ Python is an operand too: `rt.Measure`.
 OLD = {"WAVL", "WAVN", "WWGT", "WWGN"} | {
     keyword for row in surfaces.FIELD_LISTS.values() for keyword in row.keywords[1:]
 }
+REFUSED_IF_SET = "IGNR"  # a surface that OpticStudio leaves out of the trace
 
 
 def row_of(treatment: str, words: Iterable[str], reason: str = "") -> str:
@@ -95,7 +96,11 @@ def zemax() -> list[str]:
         ),
         section(
             "Surface",
-            row_of("read and written", dict.fromkeys(word for word in surface if word not in OLD)),
+            row_of(
+                "read and written",
+                dict.fromkeys(word for word in surface if word not in OLD and word != REFUSED_IF_SET),
+            ),
+            row_of("refused where it is set", [REFUSED_IF_SET], "a surface to be ignored"),
             *by_reason("reported, ignored", surfaces.SURFACE_IGNORED),
         ),
         section(
