@@ -106,7 +106,7 @@ def test_a_decentred_aperture_shows_that_part_of_a_mirror():
 
 
 def test_rays_by_wavelength_show_the_spectrum_on_the_image():
-    """The landing points of every wavelength are drawn beside the layout, in the colours of the traced rays."""
+    """The landing points of every wavelength are drawn next to the layout, in the colours of the traced rays."""
     lens = rt.read_lens("spectrometer")
     figure = rt.layout(lens, wavelengths=[0.45, 0.55, 0.65]).plot()
     lines = [line for line in figure.axes[1].lines if line.get_marker() == "."]

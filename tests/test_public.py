@@ -32,7 +32,7 @@ ROWS = [
 
 
 def test_every_public_name_matches_the_table_after_importing_all_modules():
-    """No module may stand in a function's place: `import raytrace.x` puts x into the package."""
+    """No module may replace a function of the same name: `import raytrace.x` puts x into the package."""
     without = ("raytrace.bench.peers", "raytrace.__main__")  # these need the extra [bench], or run
     for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
         if not found.name.startswith(without):
@@ -271,7 +271,7 @@ def test_a_lens_shows_itself():
     assert table.radius[1] == pytest.approx(float(1 / lens.surfaces[1].curvature))
     assert table.glass[1] == lens.surfaces[1].glass.name
     batch = rt.with_object_distance(lens, torch.tensor([[1e3], [2e3]], dtype=torch.float64))
-    assert str(batch).startswith("Lens(")  # what is no single lens shows its numbers
+    assert str(batch).startswith("Lens(")  # a batch of lenses shows its numbers
     assert "<pre>" in batch._repr_html_()
 
 

@@ -21,7 +21,10 @@ UNITS = (1.0, 10.0, 25.4, 1000.0)  # mm, cm, inch, m: raytrace gives mm, Optilan
 
 
 def by_raytrace(path: Path) -> float:
-    return float(rt.first_order(str(path)).effective_focal_length)
+    lens = rt.read_lens(path)
+    if lens.environment is not None:
+        lens = lens.at(temperature=20)  # that of the answers
+    return float(rt.first_order(lens).effective_focal_length)
 
 
 def by_optiland(path: Path) -> float:

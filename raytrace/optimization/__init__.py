@@ -11,7 +11,7 @@ optimize          `optimize`: opening, descent, targets and attained values, rep
 checkpoint        state of a descent, from which it resumes
 glass_choice      variable glasses of catalogs
 search            `search`: minima found globally; `search_tasks`, `saddle_points`: its parts
-file_check        `check`: what was read of a lens file, and which operands are evaluated
+file_check        `check`: import report of a lens file, and which operands are evaluated
 
 A new operand is a function of an `EvaluationContext` and a row of the table at the end of its family's file; its test
 compares it with the analysis of the same quantity (`tests/test_operands_FAMILY.py`). Every number of a surface that

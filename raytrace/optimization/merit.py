@@ -58,7 +58,7 @@ REFERENCES = ("centroid", "chief")
 
 
 class BadMerit(ValueError):
-    """A merit function that cannot be made; the message says what was found and what was expected."""
+    """A merit function that cannot be made; the message names the row, the value and the values expected."""
 
 
 @dataclass(frozen=True)

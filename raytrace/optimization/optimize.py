@@ -405,7 +405,7 @@ def _configurations(found) -> list[tuple[str, Lens, Lens]]:
 
 
 def _draw_conditions(axes, found) -> None:
-    """The table of what was asked for and what was reached, what is not met in red."""
+    """The table of targets and values reached; those not met are red."""
     lines, shown = found.conditions_in_words(), found.shown_conditions()
     axes.axis("off")
     axes.set_title("Asked and reached", fontweight="bold", loc="left")

@@ -515,7 +515,7 @@ class Model:
 
     @cached_property
     def start(self) -> np.ndarray:
-        """The variables (n,) as they stand."""
+        """The current variables (n,)."""
         numbers = []
         for one in self.variables:
             if one.operand is not None:
@@ -658,7 +658,7 @@ class View:
 
     @cached_property
     def further_power(self) -> tuple[np.ndarray, np.ndarray]:
-        """What bends light beside the curvature: the vertex by terms of r² (S,) in 1/mm, phases (W, S) in 1/mm."""
+        """Power in addition to the curvature: the vertex by terms of r² (S,) in 1/mm, phases (W, S) in 1/mm."""
         bend, phase = np.zeros(len(self.lens.surfaces)), np.zeros_like(self.indices)
         for k, surface in enumerate(self.lens.surfaces):
             if k == 0 or surface.is_break:

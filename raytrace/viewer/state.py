@@ -179,7 +179,7 @@ def edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag: 
 
 
 def _dragged(state: State, event: Mapping, lens: Lens, key: str) -> State:
-    """The lens of an event of the slider `key`, or of the text field beside it, which ends the drag."""
+    """The lens of an event of the slider `key`, or of its text field, which ends the drag."""
     drag = bool(event.get("drag"))
     found = edited(state, lens, drag=key if drag or state.dragged == key else "")
     return found if drag else dataclasses.replace(found, dragged="")

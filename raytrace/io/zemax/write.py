@@ -387,7 +387,7 @@ def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> 
         return ["MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
     numbers = range(1, count(lens.operands) + 1)
     for k in numbers:
-        body(with_operands(lens, k))  # refuses what no file holds
+        body(with_operands(lens, k))  # refuses a value that no file can hold
     lines = [f"MNUM {len(numbers)} {lens.current_configuration}"]
     rules = statuses(original, lens.operands)
     for position, operand in enumerate(lens.operands):

@@ -300,7 +300,7 @@ ARGUMENTS = {
 
 
 def need(line: Line, kind: str, number: int, lens: Lens) -> int:
-    """The number, if the lens has what it names. Raises BadRow."""
+    """The number, if the lens has the surface or term that it names. Raises BadRow."""
     argument = ARGUMENTS[kind]
     first, last = argument.first(lens), argument.last(lens)
     if not first <= number <= last:
