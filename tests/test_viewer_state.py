@@ -291,3 +291,13 @@ def test_a_failure_of_an_optimisation_is_one_message(triplet):
     session.answer({"type": "optimise"})
     reply = finished(session)
     assert reply["optimisation"]["failure"] or "analyses" in reply
+
+
+def test_the_working_f_number_is_that_of_the_real_marginal_ray():
+    from raytrace.tracing.f_number import working_f_number
+    from raytrace.viewer.compute import first_order_of
+
+    lens = rt.read_lens("cooke_triplet")
+    (shown,) = [row["value"] for row in first_order_of(lens) if row["name"] == "working F/#"]
+    assert shown == float(working_f_number(lens))
+    assert abs(shown / float(rt.first_order(lens).paraxial_working_f_number) - 1) > 1e-3

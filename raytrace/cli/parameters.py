@@ -64,11 +64,7 @@ def _evaluated(node: ast.expr | None, constants: Mapping) -> object:
     """A default that is a constant; None for another."""
     names = {"math": math, **constants}
     plain = node is not None and all(
-        isinstance(
-            part, ast.Constant | ast.Tuple | ast.Attribute | ast.Name | ast.expr_context | ast.UnaryOp | ast.USub
-        )
-        and (not isinstance(part, ast.Name) or part.id in names)
-        for part in ast.walk(node)
+        part.id in names if isinstance(part, ast.Name) else isinstance(part, _PLAIN) for part in ast.walk(node)
     )
     return eval(compile(ast.Expression(node), "", "eval"), names) if plain else None
 

@@ -27,6 +27,7 @@ from raytrace.plotting import style
 from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.parameter_paths import number_at, parameter_paths
+from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import FirstOrder, first_order
@@ -38,14 +39,14 @@ FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
 _DIGITS = 5  # of drawings
 
 #: First-order data: words, unit, and the number.
-FIRST_ORDER: tuple[tuple[str, str, Callable[[FirstOrder], Tensor]], ...] = (
-    ("EFL", "mm", lambda one: one.effective_focal_length),
-    ("BFD", "mm", lambda one: one.back_focal_distance),
-    ("F/#", "", lambda one: one.f_number),
-    ("working F/#", "", lambda one: one.paraxial_working_f_number),
-    ("EPD", "mm", lambda one: one.entrance_pupil_diameter),
-    ("m", "", lambda one: one.magnification),
-    ("image at", "mm", lambda one: one.paraxial_image_distance),
+FIRST_ORDER: tuple[tuple[str, str, Callable[[Lens, FirstOrder], Tensor]], ...] = (
+    ("EFL", "mm", lambda lens, one: one.effective_focal_length),
+    ("BFD", "mm", lambda lens, one: one.back_focal_distance),
+    ("F/#", "", lambda lens, one: one.f_number),
+    ("working F/#", "", lambda lens, one: working_f_number(lens)),
+    ("EPD", "mm", lambda lens, one: one.entrance_pupil_diameter),
+    ("m", "", lambda lens, one: one.magnification),
+    ("image at", "mm", lambda lens, one: one.paraxial_image_distance),
 )
 
 
@@ -183,10 +184,9 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
 
 
 def first_order_of(lens: Lens) -> list[dict]:
-    paraxial = first_order(lens)
-    return [
-        {"name": words, "value": plain(float(number(paraxial))), "unit": unit} for words, unit, number in FIRST_ORDER
-    ]
+    data = first_order(lens)
+    rows = ((words, unit, float(number(lens, data))) for words, unit, number in FIRST_ORDER)
+    return [{"name": words, "value": plain(value), "unit": unit} for words, unit, value in rows]
 
 
 def refresh(state: State) -> dict:
