@@ -20,6 +20,7 @@ from raytrace.maths.numerics import check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
+from raytrace.system.batch import aligned, lens_count, one_lens
 from raytrace.system.configurations import Operand
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
@@ -112,6 +113,10 @@ class Lens:
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
     optimization_data: OptimizationData | None = None
+
+    count = property(lens_count)
+    aligned = aligned
+    lens = one_lens
 
     with_configurations = multiple.made
     configuration = multiple.chosen
@@ -212,7 +217,7 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")
         radius = _like(given.pop("radius"), like)
-        if bool(radius == 0):
+        if bool((radius == 0).any()):
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
     made = {name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()}
@@ -449,16 +454,19 @@ def check(lens: Lens) -> None:
     if not 1 <= lens.primary_wavelength <= len(lens.wavelengths):
         last_one = len(lens.wavelengths)
         raise ValueError(f"primary wavelength number {lens.primary_wavelength}; expected one from 1 to {last_one}")
-    if not float(lens.aperture.value) > 0:
-        raise ValueError(f"aperture {lens.aperture.kind} {float(lens.aperture.value):g}: expected a number above 0")
+    lens_count(lens)  # refuses numbers of different counts
+    if not bool((lens.aperture.value > 0).all()):
+        smallest = float(lens.aperture.value.min())
+        raise ValueError(f"aperture {lens.aperture.kind} {smallest:g}: expected a number above 0")
     for number, surface in enumerate(lens.surfaces[1:], 1):
-        if not bool(torch.isfinite(surface.thickness)):
-            raise ValueError(f"surface {number} has thickness {float(surface.thickness)}; only the object's may be inf")
-    if bool(torch.isnan(lens.surfaces[0].thickness)):
+        if not bool((finite := torch.isfinite(surface.thickness)).all()):
+            wrong = float(surface.thickness[~finite][0])
+            raise ValueError(f"surface {number} has thickness {wrong}; only the object's may be inf")
+    if bool(torch.isnan(lens.surfaces[0].thickness).any()):
         raise ValueError("the object distance is nan; expected mm, or inf")
     if not bool((torch.isfinite(lens.fields.x) & torch.isfinite(lens.fields.y)).all()):
         raise ValueError("`fields` hold a number that is not finite; expected numbers y, or pairs (x, y)")
-    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness))
+    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness).any())
     if at_infinity and lens.fields.kind == "object_height":
         raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")
     if at_infinity and lens.fields.telecentric:
@@ -500,11 +508,11 @@ def _check_kinds(surface: Surface, where: str) -> None:
 def _check_cone(lens: Lens) -> None:
     """Refuse a cone at the object of a right angle, of 180° and more, or of an NA that is not below the index."""
     # Of a cone beyond a right angle rays leave on the same lines forwards, within 180 degrees less the angle.
-    kind, number = lens.aperture.kind, float(lens.aperture.value)
+    kind, number = lens.aperture.kind, float(lens.aperture.value.max())
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")
     if kind == "object_na":
-        index = float(index_behind(lens, 0, lens.primary))
+        index = float(index_behind(lens, 0, lens.primary).min())
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")
 
