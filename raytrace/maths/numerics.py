@@ -362,7 +362,7 @@ def value(cls: type) -> type:
     Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
     that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. There is no generated `==` (it would raise on
     tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
-    A class with a `__repr__` keeps it.
+    A class with a `__repr__` keeps it. `torch.load` accepts it: restoring its fields executes nothing.
     """
     shown = cls.__repr__ is object.__repr__
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
@@ -381,6 +381,7 @@ def value(cls: type) -> type:
 
     pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
     _VALUE_TYPES.add(cls)
+    torch.serialization.add_safe_globals([cls])
     return cls
 
 

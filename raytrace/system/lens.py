@@ -20,8 +20,8 @@ from raytrace.maths.numerics import check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
-from raytrace.system.configurations import Operand
-from raytrace.system.optimization_data import OptimizationData
+from raytrace.system.configurations import Operand, ScaledPath
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
@@ -207,6 +207,9 @@ _POSED = {
     for side, behind in (("before", ""), ("after", "_after"))
     for field in dataclasses.fields(Pose)
 }
+
+# Plain data of a lens, for torch.load; values are known to it already (`numerics.value`).
+torch.serialization.add_safe_globals([OptimizationData, Row, ScaledPath, Solve, Vary])
 
 
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
