@@ -74,6 +74,16 @@ def varies(number: Tensor | float | None) -> bool:
     return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None
 
 
+def is_any(mask: Tensor) -> bool:
+    """Whether any entry of a mask (...) is true; inside `torch.func.vmap`, of any element of its batch.
+
+    A search that ends early then ends when all elements have: `bool(mask.any())` raises an error there.
+    """
+    while is_functorch_wrapped_tensor(mask):
+        mask = torch._C._functorch.get_unwrapped(mask)
+    return bool(mask.any())
+
+
 def with_batch_axes(vector: Tensor, count: int) -> Tensor:
     """The vector (3, ...) with at least `count` batch axes: axes of length 1 are put in behind its components.
 
