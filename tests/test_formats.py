@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import number
+from problems import number, vector
 
 import raytrace as rt
 from raytrace.files import shipped
@@ -444,27 +444,23 @@ def featured(**row) -> Lens:
     return rt.lens(rows, stop=1, entrance_pupil_diameter=5, fields=[0, 3])
 
 
-def double(*numbers: float) -> torch.Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
-
-
 #: Lenses of a row of the page, and for each what a cell has that stands for a format which does not write it.
 FEATURES = {
     "conics, mirrors, glasses": [(featured(conic=-1.0, glass="N-BK7"), "refused")],
     "aspheres": [
-        (featured(coefficients=double(0.0, 1e-6, 1e-20)), "refused"),
-        (featured(coefficients=double(1e-4)), "r⁴ to"),
-        (featured(coefficients=double(*[0.0] * 10, 1e-30)), "r⁴ to"),
-        (featured(kind="odd asphere", coefficients=double(0.0, 0.0, 1e-5)), "r⁴ to"),
+        (featured(coefficients=vector(0.0, 1e-6, 1e-20)), "refused"),
+        (featured(coefficients=vector(1e-4)), "r⁴ to"),
+        (featured(coefficients=vector(*[0.0] * 10, 1e-30)), "r⁴ to"),
+        (featured(kind="odd asphere", coefficients=vector(0.0, 0.0, 1e-5)), "r⁴ to"),
     ],
     "toroids, biconics": [
-        (featured(kind="toroidal", coefficients=double(0.01)), "refused"),
-        (featured(kind="biconic", coefficients=double(0.01, 0.0)), "refused"),
+        (featured(kind="toroidal", coefficients=vector(0.01)), "refused"),
+        (featured(kind="biconic", coefficients=vector(0.01, 0.0)), "refused"),
     ],
     "tilts and decentres": [(featured(before=rt.Pose(tilt_x=number(3.0))), "refused")],
     "gratings, holograms, phases": [
         (featured(phase=rt.Grating(number(0.1), number(1.0))), "refused|powers"),
-        (featured(phase=rt.RadialPhase(double(3.0, 1.0), number(2.0), number(1.0))), "refused"),
+        (featured(phase=rt.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
     ],
     "apertures and obscurations": [
         (featured(apertures=(Aperture("rectangular", (4.0, 3.0)),)), "refused"),

@@ -115,7 +115,7 @@ def test_tilts_are_right_handed(tilt, point, sign):
 
 
 def test_a_pose_decentres_and_then_tilts_unless_tilts_are_first():
-    """Behind a tilt by 90° about x, the y axis lies along z; axes turn about x, then about the new y and z, or z, y, x."""
+    """Behind a tilt by 90° about x, y lies along z; axes turn about x, then about the new y and z, or about z, y, x."""
     vertex = [scalar(0.0)] * 3
     for tilts_first, expected in ((False, (0.0, 1.0, 0.0)), (True, (0.0, 0.0, 1.0))):
         pose = Pose(y=scalar(1.0), tilt_x=scalar(90.0), tilts_first=tilts_first)
