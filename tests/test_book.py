@@ -15,7 +15,6 @@ import torch
 import raytrace as rt
 from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
-from raytrace.optimization.search_tasks import Journal
 
 DOCS = Path(__file__).parents[1] / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
@@ -97,7 +96,9 @@ def failing(folder: Path) -> dict:
     (folder / "grid.zmx").write_text(text.replace("TYPE STANDARD", "TYPE GRID_SAG", 1), "utf-8")
     lens, triplet = rt.read_lens("double_gauss"), rt.read_lens("cooke_triplet")
     row = {"radius": 50, "thickness": 5}
-    Journal(Path("minima"), {"seed": 1}, 60.0)
+    (folder / "minima").mkdir()
+    (folder / "minima" / "search.jsonl").write_text('{"seed": 1}\n', "utf-8")
+    pinhole = triplet.replace(triplet.stop, apertures=(rt.Aperture("circular", (0.0, 1.5)),))
     return {
         "LensFileError": lambda: rt.read_lens("lens.xyz"),
         "UnsupportedSurface": lambda: rt.read_lens("grid.zmx"),
@@ -105,20 +106,24 @@ def failing(folder: Path) -> dict:
         "BadPrescription": lambda: rt.lens([row | {"glas": "N-BK7"}, row], stop=1, f_number=5),
         "BadMerit": lambda: rt.search(triplet),
         "NoProblem": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0),
-        "BadSearch": lambda: Journal(Path("minima"), {"seed": 2}, 60.0),
+        "BadSearch": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0, folder="minima"),
         "OutOfReach": lambda: rt.wavefront(triplet, fields=[80]),
         "NoFocus": lambda: rt.focus(triplet, fields=[80]),
         "NothingToShow": lambda: rt.distortion(triplet, fields=[0]),
         "LostRays": lambda: rt.spot(lens, fields=[80]),
         "UnfilledStop": lambda: rt.spot(lens),
+        "Incomplete": lambda: rt.wavefront(pinhole, fields=[0]),
     }
 
 
 def test_page_of_errors_shows_the_messages(tmp_path, monkeypatch):
+    """Of every class of error and warning that is public."""
     monkeypatch.chdir(tmp_path)
     page = (DOCS / "reference" / "errors.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `rt\.(\w+)` \| (.*?) \|", page, re.M))
-    for name, call in failing(tmp_path).items():
+    calls = failing(tmp_path)
+    assert calls.keys() == rows.keys()
+    for name, call in calls.items():
         kind, words = getattr(rt, name), rows[name].removesuffix("…")
         with warnings.catch_warnings(record=True) as issued:
             warnings.simplefilter("always")
