@@ -720,7 +720,7 @@ class Optimized(Result):
         return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def save(self, path: str | PathLike) -> None:
-        """Write the lens, with its variables and its merit function."""
+        """Write the lens, with its variables and its merit function; a file does not hold the constraints of `hold`."""
         write_lens(self.lens, path)
 
 

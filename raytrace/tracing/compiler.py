@@ -220,7 +220,7 @@ def run_compiler(*words: str, folder: Path) -> subprocess.CompletedProcess:
     """Run a program of `compiler` in a private folder, so that no relative path leads elsewhere."""
     environment = os.environ | {"PATH": _safe_path()}
     return subprocess.run(
-        words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600
+        words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=1800
     )
 
 
