@@ -46,6 +46,7 @@ PUBLIC = {
     "Glass": "materials.glass",
     "UnknownGlass": "materials.catalogs",
     "find_glass": "materials.catalogs",
+    "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
     "refractive_index": "materials.glass",
     # rays
@@ -125,6 +126,7 @@ PUBLIC = {
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
+    "element": "wave_optics.element",
     "element_lens": "wave_optics.hybrid",
     "elements": "wave_optics.compute",
     "fabricated": "wave_optics.fabrication",
