@@ -75,7 +75,7 @@ def compare(verb, name, ray_aiming):
     lenses = perturbed(name, ray_aiming=ray_aiming, posed=verb not in ("psf paraxial", "psf fourier"))
     assert lenses.count == 3
     together = VERBS[verb](lenses)
-    each = torch.stack([VERBS[verb](lenses.lens(k)) for k in range(3)])
+    each = torch.stack([VERBS[verb](lenses[k]) for k in range(3)])
     torch.testing.assert_close(together, each, rtol=1e-9, atol=1e-11)
 
 
@@ -131,14 +131,19 @@ def test_batch_of_lenses_in_a_list():
     assert found.surfaces[1].curvature.shape == (3,)
     assert found.surfaces[2].curvature is lens.surfaces[2].curvature
     assert torch.equal(rt.spot(found).rms_radius[1], rt.spot(lenses[1]).rms_radius)
-    assert found.lens(2).surfaces[1].curvature.shape == ()
-    assert found.lens(slice(0, 2)).count == 2
+    assert found[2].surfaces[1].curvature.shape == ()
+    assert found[:2].count == 2
+    assert [float(1 / one.surfaces[1].curvature) for one in found] == pytest.approx([60, 61, 62])
 
 
 def test_wrong_batches_are_refused():
     lens, two = rt.read_lens("double_gauss"), torch.ones(2, dtype=torch.float64)
     with pytest.raises(ValueError, match="surface 1: thickness has numbers of 2 lenses, surface 2: thickness of 3"):
         lens.replace(1, thickness=two).replace(2, thickness=torch.ones(3, dtype=torch.float64)).at(ray_aiming="off")
+    with pytest.raises(TypeError, match="a single lens"):
+        lens[0]
+    with pytest.raises(IndexError, match="lens 2 of a batch of 2"):
+        lens.replace(1, thickness=two)[2]
     with pytest.raises(ValueError, match="no lenses"):
         rt.batch([])
     with pytest.raises(ValueError, match="lens 1 has other surfaces"):

@@ -132,7 +132,7 @@ class Spots(Result):
         batch of lenses.
         """
         if self.lens.count is not None:
-            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens.lens(0)")
+            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
         lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)

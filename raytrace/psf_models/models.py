@@ -334,7 +334,7 @@ def psf(
     points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
-        trial = with_object_distance(one_lens(lens, 0), distances[0].detach())
+        trial = with_object_distance(lens if lenses is None else one_lens(lens, 0), distances[0].detach())
         failures = ray_failures(trial, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
         reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
         raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
@@ -350,7 +350,7 @@ def psf(
         for number, (distance, failed) in enumerate(zip(distances.detach(), dark, strict=True)):
             where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
             at = where if len(distances) > 1 else ""
-            trial = with_object_distance(one_lens(lens, number), distance)
+            trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
             warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
     return dataclasses.replace(
         psfs,

@@ -72,7 +72,15 @@ def aligned(lens: Part, axes: int) -> Part:
 
 
 def one_lens(lens: Part, number: int | slice | Tensor) -> Part:
-    """Lens `number` of a batch, from 0; of a slice or of a tensor of numbers, a batch of them."""
+    """Lens `number` of a batch, from 0; of a slice or of a tensor of numbers, a batch of them.
+
+    Raises TypeError for a single lens, IndexError beyond the last lens.
+    """
+    count = lens_count(lens)
+    if count is None:
+        raise TypeError("a single lens, not a batch of lenses: no number has the shape (L,)")
+    if isinstance(number, int) and not -count <= number < count:
+        raise IndexError(f"lens {number} of a batch of {count} lenses; expected 0 to {count - 1}")
 
     def take(entries: Tensor, own: int, place: str) -> Tensor:
         if entries.dim() <= own:

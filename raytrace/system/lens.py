@@ -21,7 +21,7 @@ from raytrace.maths.numerics import check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
-from raytrace.system.batch import aligned, lens_count, one_lens
+from raytrace.system.batch import lens_count, one_lens
 from raytrace.system.configurations import Operand, ScaledPath
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
@@ -98,6 +98,8 @@ class Lens:
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
     optimization_data: variables, solves and the merit function of the file; None without any.
+    A number of the surfaces, the aperture or the environment may be a tensor (L,), and a coefficient (m, L): a batch of
+    `count` lenses, of which `lens[k]` is one and `lens[:10]` some.
     """
 
     surfaces: tuple[Surface, ...]
@@ -117,8 +119,7 @@ class Lens:
     optimization_data: OptimizationData | None = None
 
     count = property(lens_count)
-    aligned = aligned
-    lens = one_lens
+    __getitem__ = one_lens
 
     with_configurations = multiple.made
     configuration = multiple.chosen
