@@ -56,7 +56,7 @@ def test_a_start_that_loses_most_rays_is_opened_until_all_pass():
 def test_never_more_light_is_lost_and_a_lens_that_loses_none_stays():
     lens = rt.read_lens("double_gauss")
     problem, bounds = problem_of(lens)
-    assert opened(problem, problem.model.start, **bounds) is problem.model.start
+    assert opened(problem, problem.model.start, **bounds).x is problem.model.start
     problem, bounds = problem_of(lens.at(f_number=0.6), "thickness:5..5.1")
     x = np.clip(problem.model.start, bounds["lower"], bounds["upper"])
     found = opened(problem, x, **bounds)

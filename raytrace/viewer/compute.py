@@ -303,7 +303,7 @@ def prescription(state: State) -> dict:
     return {
         "name": lens.name,
         "rows": rows,
-        "fields": {"unit": lens.fields.unit, "y": plain(lens.fields.y)},
+        "fields": {"unit": lens.fields.unit, "x": plain(lens.fields.x), "y": plain(lens.fields.y)},
         "wavelengths": plain(lens.wavelengths),
         "primary": lens.primary_wavelength,
         "aperture": {

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,8 +21,9 @@ from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
-from raytrace.system.parameter_paths import modelled, with_number
+from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
 from raytrace.system.prescription import medium
+from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
 
 #: Steps of undo that are kept.
@@ -53,7 +55,7 @@ class State:
 def initial(lens: Lens) -> State:
     """The state of a lens as it was read, with the variables of its file."""
     data = lens.optimization_data
-    words = dict.fromkeys(map(word_of, data.variables if data else ()))
+    words = dict.fromkeys(word_of(one) for one in (data.variables if data else ()) if is_shown(lens, one))
     try:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
@@ -83,6 +85,11 @@ def reduce(state: State, event: Mapping) -> State:
 def word_of(one: Vary) -> str:
     """A variable as a word of the variable syntax, "curvature:3"; of all configurations."""
     return f"{one.quantity}:{one.surface}"
+
+
+def is_shown(lens: Lens, one: Vary) -> bool:
+    """Whether the table has the number of a variable or solve: it has none of glasses and of other conditions."""
+    return one.quantity == "thickness" or one.quantity in parameter_paths(lens.surfaces[one.surface])
 
 
 def variables(state: State) -> list[str | Vary]:
@@ -202,14 +209,28 @@ def _vary(state: State, event: Mapping) -> State:
 
 
 def _fields(state: State, event: Mapping) -> State:
-    """Fields along y; where as many are given as there are, x, weights and vignetting factors stay."""
-    lens, y = state.lens, numbers(event["values"], "fields")
-    if len(y) == len(lens.fields.y):
-        fields = dataclasses.replace(lens.fields, y=lens.fields.y.new_tensor(y))
-        lens = dataclasses.replace(freed(lens, fields=y), fields=fields)
-        check(lens)
-        return edited(state, solved(lens), drag="")
-    return edited(state, solved(lens.at(fields=y)))
+    """Fields by their y, or with `axis` "x" by their x. All else of them stays; of fewer or more y, those that the lens
+    does not have take x and vignetting factors between their neighbours."""
+    lens, axis = state.lens, event.get("axis", "y")
+    old, values = lens.fields, numbers(event["values"], "fields")
+    if len(values) == len(old.y):
+        fields = dataclasses.replace(old, **{axis: old.y.new_tensor(values)})
+    elif axis == "x":
+        raise ValueError(f"x of the fields: found {len(values)} numbers; this lens has {len(old.y)} fields")
+    else:
+        left = list(range(len(old.y)))  # fields that no y has taken
+        taken = [next((left.pop(i) for i, k in enumerate(left) if float(old.y[k]) == y), None) for y in values]
+        order = old.y.argsort(stable=True)
+        between = np.interp(values, old.y[order], old.x[order])
+        x = [float(between[i]) if k is None else float(old.x[k]) for i, k in enumerate(taken)]
+        weight = [1.0 if k is None else float(old.weight[k]) for k in taken]
+        points = old.y.new_tensor([x, values])
+        factors = factors_at(lens, points)
+        fields = dataclasses.replace(old, x=points[0], y=points[1], weight=old.y.new_tensor(weight), vignetting=factors)
+    field_points(torch.stack([fields.x, fields.y]).T.tolist(), like=lens)
+    lens = dataclasses.replace(freed(lens, fields=values), fields=fields)
+    check(lens)
+    return edited(state, solved(lens))
 
 
 def _wavelengths(state: State, event: Mapping) -> State:
