@@ -59,5 +59,5 @@ def test_never_more_light_is_lost_and_a_lens_that_loses_none_stays():
     assert opened(problem, problem.model.start, **bounds).x is problem.model.start
     problem, bounds = problem_of(lens.at(f_number=0.6), "thickness:5..5.1")
     x = np.clip(problem.model.start, bounds["lower"], bounds["upper"])
-    found = opened(problem, x, **bounds)
+    found = opened(problem, x, **bounds).x
     assert problem.state(found, False).lost <= problem.state(x, False).lost

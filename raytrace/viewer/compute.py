@@ -8,9 +8,11 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import torch
+from matplotlib.colors import to_hex
 from torch import Tensor
 
 from raytrace.analysis.chief import field_curvature_of
@@ -69,10 +71,6 @@ def rounded(numbers: np.ndarray, digits: int = _DIGITS) -> list:
     return found if there.all() else plain(found)
 
 
-def hexadecimal(colour: str | tuple[float, ...]) -> str:
-    return colour if isinstance(colour, str) else "#" + "".join(f"{round(255 * part):02x}" for part in colour)
-
-
 # -- the drawing of a lens
 
 
@@ -91,7 +89,7 @@ class Drawing:
         self._add(x, y, kind="area", fill=facecolor or color, id=gid)
 
     def _add(self, x, y, **look) -> None:
-        look |= {name: hexadecimal(look[name]) for name in ("stroke", "fill") if name in look}
+        look |= {name: to_hex(look[name]) for name in ("stroke", "fill") if name in look}
         points = np.stack(np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float)))
         self.shapes.append({**look, "points": points})
 
@@ -215,7 +213,7 @@ def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
         "fields": [field_label(lens, point) for point in fields.T.tolist()],
         "wavelengths": plain(lens.wavelengths),
         "field_colours": style.field_colours(fields.shape[1]),
-        "wavelength_colours": [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
+        "wavelength_colours": [to_hex(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
     }
     for name, analysis in {
         "layout": lambda: layout_of(lens, fields),
@@ -245,20 +243,15 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 
 def mtf_of_field(state: State, field: int) -> dict:
     """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
-    with torch.no_grad(), warnings.catch_warnings():
+    found = {"field": field, "mtf": None}
+    with torch.no_grad(), warnings.catch_warnings(), suppress(ValueError, RuntimeError):  # as `refresh` reports
         warnings.simplefilter("ignore")
         lens = _simple(state.lens)
-        fields = shown_fields(lens)[:, field : field + 1]
-        if not fields.shape[1]:
-            return {"message": f"field {field}: this lens has fewer fields"}
-        found = {"field": field, "mtf": None}
-        whole = field_spots(lens, fields=shown_fields(lens), rings=1)[0]
-        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency / 3:
-            return found  # of so large a blur diffraction shows nothing
-        try:
-            return {**found, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
-        except (ValueError, RuntimeError):  # as `refresh` reports
-            return found
+        fields = shown_fields(lens)
+        radius = field_spots(lens, fields=fields, rings=1)[0].geometric_radius.nan_to_num(0.0).max()
+        if field < fields.shape[1] and least_reach(float(radius)) >= state.frequency / 3:
+            found["mtf"] = mtf_of(lens, fields[:, field : field + 1], state.frequency, diffraction=True)
+    return found
 
 
 def remarks(state: State) -> list[str]:

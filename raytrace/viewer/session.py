@@ -115,7 +115,7 @@ class Session:
         target = Path(path).expanduser()
         if not path.strip():
             return "save: give the name of a file, as lens.zmx"
-        if target.exists() and not overwrite:
+        if target.is_file() and not overwrite:
             return f"save: {target} exists; tick “replace” to write over it, or give another name"
         try:
             write_lens(self.state.lens, target)

@@ -19,7 +19,7 @@ from raytrace.optimization.merit import KINDS, DefaultMerit
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
-from raytrace.system.lens import Lens, SystemAperture, check, field_points
+from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
 from raytrace.system.prescription import medium
@@ -161,10 +161,8 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
 
 def solved(lens: Lens) -> Lens:
     """The lens whose solves and pickups hold."""
-    if lens.optimization_data is None or not lens.optimization_data.solves:
-        return lens
-    free = freedom(lens)
-    return Model(free.lens, (), free.solves).lens_at(torch.zeros(0).numpy())
+    solves = lens.optimization_data.solves if lens.optimization_data else ()
+    return Model(lens, (), solves).lens_at(np.zeros(0)) if solves else lens
 
 
 def aperture_sizes(lens: Lens) -> dict[str, float]:
@@ -211,26 +209,28 @@ def _vary(state: State, event: Mapping) -> State:
 def _fields(state: State, event: Mapping) -> State:
     """Fields by their y, or with `axis` "x" by their x. All else of them stays; of fewer or more y, those that the lens
     does not have take x and vignetting factors between their neighbours."""
-    lens, axis = state.lens, event.get("axis", "y")
-    old, values = lens.fields, numbers(event["values"], "fields")
+    lens, axis, values = state.lens, event.get("axis", "y"), numbers(event["values"], "fields")
+    old = lens.fields
     if len(values) == len(old.y):
         fields = dataclasses.replace(old, **{axis: old.y.new_tensor(values)})
     elif axis == "x":
         raise ValueError(f"x of the fields: found {len(values)} numbers; this lens has {len(old.y)} fields")
     else:
-        left = list(range(len(old.y)))  # fields that no y has taken
-        taken = [next((left.pop(i) for i, k in enumerate(left) if float(old.y[k]) == y), None) for y in values]
-        order = old.y.argsort(stable=True)
-        between = np.interp(values, old.y[order], old.x[order])
-        x = [float(between[i]) if k is None else float(old.x[k]) for i, k in enumerate(taken)]
-        weight = [1.0 if k is None else float(old.weight[k]) for k in taken]
-        points = old.y.new_tensor([x, values])
-        factors = factors_at(lens, points)
-        fields = dataclasses.replace(old, x=points[0], y=points[1], weight=old.y.new_tensor(weight), vignetting=factors)
+        fields = _fields_at(lens, values)
     field_points(torch.stack([fields.x, fields.y]).T.tolist(), like=lens)
     lens = dataclasses.replace(freed(lens, fields=values), fields=fields)
     check(lens)
     return edited(state, solved(lens))
+
+
+def _fields_at(lens: Lens, values: Sequence[float]) -> Fields:
+    old, left = lens.fields, list(range(len(lens.fields.y)))
+    taken = [next((left.pop(i) for i, k in enumerate(left) if float(old.y[k]) == y), None) for y in values]
+    order = old.y.argsort(stable=True)
+    x = np.interp(values, old.y[order], old.x[order])
+    points = old.y.new_tensor([[x[i] if k is None else old.x[k] for i, k in enumerate(taken)], values])
+    weight = old.y.new_tensor([1.0 if k is None else old.weight[k] for k in taken])
+    return dataclasses.replace(old, x=points[0], y=points[1], weight=weight, vignetting=factors_at(lens, points))
 
 
 def _wavelengths(state: State, event: Mapping) -> State:

@@ -225,13 +225,13 @@ function drawMtf(target, now, stored, highest) {
 
 function drawCurvature(target, now, stored, unit) {
   const found = now.curvature;
-  if (!found) return empty(target, "curvature", "no field curves: the fields are on the axis");
+  if (!found || !found.field.at(-1)) return empty(target, "curvature", "no field curves: the fields are on the axis");
   const width = target.clientWidth || 300, height = target.clientHeight || 200;
   const sources = [found, stored && stored.curvature].filter(Boolean);
   const all = sources.flatMap((one) => [one.tangential, one.sagittal].flat(2)).filter((one) => one !== null).map(Math.abs);
-  const top = 1.05 * (Math.max(0, ...all) || 1), largest = found.field.at(-1) || 1;
+  const top = 1.05 * (Math.max(0, ...all) || 1), largest = found.field.at(-1);
   const picture = figure("curvature", "", width, height, `Field curvature within ±${words(top, 3)} mm`);
-  const { at, up, curves } = axes(picture, width, height, { x: [-top, top], y: [0, largest], left: 40, xlabel: "focus from the sensor, mm", ylabel: `field, ${unit}`, ticksX: 4 });
+  const { at, up, curves } = axes(picture, width, height, { x: [-top, top], y: [Math.min(0, largest), Math.max(0, largest)], left: 40, xlabel: "focus from the sensor, mm", ylabel: `field, ${unit}`, ticksX: 4 });
   picture.append(svg("line", { x1: at(0), x2: at(0), y1: up(0), y2: up(largest), class: "zero" }));
   for (const [source, was] of [[stored && stored.curvature, true], [found, false]]) if (source) {
     ["tangential", "sagittal"].forEach((section, s) => source[section].forEach((values, w) => {
@@ -297,6 +297,11 @@ class Viewer {
     this.fieldKey = make("span", { className: "key" });
     this.problems = make("ul", { className: "problems", "aria-label": "remarks" });
     this.root.classList.add("raytrace-viewer");
+    const system = matchMedia("(prefers-color-scheme: dark)"), { body } = document;
+    const paint = () => this.root.classList.toggle("dark", body.dataset.jpThemeLight ? body.dataset.jpThemeLight === "false" : system.matches || body.classList.contains("vscode-dark"));
+    system.addEventListener("change", paint);
+    new MutationObserver(paint).observe(body, { attributes: true, attributeFilter: ["data-jp-theme-light", "class"] });
+    paint();
     this.root.replaceChildren(
       make("header", {}, this.title,
         make("span", { className: "group" }, this.undo, this.redo, this.restore),
@@ -325,9 +330,11 @@ class Viewer {
       const { dataset, value } = e.target;
       if (dataset.shown !== undefined && dataset.shown !== value) return; // the text that is being typed
       e.preventDefault();
+      e.stopPropagation(); // a notebook has the same keys
       this.event({ type: key === "y" || e.shiftKey ? "redo" : "undo" });
     } else if (key === "enter") {
       e.preventDefault();
+      e.stopPropagation();
       this.toggleOptimise();
     }
   }
@@ -360,7 +367,7 @@ class Viewer {
 
   receive(reply, event, waited) {
     if (reply.message || !["settle", "progress"].includes(event.type)) this.say(reply.message, !/^written/.test(reply.message));
-    if (reply.path) this.path.value = reply.path;
+    if (reply.path) this.path.value = this.path.title = reply.path;
     if (reply.analyses) {
       this.last = reply;
       this.prescription(reply.prescription, reply.refused);
@@ -417,7 +424,8 @@ class Viewer {
     drawCurvature(this.figures.curvature, now, stored, unitOf(this.last.prescription));
     this.transfer.textContent = now.mtf ? now.mtf.transfer : "";
     const key = (names, colours) => names.map((name, k) => make("span", { style: `--colour:${colours[k]}`, textContent: name }));
-    this.fieldKey.replaceChildren(...key(now.fields, now.field_colours));
+    const all = this.last.prescription.fields.y.length, drawn = now.fields.length;
+    this.fieldKey.replaceChildren(drawn < all ? make("i", { textContent: `${drawn} of ${all} fields` }) : "", ...key(now.fields, now.field_colours));
     this.wavelengthKey.replaceChildren(...key(now.wavelengths.map((one) => `${words(one)}`), now.wavelength_colours));
   }
 
