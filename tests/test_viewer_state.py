@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import threading
 import time
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 import raytrace as rt
 from raytrace.viewer import compute
-from raytrace.viewer.session import Session
+from raytrace.viewer.session import Optimisation, Session
 from raytrace.viewer.state import initial, merit_of, reduce, shown_fields, variables
 
 
@@ -252,6 +253,20 @@ def test_a_session_saves_where_it_is_told_and_nowhere_else(triplet, tmp_path):
     assert float(rt.read_lens(file).surfaces[3].thickness) == 3
 
 
+@pytest.fixture
+def held(monkeypatch):
+    """Optimisations wait behind their first cycle until this is set."""
+    gate, watch = threading.Event(), Optimisation._watch
+
+    def wait(work, cycle, lens):
+        watch(work, cycle, lens)
+        gate.wait(60)
+
+    monkeypatch.setattr(Optimisation, "_watch", wait)
+    yield gate
+    gate.set()
+
+
 def progress(session, ended=False, until=60):
     """The first reply of the optimisation of a session with a lens of another cycle, or at its end."""
     ends = time.monotonic() + until
@@ -270,7 +285,7 @@ def ticked(lens):
     return session
 
 
-def test_an_optimisation_shows_the_lens_of_its_cycles_and_is_one_step_of_undo(triplet):
+def test_an_optimisation_shows_the_lens_of_its_cycles_and_is_one_step_of_undo(triplet, held):
     session = ticked(triplet)
     before = session.state
     assert session.answer({"type": "optimise"})["optimisation"]["running"]
@@ -284,7 +299,9 @@ def test_an_optimisation_shows_the_lens_of_its_cycles_and_is_one_step_of_undo(tr
     assert shown["analyses"]["spots"]["rms"] != compared["stored"]["spots"]["rms"]
     reloaded = session.answer({"type": "open"})
     assert "analyses" in reloaded
+    assert reloaded["optimisation"]["running"]
     assert "path" in reloaded
+    held.set()
     last = progress(session, ended=True)
     assert last["optimisation"]["cycles"] == len(last["optimisation"]["merits"]) > 3
     assert session.optimisation is None
@@ -295,7 +312,7 @@ def test_an_optimisation_shows_the_lens_of_its_cycles_and_is_one_step_of_undo(tr
     assert session.state.lens is optimised
 
 
-def test_stop_acts_at_once_and_keeps_the_last_lens_also_while_rays_fail(triplet):
+def test_stop_acts_at_once_and_keeps_the_last_lens_also_while_rays_fail(triplet, held):
     session = ticked(triplet)
     session.answer({"type": "edit", "surface": 1, "quantity": "radius", "value": 5})
     start = session.state.lens
@@ -311,6 +328,7 @@ def test_stop_acts_at_once_and_keeps_the_last_lens_also_while_rays_fail(triplet)
     stopped = session.state.lens
     assert stopped is work.lens
     assert reply["prescription"]["rows"][1]["cells"]["curvature"] == float(stopped.surfaces[1].curvature) != 1 / 5
+    held.set()
     work.thread.join(60)
     assert not work.thread.is_alive()
     assert session.state.lens is stopped

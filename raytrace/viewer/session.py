@@ -104,7 +104,7 @@ class Session:
             return {"optimisation": document, **(refresh(self.shown) if len(work.merits) > cycles else {})}
         self.optimisation, work.is_stopped = None, True
         if work.failure:
-            return {"optimisation": document, "message": work.failure, **refresh(self.state)}
+            return {**refresh(self.state), "optimisation": document, "message": work.failure}
         if work.merits or work.result:
             self.state = edited(self.state, work.result.lens if work.result else work.lens)
         document["words"] += "; stopped" if stop else ""
