@@ -114,17 +114,21 @@ def settled(page) -> None:
     raise AssertionError("the viewer does not settle")
 
 
+def until(page, condition) -> None:
+    deadline = time.monotonic() + SECONDS / 1e3
+    while not condition():
+        assert time.monotonic() < deadline
+        page.wait_for_timeout(20)
+
+
 def changed(page, action) -> None:
     """Do something, and wait for the new numbers."""
     idle = f"{VIEWER}[aria-busy=false]"
     page.wait_for_selector(idle)
     before = count(page)
     action()
-    deadline = time.monotonic() + 60
-    while count(page) == before and time.monotonic() < deadline:
-        page.wait_for_timeout(20)
+    until(page, lambda: count(page) > before)
     page.wait_for_selector(idle)
-    assert count(page) > before
 
 
 def shown(page, name: str) -> float:
@@ -326,8 +330,8 @@ def test_an_optimisation_is_shown_stopped_and_undone_in_one_step(page):
     page.focus('[data-cell="thickness:2"]')
     page.keyboard.press("Control+Enter")
     page.wait_for_selector(f"{VIEWER}.running")
-    page.wait_for_function("Number(document.querySelector('.raytrace-viewer').dataset.cycles) > 0", timeout=SECONDS)
-    page.wait_for_function(f"Number(document.querySelector('[data-number=EFL]').dataset.value) !== {before}")
+    until(page, lambda: shown(page, "EFL") != before)
+    assert int(page.get_attribute(VIEWER, "data-cycles")) > 0
     assert glass.get_attribute("d") != outline
     assert page.evaluate("document.querySelector('.left').inert")
     page.keyboard.press("Control+Enter")
@@ -439,9 +443,9 @@ def notebook(browser):
         tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         tab.on("pageerror", lambda error: errors.append(str(error)))
         tab.expose_function("kernel", kernel)
-        for name, body in (("viewer.js", widget._esm), ("dark.html", NOTEBOOK.format(light="false"))):
-            kind = "text/javascript" if name.endswith(".js") else "text/html"
-            tab.route(f"**/{name}", lambda route, body=body, kind=kind: route.fulfill(body=body, content_type=kind))
+        page = NOTEBOOK.format(light="false")
+        tab.route("**/dark.html", lambda route: route.fulfill(body=page, content_type="text/html"))
+        tab.route("**/viewer.js", lambda route: route.fulfill(body=widget._esm, content_type="text/javascript"))
         tab.goto("http://127.0.0.1:9/dark.html")
         tab.add_style_tag(content=widget._css)
         tab.wait_for_selector(f"{VIEWER}[data-count]", timeout=SECONDS)

@@ -272,10 +272,6 @@ def _frequency(state: State, event: Mapping) -> State:
     return dataclasses.replace(state, frequency=highest)
 
 
-def _configuration(state: State, event: Mapping) -> State:
-    return edited(state, state.lens.configuration(int(event["number"])))
-
-
 def _step(state: State, source: str) -> State:
     """Undo, from "past", or redo, from "future"."""
     before = state.past if source == "past" else state.future
@@ -302,7 +298,7 @@ EVENTS: dict[str, Callable[[State, Mapping], State]] = {
     "wavelengths": _wavelengths,
     "primary": _primary,
     "aperture": _aperture,
-    "configuration": _configuration,
+    "configuration": lambda state, event: edited(state, state.lens.configuration(int(event["number"]))),
     "frequency": _frequency,
     "merit": _merit,
     "compare": lambda state, event: dataclasses.replace(state, compare=bool(event.get("on"))),

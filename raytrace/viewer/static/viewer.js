@@ -361,8 +361,10 @@ class Viewer {
       this.say(`no answer: ${error.message}; has the server ended?`, true);
     }
     this.busy = false;
-    if (this.queue && this.queue.length) this.run(this.queue.shift());
-    else this.root.setAttribute("aria-busy", "false");
+    if (this.queue && this.queue.length) return this.run(this.queue.shift());
+    this.root.setAttribute("aria-busy", "false");
+    const settle = () => this.event({ type: "settle", field: this.unsettled });
+    if (this.unsettled !== undefined && !this.running) this.settling = setTimeout(settle, event.type === "settle" ? 0 : SETTLE);
   }
 
   receive(reply, event, waited) {
@@ -374,11 +376,11 @@ class Viewer {
       this.draw();
       this.latency.textContent = `${reply.milliseconds.toFixed(0)} ms numbers, ${waited.toFixed(0)} ms with the way there`;
       this.root.dataset.milliseconds = reply.milliseconds;
+      this.unsettled = 0; // the next field whose slower analyses are missing, null for the remarks
       this.root.dataset.count = 1 + Number(this.root.dataset.count || 0);
     }
     if (event.type === "settle") this.settled(reply, event);
     if ("optimisation" in reply) this.optimised(reply.optimisation);
-    if (reply.analyses && !this.running) this.settling = setTimeout(() => this.event({ type: "settle", field: 0 }), SETTLE);
   }
 
   // Slower analyses, one field after the other, until something else happens.
@@ -397,11 +399,9 @@ class Viewer {
     if (reply.remarks) {
       this.listProblems([...this.last.problems, ...reply.remarks]);
       this.root.dataset.settled = this.root.dataset.count;
-      return;
     }
-    if ((this.queue && this.queue.length) || this.running) return;
     const next = event.field + 1;
-    this.event(next < this.last.analyses.fields.length ? { type: "settle", field: next } : { type: "settle", field: null });
+    this.unsettled = event.field === null ? undefined : next < this.last.analyses.fields.length ? next : null;
   }
 
   say(text, wrong = true) {
@@ -625,6 +625,7 @@ class Viewer {
 
   optimised(found) {
     this.running = Boolean(found && found.running);
+    clearTimeout(this.polling);
     this.optimise.textContent = this.running ? "Stop" : "Optimise";
     this.root.classList.toggle("running", this.running);
     if (this.running && this.left.contains(document.activeElement)) this.optimise.focus();
@@ -635,7 +636,7 @@ class Viewer {
     drawMerit(this.meritCurve, found.merits);
     if (!this.message.classList.contains("wrong")) this.say(`${this.running ? "optimising: " : "optimised: "}${found.words}`, false);
     this.root.dataset.cycles = found.cycles;
-    if (this.running) setTimeout(() => this.event({ type: "progress", cycles: found.cycles }), 60);
+    if (this.running) this.polling = setTimeout(() => this.event({ type: "progress", cycles: found.cycles }), 60);
   }
 
   save() {
