@@ -359,6 +359,7 @@ class Viewer {
       this.receive(reply, event, performance.now() - started);
     } catch (error) {
       this.say(`no answer: ${error.message}; has the server ended?`, true);
+      this.unsettled = undefined;
     }
     this.busy = false;
     if (this.queue && this.queue.length) return this.run(this.queue.shift());
@@ -397,7 +398,8 @@ class Viewer {
       }
     }
     if (reply.remarks) {
-      this.listProblems([...this.last.problems, ...reply.remarks]);
+      this.last.problems.push(...reply.remarks);
+      this.listProblems(this.last.problems);
       this.root.dataset.settled = this.root.dataset.count;
     }
     const next = event.field + 1;
