@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from raytrace.io import write_lens
+from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.optimize import Optimized, optimize
 from raytrace.system.lens import Lens
@@ -48,7 +49,8 @@ class Optimisation:
         if self.result is not None:
             missed = [str(one) for one in self.result.conditions if not one.met]
             before, after = self.result.merit_before, self.result.merit_after
-            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}, {self.result.stopped}", *missed])
+            reason = STOPPED[self.result.stopped]
+            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *missed])
         return f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
 
 
