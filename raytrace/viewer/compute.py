@@ -11,7 +11,6 @@ from contextlib import suppress
 
 import numpy as np
 import torch
-from matplotlib.colors import to_hex
 from torch import Tensor
 
 from raytrace.analysis.chief import field_curvature_of
@@ -58,6 +57,10 @@ def curves(values: Tensor) -> list:
     return found if there.all() else plain(found)
 
 
+def hexadecimal(colour: str | tuple[float, ...]) -> str:
+    return colour if isinstance(colour, str) else "#" + "".join(f"{round(255 * part):02x}" for part in colour)
+
+
 # -- the drawing of a lens
 
 
@@ -76,7 +79,7 @@ class Drawing:
         self._add(x, y, kind="area", fill=facecolor or color, id=gid)
 
     def _add(self, x, y, **look) -> None:
-        look |= {name: to_hex(look[name]) for name in ("stroke", "fill") if name in look}
+        look |= {name: hexadecimal(look[name]) for name in ("stroke", "fill") if name in look}
         points = np.stack(np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float)))
         self.shapes.append({**look, "points": points})
 
@@ -205,7 +208,7 @@ def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
         "fields": [field_label(lens, point) for point in fields.T.tolist()],
         "wavelengths": plain(lens.wavelengths),
         "field_colours": style.field_colours(fields.shape[1]),
-        "wavelength_colours": [to_hex(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
+        "wavelength_colours": [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
     }
     for name, analysis in {
         "layout": lambda: layout_of(lens, fields),
