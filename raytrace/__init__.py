@@ -124,6 +124,7 @@ PUBLIC = {
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
+    "element": "wave_optics.element",
     "element_lens": "wave_optics.hybrid",
     "elements": "wave_optics.compute",
     "fabricated": "wave_optics.fabrication",

@@ -124,6 +124,7 @@ from raytrace.tracing.trace import hit_jacobian as hit_jacobian
 from raytrace.viewer.widget import view as view
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf
+from raytrace.wave_optics.element import element as element
 from raytrace.wave_optics.element_files import read_element as read_element
 from raytrace.wave_optics.element_files import write_element as write_element
 from raytrace.wave_optics.fabrication import as_pixels as as_pixels

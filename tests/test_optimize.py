@@ -460,3 +460,17 @@ def test_cycles_are_limited_where_neither_they_nor_the_time_are(monkeypatch):
     assert (found.cycles, found.stopped) == (3, "cycles")
     assert paths.best_of_paths(state, start, lower=-ends, upper=ends, seconds=60).cycles > 3
     assert paths.best_of_paths(state, start, lower=-ends, upper=ends, cycles=5).cycles == 5
+
+
+def test_an_mtf_that_starts_near_zero_is_reported():
+    """Through spots first the same merit function ends far lower, and the line is gone."""
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial", fields=[0.0, 8.4])
+    unsharp = lens.at(sensor_distance=lens.surfaces[-2].thickness + 2)
+    mtf = dict(merit=rt.DefaultMerit("mtf", frequencies=[20]), vary="sensor")
+    stuck = rt.optimize(unsharp, **mtf)
+    better = rt.optimize(rt.optimize(unsharp, merit="spot", vary="sensor").lens, **mtf)
+    assert "2 of 2 rows of the MTF start below 0.1, where it hardly has a slope: minimise `merit=spot` first" in str(
+        stuck
+    )
+    assert stuck.merit_after > 0.9 * stuck.merit_before > 1.2 * better.merit_after
+    assert "rows of the MTF start" not in str(better)

@@ -15,7 +15,7 @@ from raytrace.shards import torch_threads
 
 #: Of every subject: the function, and its options in addition to --json, --repeats, --threads and --no-peers.
 _SUBJECTS = {
-    "trace": (trace.bench, ("lens", "rays", "output", "plot")),
+    "trace": (trace.bench, ("lens", "rays", "device", "output", "plot")),
     "psf": (psf.bench, ("lenses", "output", "csv", "plot")),
     "speed": (speed.bench, ("docs", "quick")),
 }

@@ -53,6 +53,7 @@ class Tracer:
     with_path: bool = True
     has_gradient: bool = True
     most: int | None = None
+    device: str = "cpu"
 
     def prepare(self) -> None:
         """Called before every timed call."""
@@ -68,13 +69,18 @@ class Tracer:
 
 class Own(Tracer):
     """This package's trace. engine: "auto" (the program's choice), "eager", or None for the current engine;
-    by_indices: gradients also with respect to the index of every medium.
+    by_indices: gradients also with respect to the index of every medium; device: of the lens and its rays.
     """
 
-    def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False):
-        self.dtype, self.with_path, self.engine = dtype, with_path, engine or current_engine()
-        self.name = "raytrace" if engine in (None, "auto") else f"raytrace, {engine}"
-        self.lens, self.wavelength = to(lens, dtype=dtype), lens.primary
+    def __init__(
+        self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False,
+        device: str = "cpu",
+    ):  # fmt: skip
+        self.dtype, self.with_path, self.engine, self.device = dtype, with_path, engine or current_engine(), device
+        parts = ["raytrace", "" if engine in (None, "auto") else engine, "" if device == "cpu" else device]
+        self.name = ", ".join(part for part in parts if part)
+        self.lens = to(lens, dtype=dtype, device=device)
+        self.wavelength = self.lens.primary
         self.surfaces, self.indices, self.leaves = leaves_of(self.lens, by_indices=by_indices)
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
@@ -195,7 +201,7 @@ def errors_of(tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradie
     surfaces, index = reference_of(lens)
     starts = list(zip(rays.position.T.tolist(), rays.direction.T.tolist(), strict=True))
     exact, count = [trace_reference(surfaces, index, *start) for start in starts], len(starts)
-    batch = some(rays, lambda x: x.repeat(*(1,) * (x.dim() - 1), copies))
+    batch = to(some(rays, lambda x: x.repeat(*(1,) * (x.dim() - 1), copies)), device=tracer.device)
     tracer.prepare()
     points, path = tracer.forward(batch)
     points = points[:, :count]
@@ -225,7 +231,7 @@ def _worst(values: Sequence[float], expected: Sequence) -> float:
 
 def clock(threads: int) -> Callable[[], float]:
     """Processor time for one thread, which other load of the machine lengthens little; else the time of day."""
-    return time.process_time if threads == 1 else time.perf_counter
+    return time.process_time if threads == 1 and not torch.cuda.is_initialized() else time.perf_counter
 
 
 def seconds_of(job: Job, calls: int, threads: int) -> float:
@@ -234,10 +240,18 @@ def seconds_of(job: Job, calls: int, threads: int) -> float:
     with torch_threads(threads):
         prepare()
         now = clock(threads)
+        wait_for_devices()
         start = now()
         for _ in range(calls):
             call()
+        wait_for_devices()
         return (now() - start) / calls
+
+
+def wait_for_devices() -> None:
+    """Until the GPU, if one is used, has finished."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
 
 
 def in_turns(
@@ -292,10 +306,12 @@ def measured_rows(
     a graph of a tracer, None for any. Tasks are timed in turns.
     """
     rays = field_rays(lens, count)
-    of_dtype = {dtype: to(rays, dtype=dtype) for dtype in {tracer.dtype for tracer, *_ in tasks}}
+    kinds = {(tracer.dtype, tracer.device) for tracer, *_ in tasks}
+    of_kind = {(dtype, device): to(rays, dtype=dtype, device=device) for dtype, device in kinds}
 
     def job(tracer: Tracer, work: str, size: int) -> Job:
-        batch, centroid = of_dtype[tracer.dtype], torch.zeros(2, dtype=tracer.dtype)
+        batch = of_kind[tracer.dtype, tracer.device]
+        centroid = torch.zeros(2, dtype=tracer.dtype, device=tracer.device)
         call = tracer.forward if work == "forward" else lambda part: tracer.gradient(part, centroid)
         if size >= count:
             return lambda: call(batch), tracer.prepare

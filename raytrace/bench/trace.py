@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import torch
+
 from raytrace.bench.figures import trace_figure
 from raytrace.bench.measure import (
     COLUMNS,
@@ -36,6 +38,13 @@ def bench(request: Request) -> Measured:
     if not bool(field_rays(lens, 1000).valid.all()):
         raise CommandError(f"{name}: rays of the middle field fail at launch; choose another lens")
     tracers = [Own(lens, dtype, with_path=path) for dtype in DTYPES for path in (True, False)]
+    if arguments.device:
+        try:
+            torch.empty(0, device=arguments.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise CommandError(f"--device {arguments.device}: torch cannot use this device ({reason})") from None
+        tracers += [Own(lens, dtype, with_path=True, device=arguments.device) for dtype in DTYPES]
     tracers += request.peers.peers(lens) if request.peers else []
     steps = len(counts) * repeats * sum(1 + tracer.has_gradient for tracer in tracers)
     with progress(steps, "call", what="measuring") as bar:

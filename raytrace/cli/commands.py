@@ -599,6 +599,7 @@ COMMANDS = (
             nargs="+",
             help="trace: numbers of rays (default 1000 10000 100000 1000000)",
         ),
+        option("--device", metavar="NAME", help="trace: device to trace on as well, such as cuda"),
         option("--repeats", metavar="N", type=count, default=5, help="runs, whose median is reported"),
         option("--threads", metavar="N", type=count, help="threads of torch"),
         option("--no-peers", action="store_true", help="leave out Optiland even if it is installed"),

@@ -46,6 +46,7 @@ from raytrace.optimization.least_squares import (
     minimise,
 )
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, arguments, configurations_of, merit_for
+from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import (
     RELATIONS,
@@ -519,6 +520,7 @@ def _groups(found) -> list[tuple[int, str]]:
 # -- result ------------------------------------------------------------------------------------------------------------
 
 _SHOWN = 12  # rows of the merit function in the text, those of largest contribution
+_UNSHARP = 0.1  # MTF, of a start from which an MTF merit function is far from its maximum
 
 
 def _glass_table(steps: Sequence[GlassStep]) -> Table:
@@ -637,6 +639,7 @@ class Optimized(Result):
             f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            *self._unsharp_start(),
             "",
         ]
         variables = {
@@ -649,6 +652,15 @@ class Optimized(Result):
         rows = rows._replace(notes=[*rows.notes, *(["", *conditions] if conditions else [])])
         glasses = [_glass_table(self.glasses)] if self.glasses else []
         return [Table(variables, head), *glasses, *([self._lengths()] if self.has_configurations else []), rows]
+
+    def _unsharp_start(self) -> list[str]:
+        """A line where most rows of the MTF start near zero: there it has side lobes, and hardly a slope."""
+        rows = [k for k, row in enumerate(self.merit) if row.operand in MODULATION and row.weight != 0]
+        low = int((self.values_before[rows].abs() < _UNSHARP).sum())
+        if 2 * low <= len(rows):
+            return []
+        hint = "minimise `merit=spot` first, then the MTF from its result"
+        return [f"  {low} of {len(rows)} rows of the MTF start below {_UNSHARP:g}, where it hardly has a slope: {hint}"]
 
     def _lengths(self) -> Table:
         """Focal lengths of every configuration, and its part of the merit that is left."""
@@ -708,7 +720,7 @@ class Optimized(Result):
         return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def save(self, path: str | PathLike) -> None:
-        """Write the lens, with its variables and its merit function."""
+        """Write the lens, with its variables and its merit function; a file does not hold the constraints of `hold`."""
         write_lens(self.lens, path)
 
 

@@ -2,7 +2,7 @@
 
 curvature thickness           all refracting and reflecting surfaces; all gaps from surface 1 to the image
 curvature:1-4,7 conic:3 a4:3  of some surfaces
-tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose
+tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose; of the image, too
 sensor                        the last gap
 index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
 thickness:6@2                 in configuration 2, of a number that differs between configurations
@@ -314,8 +314,9 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
     """The numbers of a surface that a kind stands for."""
     if kind == "thickness" and k == 0 and bool(torch.isfinite(lens.surfaces[0].thickness)):
         return [kind]
-    if not 1 <= k <= sensor(lens):
-        raise BadVariables(f"{word!r}: surface {k}; this lens has surfaces 1 to {sensor(lens)} to vary")
+    last = sensor(lens) if kind in ("thickness", *MEDIA) else sensor(lens) + 1  # nothing is behind the image
+    if not 1 <= k <= last:
+        raise BadVariables(f"{word!r}: surface {k}; this lens has surfaces 1 to {last} to vary")
     surface = lens.surfaces[k]
     if kind in MEDIA:
         if surface.is_mirror or surface.is_break or is_air(surface.glass):

@@ -20,8 +20,9 @@ from raytrace.maths.numerics import check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
-from raytrace.system.configurations import Operand
-from raytrace.system.optimization_data import OptimizationData
+from raytrace.system.configurations import Operand, ScaledPath
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean
@@ -204,7 +205,8 @@ class Lens:
     def replace(self, surface: int, **numbers) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
-        surface: its number in the file, 0 the object; numbers: fields of Surface, or radius (mm); plain numbers, or
+        surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
+        x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a Glass. Raises ValueError naming what the surface does not have.
         """
         if not 0 <= surface < len(self.surfaces):
@@ -215,15 +217,35 @@ class Lens:
         return multiple.kept(found) if self.operands else found
 
 
+#: Fields of a surface and of its pose, by the name of a number of a pose: tilt_x; behind the surface, tilt_x_after.
+_POSED = {
+    field.name + behind: (side, field.name)
+    for side, behind in (("before", ""), ("after", "_after"))
+    for field in dataclasses.fields(Pose)
+}
+
+# Plain data of a lens, for torch.load; values are known to it already (`numerics.value`).
+torch.serialization.add_safe_globals([OptimizationData, Row, ScaledPath, Solve, Vary])
+
+
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
-    """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature."""
+    """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature;
+    tilt_x, … and tilt_x_after, …: of its poses, whose other numbers stay."""
     known = [field.name for field in dataclasses.fields(Surface)]
     numeric = {field.name for field in dataclasses.fields(Surface) if field.type in (Tensor, Tensor | None)}
     given = dict(numbers)
     for name in given:
-        if name not in (*known, "radius"):
-            meant = did_you_mean(name, [*known, "radius"])
-            raise ValueError(f"{where} has no {name!r}{meant} (it has {', '.join(known)}, radius)")
+        if name not in (*known, "radius", *_POSED):
+            meant = did_you_mean(name, [*known, "radius", *_POSED])
+            listed = ", ".join([*known, "radius", *_POSED])
+            raise ValueError(f"{where} has no {name!r}{meant} (it has {listed})")
+    for name in [name for name in given if name in _POSED]:
+        side, field = _POSED[name]
+        if side in numbers:
+            raise ValueError(f"{where}: both {side} and {name} are given; leave one out")
+        given[side] = dataclasses.replace(
+            given.get(side) or getattr(surface, side) or Pose(), **{field: given.pop(name)}
+        )
     if "radius" in given:
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")

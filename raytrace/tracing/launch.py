@@ -28,6 +28,7 @@ from raytrace.maths.numerics import (
     detached,
     dot,
     dot_2,
+    is_any,
     safe_divide,
     safe_sqrt,
     select,
@@ -173,9 +174,9 @@ def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays
 def is_at_infinity(lens: Lens) -> bool:
     """Whether the object, or every object of a batch, is at infinity. Raises ValueError for a batch that mixes."""
     infinite = torch.isinf(lens.surfaces[0].thickness.detach())
-    if bool(infinite.all()):
+    if not is_any(~infinite):
         return True
-    if bool(infinite.any()):
+    if is_any(infinite):
         raise ValueError("object distances mix infinity and finite ones in one batch: trace them in two")
     return False
 
@@ -290,7 +291,7 @@ def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> 
 def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
     """As `_signed`; warns MarginalRayLost."""
     radius, arrives = _stop_radius(lens, paraxial, entrance)
-    if arrives is not None and not bool(arrives.all()):
+    if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=calling_level())
     return _signed(radius, paraxial, entrance)

@@ -83,7 +83,7 @@ class Gaussian(NamedTuple):
 
     @property
     def effective_focal_length(self):
-        return -abs(self.n_image) / self.C
+        return quotient(-abs(self.n_image), self.C)
 
     @property
     def entrance_pupil_position(self):
