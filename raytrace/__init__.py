@@ -46,6 +46,7 @@ PUBLIC = {
     "Glass": "materials.glass",
     "UnknownGlass": "materials.catalogs",
     "find_glass": "materials.catalogs",
+    "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
     "refractive_index": "materials.glass",
     # rays

@@ -52,6 +52,7 @@ from raytrace.io.ray_tables import read_rays as read_rays
 from raytrace.io.zemax.optimization import read_merit as read_merit
 from raytrace.materials.catalogs import UnknownGlass as UnknownGlass
 from raytrace.materials.catalogs import find_glass as find_glass
+from raytrace.materials.catalogs import nearest_glasses as nearest_glasses
 from raytrace.materials.glass import AIR as AIR
 from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import MIRROR as MIRROR
