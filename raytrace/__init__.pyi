@@ -34,6 +34,7 @@ from raytrace.imaging.image import blur_layers as blur_layers
 from raytrace.imaging.image import count_electrons as count_electrons
 from raytrace.imaging.image import depth_masks as depth_masks
 from raytrace.imaging.image import digitise as digitise
+from raytrace.imaging.image import transfer_functions as transfer_functions
 from raytrace.imaging.restoration import depth_invariant_wiener as depth_invariant_wiener
 from raytrace.imaging.restoration import power_law as power_law
 from raytrace.imaging.restoration import power_spectrum as power_spectrum
@@ -51,6 +52,7 @@ from raytrace.io.ray_tables import read_rays as read_rays
 from raytrace.io.zemax.optimization import read_merit as read_merit
 from raytrace.materials.catalogs import UnknownGlass as UnknownGlass
 from raytrace.materials.catalogs import find_glass as find_glass
+from raytrace.materials.catalogs import nearest_glasses as nearest_glasses
 from raytrace.materials.glass import AIR as AIR
 from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import MIRROR as MIRROR

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.catalogs import find_glass
-from raytrace.materials.glass import AIR, MIRROR, Glass, check_unit, constant, model_glass
+from raytrace.materials.catalogs import medium
+from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
 from raytrace.words import named_value
@@ -98,19 +98,6 @@ def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surf
         return changed(Surface(_tensor(0.0)), cells, where, like=_tensor(0.0))
     except (TypeError, ValueError) as error:
         raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
-
-
-def medium(glass: Glass | str | float | Sequence[float], catalogs: Sequence[str] = (), where: str = "") -> Glass:
-    """A glass by its name, its index, (nd, Vd) or (nd, Vd, ΔPgF); a Glass passes as it is."""
-    if isinstance(glass, Glass):
-        return glass
-    if isinstance(glass, str):
-        word = glass.strip().upper()
-        known = {"": AIR, "AIR": AIR, "MIRROR": MIRROR}
-        return known[word] if word in known else find_glass(glass.strip(), catalogs=catalogs, where=where)
-    if isinstance(glass, Sequence):
-        return model_glass(*glass)
-    return AIR if not isinstance(glass, Tensor) and float(glass) == 1 else constant(glass)
 
 
 def _aperture(apertures: Mapping[str, float]) -> SystemAperture:

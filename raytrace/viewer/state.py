@@ -22,7 +22,6 @@ from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
-from raytrace.system.prescription import medium
 from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
 
@@ -135,7 +134,7 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
     if not 0 <= surface < len(lens.surfaces):
         raise ValueError(f"{what}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
     if quantity == "glass":
-        lens = lens.replace(surface, glass=medium(str(text), lens.catalogs, f"surface {surface}"))
+        lens = lens.replace(surface, glass=str(text))
     elif quantity == "semi_diameter":
         size = number(text, what) if str(text).strip() else None
         if size is not None and not 0 <= size < math.inf:
