@@ -147,6 +147,7 @@ PUBLIC = {
     "power_spectrum": "imaging.restoration",
     "psnr": "imaging.restoration",
     "restore": "imaging.restoration",
+    "transfer_functions": "imaging.image",
     "wiener": "imaging.restoration",
     "Camera": "imaging",
     "PhaseVariables": "imaging",
@@ -160,6 +161,8 @@ __all__ = [*PUBLIC]
 
 
 def __getattr__(name: str):
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("raytrace")
     if name not in PUBLIC:
         raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
     place, _, own = PUBLIC[name].partition(":")

@@ -94,7 +94,7 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
     lost = []
 
     def recorded(problem, x, **bounds):
-        there = opened(problem, x, **bounds)
+        there = opened(problem, x, **bounds).x
         lost.append([problem.state(one, False).lost for one in (x, there)])
         return there
 

@@ -147,18 +147,19 @@ def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freed
         if data is None or not data.variables:
             raise BadVariables("the file has no variables: `vary` names them, as 'curvature thickness'")
         return Freedom(lens, data.variables, of_file)
-    if not isinstance(vary, str) and not all(isinstance(one, str) for one in vary):
+    listed = [vary] if isinstance(vary, str) else vary
+    variables: dict[str, Vary] = {name_of(one): one for one in listed if not isinstance(one, str)}
+    words = split_words([one for one in listed if isinstance(one, str)])
+    if variables and not words:
         return Freedom(lens, tuple(vary), of_file)
-    words = split_words(vary)
     new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
-    variables: dict[str, Vary] = {}
     for word in words:
         if "=" not in word:
             solved = set() if ":" in word or word == "sensor" else _addresses((*new, *of_file))
             variables |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & solved}
     if not variables:
         raise BadVariables(
-            f"`vary={joined(vary)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
+            f"`vary={joined(words)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
         )
     free, solved = _addresses(variables.values()), _addresses(new)
     for surface, quantity, *_ in free & solved:

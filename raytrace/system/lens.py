@@ -81,6 +81,19 @@ class Fields:
         return FIELD_UNITS[self.kind]
 
 
+#: Methods of modules and tensors of torch that a lens, a value, lacks: the function in their place.
+_IN_TORCH = {
+    **dict.fromkeys(
+        ("to", "cpu", "cuda", "float", "double", "dtype", "device"),
+        "; `rt.to(lens, dtype=…, device=…)` converts it, and its tensors have dtype and device",
+    ),
+    **dict.fromkeys(
+        ("parameters", "named_parameters", "requires_grad_", "train", "state_dict", "load_state_dict"),
+        '; it is a value: `rt.Variables(lens, "curvature thickness")` is the module of its numbers',
+    ),
+}
+
+
 @value
 class Lens:
     """A sequential lens in mm and µm. `lens.surfaces[k]` is surface k of the file: 0 the object, the last the image.
@@ -129,6 +142,9 @@ class Lens:
     def primary(self) -> Tensor:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
+
+    def __getattr__(self, name: str):
+        raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
 
     def __str__(self) -> str:
         from raytrace.tracing.lens_report import text

@@ -358,6 +358,20 @@ def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
     return torch.stack([x + (xx * pupil[0] + xy * pupil[1]), y + (xy * pupil[0] + yy * pupil[1])])
 
 
+def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
+    """Vignetting factors (5, F) of fields (2, F), as of `Fields`: those of the lens at its own fields, else of the map
+    between them, whose matrix is turned to be diagonal by tan 2 VAN = 2 M_xy / (M_xx - M_yy); None without factors."""
+    if lens.fields.vignetting is None:
+        return None
+    maps = _map_of(lens, fields)
+    xx, xy, yy = maps[2:]
+    angle = torch.where(xy.abs() > 1e-12, 0.5 * torch.atan2(2 * xy, xx - yy), 0.0)
+    x, y, xx, _, yy = _rotated(maps, torch.cos(angle), -torch.sin(angle))
+    between = torch.stack([x, y, 1 - xx, 1 - yy, torch.rad2deg(angle)])
+    same = (torch.stack([lens.fields.x, lens.fields.y])[:, :, None] == fields[:, None]).all(0)
+    return torch.where(same.any(0), lens.fields.vignetting[:, same.to(torch.int64).argmax(0)], between)
+
+
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
     """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...)."""
     listed = torch.stack([lens.fields.x, lens.fields.y]).reshape(2, -1, *(1,) * (field.dim() - 1))
