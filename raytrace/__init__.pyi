@@ -86,7 +86,7 @@ from raytrace.psf_models import Psf as Psf
 from raytrace.psf_models import Wave as Wave
 from raytrace.psf_models import psf as psf
 from raytrace.system.apertures import Aperture as Aperture
-from raytrace.system.batch import batch as batch
+from raytrace.system.lens import batch as batch
 from raytrace.system.lens import Fields as Fields
 from raytrace.system.lens import Lens as Lens
 from raytrace.system.lens import SystemAperture as SystemAperture

@@ -29,8 +29,7 @@ from raytrace.maths.result import Table, axis
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
-from raytrace.system.batch import aligned
-from raytrace.system.lens import Lens, vector, with_sensor_distance
+from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Memo, Scene

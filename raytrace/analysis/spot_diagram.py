@@ -15,9 +15,9 @@ from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
 from raytrace.maths.sampling import gauss_rings, hexapolar, sampled, sobol, with_rim
 from raytrace.plotting import style
-from raytrace.system.batch import aligned
 from raytrace.system.lens import (
     Lens,
+    aligned,
     field_label,
     field_points,
     field_title,

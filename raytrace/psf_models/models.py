@@ -27,8 +27,7 @@ from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
-from raytrace.system.batch import one_lens
-from raytrace.system.lens import Lens, field_points, with_object_distance
+from raytrace.system.lens import Lens, field_points, one_lens, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order

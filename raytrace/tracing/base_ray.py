@@ -16,8 +16,7 @@ from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, dot, is_any, safe_sqrt, unit, value, varies
-from raytrace.system.batch import batch_shape
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, batch_shape, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind

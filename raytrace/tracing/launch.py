@@ -37,11 +37,11 @@ from raytrace.maths.numerics import (
     varies,
 )
 from raytrace.maths.sampling import gauss_rings
-from raytrace.system.batch import aligned
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,
     Lens,
+    aligned,
     field_points,
     index_behind,
     name_of_field,

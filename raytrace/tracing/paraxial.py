@@ -12,8 +12,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
 from raytrace.maths.result import flat
-from raytrace.system.batch import aligned
-from raytrace.system.lens import Lens, is_round_about_axis, media
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
 

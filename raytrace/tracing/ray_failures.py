@@ -9,8 +9,7 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import value
 from raytrace.maths.sampling import hexapolar
-from raytrace.system.batch import one_lens
-from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order

@@ -19,8 +19,7 @@ from raytrace.files import write_atomically
 from raytrace.io.ray_tables import read_rays
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.system.batch import aligned, one_lens
-from raytrace.system.lens import Lens, field_points, media, vector, wavelengths_of
+from raytrace.system.lens import Lens, aligned, field_points, media, one_lens, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling

@@ -17,8 +17,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, value, varies
 from raytrace.system.apertures import SHAPES
-from raytrace.system.batch import aligned
-from raytrace.system.lens import Lens, is_round_about_axis, media, with_object_distance
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
