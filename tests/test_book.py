@@ -101,6 +101,7 @@ def failing(folder: Path) -> dict:
         "BadPrescription": lambda: rt.lens([row | {"glas": "N-BK7"}, row], stop=1, f_number=5),
         "BadMerit": lambda: rt.search(triplet),
         "NoProblem": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0),
+        "BadTolerance": lambda: rt.perturbed(triplet, [rt.Tolerance("radius", (40,), -0.1, 0.1)], [0.0]),
         "OutOfReach": lambda: rt.wavefront(triplet, fields=[80]),
         "NoFocus": lambda: rt.focus(triplet, fields=[80]),
         "NothingToShow": lambda: rt.distortion(triplet, fields=[0]),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -405,6 +406,12 @@ def test_a_plane_inside_glass_belongs_to_the_element_and_a_mirror_inside_glass_t
     mirror = rt.Surface(-zero, glass=rt.MIRROR)
     surfaces = (*nominal.surfaces[:2], mirror, rt.Surface(zero), nominal.surfaces[-1])
     assert rt.lens_elements(dataclasses.replace(nominal, surfaces=surfaces)) == [(1, 3)]
+
+
+def test_the_page_of_kinds_is_that_of_the_table():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "tolerances.md").read_text("utf-8")
+    for name, kind in KINDS.items():
+        assert f"| `{name}` | {kind.unit} | {kind.operand} | {kind.words} |" in page
 
 
 # -- random errors ----------------------------------------------------------------------------------------------------

@@ -17,14 +17,13 @@ PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linea
 import dataclasses
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import Sag, polynomial_xy, powers, zernike_to_powers
+from raytrace.maths.bivariate import Sag, polynomial_xy, powers, shifted, zernike_to_powers
 from raytrace.maths.numerics import broadcast_shape, polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
@@ -442,7 +441,7 @@ def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor
     given = SAG_TERMS[type(sag_terms).__name__].powers(sag_terms)
     terms = _scaled(coefficients, given.radius / radius)
     if isinstance(sag_terms, FringeSag | PowerSag):
-        height, terms = _about(terms, given)
+        height, terms = shifted(terms, given.centre_x / given.radius, given.centre_y / given.radius)
         given = dataclasses.replace(given, height=given.height + height)
     entries = itertools.zip_longest(given.coefficients.unbind(0), terms, fillvalue=zero)
     sums = [a if b is zero else b if a is zero else a + b for a, b in entries]
@@ -453,18 +452,6 @@ def _scaled(coefficients: Tensor, factor: Tensor) -> list[Tensor]:
     """The coefficients of powers of x/(f R) in place of x/R."""
     degrees = [sum(power) for power in powers(len(coefficients))]
     return [a * factor**degree for degree, a in zip(degrees, coefficients.unbind(0), strict=True)]
-
-
-def _about(terms: Sequence[Tensor], frame: PowerSag) -> tuple[Tensor, list[Tensor]]:
-    """Height and coefficients about a centre, of powers of x/R and y/R about the vertex; x = x_0 + R u."""
-    x, y = frame.centre_x / frame.radius, frame.centre_y / frame.radius
-    order, sums = powers(len(terms)), {}
-    for (i, j), a in zip(order, terms, strict=True):
-        for p in range(i + 1):
-            for q in range(j + 1):
-                part = math.comb(i, p) * math.comb(j, q) * a * x ** (i - p) * y ** (j - q)
-                sums[p, q] = sums[p, q] + part if (p, q) in sums else part
-    return sums[0, 0], [sums.get(power, torch.zeros_like(terms[0])) for power in order]
 
 
 def _with_heights(grid: GridSag | SplineSag, coefficients: Tensor, radius: Tensor) -> GridSag | SplineSag:
