@@ -93,6 +93,15 @@ PUBLIC = {
     "Searched": "optimization.search",
     "optimize": "optimization.optimize",
     "search": "optimization.search",
+    # errors of manufacture
+    "BadTolerance": "tolerancing.tolerances",
+    "Compensator": "system.tolerance_data",
+    "Tolerance": "system.tolerance_data",
+    "Tolerances": "tolerancing.tolerances",
+    "cemented_groups": "tolerancing.elements",
+    "draw_errors": "tolerancing.sampling",
+    "lens_elements": "tolerancing.elements",
+    "perturbed": "tolerancing.perturbation",
     # images and analyses
     "Memo": "tracing.scene",
     "DRT": "psf_models",

@@ -106,6 +106,14 @@ from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
 from raytrace.system.rays import Rays as Rays
 from raytrace.system.surface import Surface as Surface
+from raytrace.system.tolerance_data import Compensator as Compensator
+from raytrace.system.tolerance_data import Tolerance as Tolerance
+from raytrace.tolerancing.elements import cemented_groups as cemented_groups
+from raytrace.tolerancing.elements import lens_elements as lens_elements
+from raytrace.tolerancing.perturbation import perturbed as perturbed
+from raytrace.tolerancing.sampling import draw_errors as draw_errors
+from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance
+from raytrace.tolerancing.tolerances import Tolerances as Tolerances
 from raytrace.tracing.base_ray import BaseRay as BaseRay
 from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiled import prepare as prepare

@@ -107,6 +107,7 @@ def failing(folder: Path) -> dict:
         "BadMerit": lambda: rt.search(triplet),
         "NoProblem": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0),
         "BadSearch": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0, folder="minima"),
+        "BadTolerance": lambda: rt.perturbed(triplet, [rt.Tolerance("radius", (40,), -0.1, 0.1)], [0.0]),
         "OutOfReach": lambda: rt.wavefront(triplet, fields=[80]),
         "NoFocus": lambda: rt.focus(triplet, fields=[80]),
         "NothingToShow": lambda: rt.distortion(triplet, fields=[0]),
