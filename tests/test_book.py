@@ -159,9 +159,10 @@ def test_expressions_of_coming_from_another_program_run():
     cells = re.findall(r"^\|[^|]+\|([^|]+)\|$", page, re.M)
     code = {text for cell in cells for text in re.findall(r"`([^`]+)`", cell) if "…" not in text}
     calls = {text for text in code if re.match(r"(rt|lens)\..*\)", text)}
-    names = {"rt": rt, "lens": rt.read_lens("scan_lens"), "images": torch.ones(1, 9, 9), "kernels": torch.ones(3, 3)}
+    names = {"rt": rt, "lens": rt.read_lens("double_gauss"), "images": torch.ones(1, 9, 9), "kernels": torch.ones(3, 3)}
     for text in sorted(calls - {'rt.psf(lens, "wave")', "rt.Camera(variables, network)"}):
-        assert eval(text, names) is not None, text
+        of = {"lens": rt.read_lens("scan_lens")} if "configuration" in text else {}
+        assert eval(text, names | of) is not None, text
     assert len(calls) >= 10
     known = {name for verb in rt.PUBLIC for name in options(getattr(rt, verb))} | {*options(names["lens"].at)}
     options_alone = {match[1] for text in code if (match := re.match(r"(\w+)=", text))}
