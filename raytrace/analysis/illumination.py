@@ -94,7 +94,7 @@ def _illumination(lens: Lens, fields: Tensor, *, marked: bool = False) -> Relati
     # Where light comes through a small part of the pupil alone, the slopes of the map are not known from it.
     fitted, known = zernike.fit_known(front.direction[:2], basis, light, worst=_WORST_CONDITION)
     lit = front.valid
-    if is_clipped(scene, points):
+    if not bool(front.valid.all()) and is_clipped(scene, points):
         points, weights = arms_of(scene, _CLEAR[1]).rule(_CLEAR[0])
         lit = torch.ones_like(weights, dtype=torch.bool)
         slopes = (slope.movedim(0, -2) for slope in zernike.gradients(orders, *points))
