@@ -46,6 +46,7 @@ PUBLIC = {
     "Glass": "materials.glass",
     "UnknownGlass": "materials.catalogs",
     "find_glass": "materials.catalogs",
+    "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
     "refractive_index": "materials.glass",
     # rays
@@ -91,6 +92,15 @@ PUBLIC = {
     "Searched": "optimization.search",
     "optimize": "optimization.optimize",
     "search": "optimization.search",
+    # errors of manufacture
+    "BadTolerance": "tolerancing.tolerances",
+    "Compensator": "system.tolerance_data",
+    "Tolerance": "system.tolerance_data",
+    "Tolerances": "tolerancing.tolerances",
+    "cemented_groups": "tolerancing.elements",
+    "draw_errors": "tolerancing.sampling",
+    "lens_elements": "tolerancing.elements",
+    "perturbed": "tolerancing.perturbation",
     # images and analyses
     "Memo": "tracing.scene",
     "DRT": "psf_models",
@@ -124,6 +134,7 @@ PUBLIC = {
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
+    "element": "wave_optics.element",
     "element_lens": "wave_optics.hybrid",
     "elements": "wave_optics.compute",
     "fabricated": "wave_optics.fabrication",
@@ -144,6 +155,7 @@ PUBLIC = {
     "power_spectrum": "imaging.restoration",
     "psnr": "imaging.restoration",
     "restore": "imaging.restoration",
+    "transfer_functions": "imaging.image",
     "wiener": "imaging.restoration",
     "Camera": "imaging",
     "PhaseVariables": "imaging",
@@ -157,6 +169,8 @@ __all__ = [*PUBLIC]
 
 
 def __getattr__(name: str):
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("raytrace")
     if name not in PUBLIC:
         raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
     place, _, own = PUBLIC[name].partition(":")

@@ -34,6 +34,7 @@ from raytrace.imaging.image import blur_layers as blur_layers
 from raytrace.imaging.image import count_electrons as count_electrons
 from raytrace.imaging.image import depth_masks as depth_masks
 from raytrace.imaging.image import digitise as digitise
+from raytrace.imaging.image import transfer_functions as transfer_functions
 from raytrace.imaging.restoration import depth_invariant_wiener as depth_invariant_wiener
 from raytrace.imaging.restoration import power_law as power_law
 from raytrace.imaging.restoration import power_spectrum as power_spectrum
@@ -51,6 +52,7 @@ from raytrace.io.ray_tables import read_rays as read_rays
 from raytrace.io.zemax.optimization import read_merit as read_merit
 from raytrace.materials.catalogs import UnknownGlass as UnknownGlass
 from raytrace.materials.catalogs import find_glass as find_glass
+from raytrace.materials.catalogs import nearest_glasses as nearest_glasses
 from raytrace.materials.glass import AIR as AIR
 from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import MIRROR as MIRROR
@@ -103,6 +105,14 @@ from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
 from raytrace.system.rays import Rays as Rays
 from raytrace.system.surface import Surface as Surface
+from raytrace.system.tolerance_data import Compensator as Compensator
+from raytrace.system.tolerance_data import Tolerance as Tolerance
+from raytrace.tolerancing.elements import cemented_groups as cemented_groups
+from raytrace.tolerancing.elements import lens_elements as lens_elements
+from raytrace.tolerancing.perturbation import perturbed as perturbed
+from raytrace.tolerancing.sampling import draw_errors as draw_errors
+from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance
+from raytrace.tolerancing.tolerances import Tolerances as Tolerances
 from raytrace.tracing.base_ray import BaseRay as BaseRay
 from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiled import prepare as prepare
@@ -123,6 +133,7 @@ from raytrace.tracing.trace import hit_jacobian as hit_jacobian
 from raytrace.viewer.widget import view as view
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf
+from raytrace.wave_optics.element import element as element
 from raytrace.wave_optics.element_files import read_element as read_element
 from raytrace.wave_optics.element_files import write_element as write_element
 from raytrace.wave_optics.fabrication import as_pixels as as_pixels

@@ -34,6 +34,8 @@ _KINDS = {
     **{Tensor: "a tensor", str: "a text", os.PathLike: "a path", Path: "a path", int: "a whole number"},
     **{float: "a number", Sequence: "a sequence", Iterable: "a sequence", tuple: "a pair", Callable: "a function"},
 }
+#: Values that functions make, by the name of their class: how to get one.
+_MADE = {"Element": "an Element of rt.elements (a name, a file) or rt.element (an array)"}
 
 
 @functools.cache
@@ -140,17 +142,18 @@ def _lens(verb: str, name: str, value: object) -> Lens:
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
     """A value of one of some classes; where tensors are expected alone, numbers become one, float64."""
-    words = isinstance(value, (str, bytes))
+    is_text = isinstance(value, (str, bytes))
     numeric = isinstance(value, (Real, list, tuple)) or hasattr(value, "tolist")
     if kinds == {Tensor} and isinstance(value, Real):
         return torch.tensor(_number(verb, name, value), dtype=torch.float64)
-    if isinstance(value, tuple(kinds)) and not (words and str not in kinds):
+    if isinstance(value, tuple(kinds)) and not (is_text and str not in kinds):
         return value
     if (kinds & {Tensor, float} and numeric) or (kinds & {int} and isinstance(value, Integral)):
         return value
-    if kinds & _ITERABLE and isinstance(value, Iterable) and not words:
+    if kinds & _ITERABLE and isinstance(value, Iterable) and not is_text:
         return value
-    expected = " or ".join(sorted({_KINDS.get(kind) or with_article(kind.__name__) for kind in kinds}))
+    words = {_KINDS.get(kind) or _MADE.get(kind.__name__) or with_article(kind.__name__) for kind in kinds}
+    expected = " or ".join(sorted(words))
     raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}")
 
 

@@ -54,7 +54,9 @@ def known_option(verb: str, word: str, names: tuple[str, ...], options: Mapping,
 
 def nameless(value: object, names: Iterable[str]) -> str:
     """The message for a value without the name of its option; names: options that take a name."""
-    return f"{named_value(value)} is given without a name; write name=value (options: {', '.join(names)})"
+    names = [*names]
+    where = f"write name=value (options: {', '.join(names)})" if names else "it takes no further value; leave it out"
+    return f"{named_value(value)} is given without a name; {where}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

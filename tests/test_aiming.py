@@ -14,7 +14,7 @@ from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS
 from raytrace.io.source import Place, decode
 from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
-from raytrace.tracing.trace import aiming_of, at_stop
+from raytrace.tracing.trace import aiming_of, at_stop, trace_lens
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
@@ -165,3 +165,25 @@ def test_derivatives_of_an_aimed_beam_are_finite_for_an_object_at_infinity():
     )  # fmt: skip
     (slope,) = torch.autograd.grad(launch(lens, RIM).position.sum(), tilt)
     assert slope.isfinite()
+
+
+@pytest.mark.parametrize("aiming", ["paraxial", "real"])
+@pytest.mark.parametrize("name", ["double_gauss", "folded_relay"])
+def test_aimed_rays_of_a_batch_of_lenses_are_those_of_each(name, aiming):
+    """Launch and trace inside `torch.func.vmap`, and derivatives of each lens."""
+    lens = rt.read_lens(name).at(ray_aiming=aiming)
+    pupil, bend = rt.gauss_rings(2)[0], lens.surfaces[2].curvature
+
+    def hits(change):
+        variant = lens.replace(2, curvature=bend + change)
+        return trace_lens(variant, launch(variant, pupil), variant.wavelengths[:, None]).position
+
+    def energy(change):
+        return hits(change).square().sum()
+
+    changes = vector(0.0, 3e-5, -2e-5)
+    batch = torch.func.vmap(hits)(changes)
+    assert torch.allclose(batch, torch.stack([hits(change) for change in changes]), rtol=0, atol=1e-12)
+    slopes = torch.func.vmap(torch.func.grad(energy))(changes)
+    expected = [torch.autograd.functional.jacobian(energy, change) for change in changes]
+    assert torch.allclose(slopes, torch.stack(expected), rtol=1e-12, atol=0)

@@ -1,5 +1,6 @@
 """The book: its notebooks run, are short, assert their figures, and mention only names and commands that exist."""
 
+import inspect
 import os
 import re
 import shlex
@@ -9,6 +10,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 
 import raytrace as rt
 from raytrace.cli import build_parser
@@ -94,6 +96,9 @@ def failing(folder: Path) -> dict:
     (folder / "grid.zmx").write_text(text.replace("TYPE STANDARD", "TYPE GRID_SAG", 1), "utf-8")
     lens, triplet = rt.read_lens("double_gauss"), rt.read_lens("cooke_triplet")
     row = {"radius": 50, "thickness": 5}
+    (folder / "minima").mkdir()
+    (folder / "minima" / "search.jsonl").write_text('{"seed": 1}\n', "utf-8")
+    pinhole = triplet.replace(triplet.stop, apertures=(rt.Aperture("circular", (0.0, 1.5)),))
     return {
         "LensFileError": lambda: rt.read_lens("lens.xyz"),
         "UnsupportedSurface": lambda: rt.read_lens("grid.zmx"),
@@ -101,19 +106,25 @@ def failing(folder: Path) -> dict:
         "BadPrescription": lambda: rt.lens([row | {"glas": "N-BK7"}, row], stop=1, f_number=5),
         "BadMerit": lambda: rt.search(triplet),
         "NoProblem": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0),
+        "BadSearch": lambda: rt.search(triplet, merit="spot", vary="curvature", starts=0, folder="minima"),
+        "BadTolerance": lambda: rt.perturbed(triplet, [rt.Tolerance("radius", (40,), -0.1, 0.1)], [0.0]),
         "OutOfReach": lambda: rt.wavefront(triplet, fields=[80]),
         "NoFocus": lambda: rt.focus(triplet, fields=[80]),
         "NothingToShow": lambda: rt.distortion(triplet, fields=[0]),
         "LostRays": lambda: rt.spot(lens, fields=[80]),
         "UnfilledStop": lambda: rt.spot(lens),
+        "Incomplete": lambda: rt.wavefront(pinhole, fields=[0]),
     }
 
 
 def test_page_of_errors_shows_the_messages(tmp_path, monkeypatch):
+    """Of every class of error and warning that is public."""
     monkeypatch.chdir(tmp_path)
     page = (DOCS / "reference" / "errors.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `rt\.(\w+)` \| (.*?) \|", page, re.M))
-    for name, call in failing(tmp_path).items():
+    calls = failing(tmp_path)
+    assert calls.keys() == rows.keys()
+    for name, call in calls.items():
         kind, words = getattr(rt, name), rows[name].removesuffix("…")
         with warnings.catch_warnings(record=True) as issued:
             warnings.simplefilter("always")
@@ -133,6 +144,37 @@ def test_page_of_errors_lists_every_public_class():
     for kind in public:
         if isinstance(kind, type) and issubclass(kind, Exception):
             assert f"| `rt.{kind.__name__}` |" in page
+
+
+def test_errors_have_the_base_classes_of_the_page():
+    for kind in (getattr(rt, name) for name in rt.PUBLIC):
+        if isinstance(kind, type) and issubclass(kind, Exception):
+            base = UserWarning if issubclass(kind, Warning) else ValueError
+            assert issubclass(kind, LookupError if kind is rt.UnknownGlass else base), kind
+
+
+def test_expressions_of_coming_from_another_program_run():
+    """Complete expressions in the column of raytrace; alone, an option is one of a public function or of `Lens.at`."""
+    page = (DOCS / "start" / "coming_from.md").read_text("utf-8")
+    cells = re.findall(r"^\|[^|]+\|([^|]+)\|$", page, re.M)
+    code = {text for cell in cells for text in re.findall(r"`([^`]+)`", cell) if "…" not in text}
+    calls = {text for text in code if re.match(r"(rt|lens)\..*\)", text)}
+    names = {"rt": rt, "lens": rt.read_lens("scan_lens"), "images": torch.ones(1, 9, 9), "kernels": torch.ones(3, 3)}
+    for text in sorted(calls - {'rt.psf(lens, "wave")', "rt.Camera(variables, network)"}):
+        assert eval(text, names) is not None, text
+    assert len(calls) >= 10
+    known = {name for verb in rt.PUBLIC for name in options(getattr(rt, verb))} | {*options(names["lens"].at)}
+    options_alone = {match[1] for text in code if (match := re.match(r"(\w+)=", text))}
+    assert options_alone - {"entrance_pupil_diameter"} <= known
+    assert {"vary", "ray_aiming", "geometric", "through_focus", "numbering"} <= options_alone
+    words = next(text for text in code if text.startswith("vary=")).removeprefix("vary=").strip('"')
+    tessar = rt.read_lens("tessar")
+    result = rt.optimize(tessar, merit="spot", vary=words, cycles=1)
+    assert abs(float(result.lens.surfaces[4].curvature + result.lens.surfaces[3].curvature)) < 1e-15
+
+
+def options(function) -> list[str]:
+    return [*inspect.signature(function).parameters] if inspect.isroutine(function) else []
 
 
 @pytest.mark.slow

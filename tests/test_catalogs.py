@@ -26,13 +26,14 @@ from raytrace.materials.catalogs import (
     aliases,
     find_glass,
     missing_catalogs,
+    nearest_glasses,
     nearest_names,
     read_agf,
     shipped_catalog,
     shipped_folder,
     write_agf,
 )
-from raytrace.materials.glass import BY_NUMBER, constant, index, listing_error, refractive_index
+from raytrace.materials.glass import BY_NUMBER, MIRROR, constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.
@@ -474,3 +475,26 @@ def test_the_figures_of_a_glass_are_text_document_and_table():
     assert str(rt.glass("517642")).startswith("517642  (MIL code)")
     with pytest.raises(ValueError, match=r"did you mean 0\.53"):
         rt.glass("SK16", wavelengths=530)
+
+
+def test_the_nearest_glasses_of_a_vendor_come_in_order_of_their_distance_in_nd_and_vd():
+    found = nearest_glasses("N-SK16", catalogs=["OHARA"], count=400)
+    assert {glass.catalog for glass in found} == {"OHARA"}
+    assert found[0].name == "S-BSM16"  # OHARA's own equivalent
+    sk16 = find_glass("N-SK16")
+    distances = [
+        math.hypot(glass.nd_listed - sk16.nd_listed, (glass.abbe_listed - sk16.abbe_listed) / 100) for glass in found
+    ]
+    assert distances == sorted(distances)
+    assert [glass.name for glass in nearest_glasses((1.6204, 60.32), catalogs=["ohara"], count=1)] == ["S-BSM16"]
+    assert "N-SK16" not in [glass.name for glass in nearest_glasses(sk16, catalogs=["SCHOTT"])]
+    assert len(nearest_glasses("N-BK7")) == 5
+
+
+def test_what_has_no_nd_and_vd_has_no_nearest_glass():
+    with pytest.raises(ValueError, match="has no nd and Vd; give a pair"):
+        nearest_glasses(constant(1.5))
+    with pytest.raises(ValueError, match="a mirror has no refractive index"):
+        nearest_glasses(MIRROR)
+    with pytest.raises(CatalogError, match="no catalog 'OHARRA' is shipped; there are SCHOTT, OHARA"):
+        nearest_glasses("N-BK7", catalogs=["OHARRA"])

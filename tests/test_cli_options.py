@@ -1,6 +1,7 @@
 """Options of the commands: one name has one meaning; options with several values; suggestions for misspelt options."""
 
 import argparse
+import csv
 import inspect
 import io
 import json
@@ -195,6 +196,8 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot DOUBLE_GAUS", 1, "did you mean double_gauss?"),
         ("spot mien.zmx", 1, "did you mean mine.zmx?"),
         ("spot double_gauss --sampling gaus", 2, "did you mean gauss?"),
+        ("seidel tessar --csv seidel.csv", 2, "unknown option --csv; tables are saved by -o FILE.csv"),
+        ("seidel tessar -o seidel.txt", 1, "seidel.txt"),
         ("layout double_gauss -o layout.png", 2, "unknown option -o; figures are saved by --plot"),
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
@@ -357,3 +360,12 @@ def test_options_of_other_commands_are_not_built():
     every, one = count(build_parser()), count(build_parser("mtf"))
     assert one["mtf"] == every["mtf"] > 10
     assert {name for name, number in one.items() if number > 1} == {"mtf"}
+
+
+def test_the_table_of_an_analysis_is_written_by_o(command):
+    assert command("seidel", "singlet", "-o", "seidel.csv")[0] == 0
+    rows = csv.DictReader(io.StringIO(Path("seidel.csv").read_text()))
+    expected = rt.seidel("singlet").to_frame()
+    assert [float(row["S1"]) for row in rows] == expected["S1"].tolist()
+    assert command("distortion", "singlet", "--field", "1", "-o", "distortion.json")[0] == 0
+    assert json.loads(Path("distortion.json").read_text()) == rt.distortion("singlet", fields=[1]).document()

@@ -197,13 +197,32 @@ def test_powers_are_the_sag_terms(name):
 
 
 def test_unsupported_surfaces_are_traced_by_torch():
-    """Heights on a grid, terms of a degree whose powers would lose digits, odd bases, and powers that differ by ray."""
+    """Heights on a grid, terms of a degree whose powers would lose digits, and odd bases."""
     faces = [
         departed(GridSag(torch.zeros(4, 4, dtype=torch.float64), scalar(5.0))),
         departed(ZernikeSag(drawn(92, 1e-3), scalar(9.0))),
-        departed(PowerSag(*(scalar(n) for n in (0.0, 0.0, 1.0, 0.0)), torch.zeros(2, 3, 1, dtype=torch.float64))),
         dataclasses.replace(departed(TiltSag(scalar(0.1), scalar(0.0)), 0.01, None, 1e-3), kind="odd asphere"),
     ]
     assert not any(is_expressible(face) for face in faces)
     with pytest.raises(ValueError, match="no Jacobian for height maps"):
         hit_jacobian(faces[:1], some_rays(5), [faces[0].thickness.clone().requires_grad_()], indices=indices()[:2])
+
+
+def test_powers_that_differ_from_lens_to_lens_are_compiled_with_their_gradients():
+    coefficients = torch.stack([drawn(9, 1e-3, seed=k) for k in range(3)], 1)[..., None].requires_grad_()
+    face = departed(PowerSag(*(scalar(n) for n in (0.1, -0.2, 4.0, 1e-3)), coefficients), 0.02)
+    assert is_expressible(face)
+    rays, weights = some_rays(300), drawn(300, 1.0, seed=9)
+
+    def traced():
+        end = trace_surfaces([face, END], rays, indices=indices()[:3])
+        total = (weights * end.position[:2]).sum()
+        (slope,) = torch.autograd.grad(total, coefficients, create_graph=True)
+        (bend,) = torch.autograd.grad((slope * slope).sum(), coefficients)
+        return end, slope.detach(), bend
+
+    (compiled, slope, bend), (eager, slope_eager, bend_eager) = both(traced)
+    assert compiled.position.shape == (3, 3, 300)
+    assert_same_rays(compiled, eager, 1e-12)
+    for f, e in ((slope, slope_eager), (bend, bend_eager)):
+        assert float((f - e).abs().max()) <= 1e-11 * float(e.abs().max())

@@ -13,8 +13,20 @@ from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, writ
 from raytrace.io.codev.glass import _fictitious_error
 from raytrace.io.source import BadSubstitute, substitutes_of
 from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
-from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
-from raytrace.system.lens import check_media
+from raytrace.materials.environment import Environment
+from raytrace.materials.glass import (
+    AIR,
+    MIRROR,
+    ImplausibleWavelength,
+    OutOfRange,
+    abbe_number,
+    constant,
+    index,
+    mil_glass,
+    model_glass,
+    nd,
+)
+from raytrace.system.lens import check_media, media
 from raytrace.system.optimization_data import OptimizationData, Row
 
 #: A pickup of a medium with figures that are left from before.
@@ -248,3 +260,48 @@ def test_a_table_is_met_at_the_lines_of_the_lens_and_estimated_between_them():
     assert not sequence("600", "'X'", three)[1].warnings
     with pytest.raises(LensFileError, match="index of X at 365 nm"):
         sequence("365", "'X'", three)
+
+
+#: Every kind of medium that a lens can hold.
+MEDIA = {
+    "catalog": lambda: find_glass("N-SF6"),
+    "liquid of index below 1.5": lambda: find_glass("WATER"),
+    "model glass": lambda: model_glass(1.6204, 60.32),
+    "model glass with partial dispersion": lambda: model_glass(1.72, 29.5, 0.0123),
+    "named model glass": lambda: model_glass(1.72, 29.5, 0.0123, name="MINE"),
+    "MIL code": lambda: mil_glass("517642"),
+    "constant index": lambda: constant(1.37),
+    "named constant index": lambda: constant(1.37, "OIL"),
+    "vacuum in a flask": lambda: constant(0.99973, "VACUUM"),
+    "air": lambda: AIR,
+    "mirror": lambda: MIRROR,
+}
+
+
+@pytest.mark.parametrize("warm", [False, True], ids=["20 °C", "40 °C and 0.7 atm"])
+@pytest.mark.parametrize("medium", MEDIA)
+def test_every_medium_comes_back_from_a_zmx_file(medium, warm, tmp_path):
+    glass, path = MEDIA[medium](), tmp_path / "lens.zmx"
+    lens = rt.lens([dict(radius=80.0, thickness=-4.0 if glass is MIRROR else 4.0, glass=glass)], stop=1, f_number=8)
+    lens = dataclasses.replace(lens, environment=Environment(*map(torch.tensor, (40.0, 0.7))) if warm else None)
+    write_lens(lens, path)
+    again = read_lens(path)
+    back = again.surfaces[1].glass
+    assert (back.name, back.formula) == (glass.name, glass.formula)
+    assert back.coefficients.equal(glass.coefficients)
+    waves = torch.linspace(0.45, 0.65, 5, dtype=torch.float64)
+    for before, behind in zip(media(lens, waves), media(again, waves), strict=True):
+        assert before.equal(behind)
+
+
+def test_a_written_glass_has_its_nd_and_vd_for_a_substitute(tmp_path):
+    """A .zmx file of a glass whose catalog is not available where the file is read."""
+    glass, path = find_glass("N-SF6"), tmp_path / "lens.zmx"
+    write_lens(rt.lens([dict(radius=80.0, thickness=4.0, glass=glass)], stop=1, f_number=8), path)
+    (line,) = re.findall("GLAS .*", path.read_text())
+    assert line.split()[4:6] == [repr(glass.nd_listed), repr(glass.abbe_listed)]
+    path.write_text(path.read_text().replace("N-SF6", "XK99"))
+    with pytest.warns(LensFileWarning, match="taken for the unknown glass XK99: the nearest to nd 1.80518, Vd 25.36"):
+        nearest = read_lens(path, substitute="nearest").surfaces[1].glass
+    assert abs(nearest.nd_listed - glass.nd_listed) < 1e-5
+    assert abs(nearest.abbe_listed - glass.abbe_listed) < 0.02

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import number
+from problems import number, vector
 
 import raytrace as rt
 from raytrace.files import shipped
@@ -20,6 +20,7 @@ from raytrace.io import FORMATS, WRITTEN, LensFileError, LensFileWarning, read_l
 from raytrace.io.frames import lens_from_frame, to_frame
 from raytrace.io.source import MAX_BYTES, Place, decode
 from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.environment import Environment
 from raytrace.materials.glass import constant, model_glass
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture, is_freeform, is_posed
@@ -433,3 +434,60 @@ def test_convert_reports_the_file_written(tmp_path):
     assert str(found) == f"{target}: 13 surfaces from {source}"
     assert found.document() == {"input": str(source), "output": str(target), "surfaces": 13}
     assert leaves(read_lens(tmp_path / "copy.csv")) == leaves(read_lens("double_gauss"))
+
+
+# -- the page of formats -----------------------------------------------------------------------------------------------
+
+
+def featured(**row) -> Lens:
+    rows = [{"radius": 50.0, "thickness": 5.0, "glass": 1.5, **row}, {"radius": -60.0, "thickness": 40.0}]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=5, fields=[0, 3])
+
+
+#: Lenses of a row of the page, and for each what a cell has that stands for a format which does not write it.
+FEATURES = {
+    "conics, mirrors, glasses": [(featured(conic=-1.0, glass="N-BK7"), "refused")],
+    "aspheres": [
+        (featured(coefficients=vector(0.0, 1e-6, 1e-20)), "refused"),
+        (featured(coefficients=vector(1e-4)), "r⁴ to"),
+        (featured(coefficients=vector(*[0.0] * 10, 1e-30)), "r⁴ to"),
+        (featured(kind="odd asphere", coefficients=vector(0.0, 0.0, 1e-5)), "r⁴ to"),
+    ],
+    "toroids, biconics": [
+        (featured(kind="toroidal", coefficients=vector(0.01)), "refused"),
+        (featured(kind="biconic", coefficients=vector(0.01, 0.0)), "refused"),
+    ],
+    "tilts and decentres": [(featured(before=rt.Pose(tilt_x=number(3.0))), "refused")],
+    "gratings, holograms, phases": [
+        (featured(phase=rt.Grating(number(0.1), number(1.0))), "refused|powers"),
+        (featured(phase=rt.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
+    ],
+    "apertures and obscurations": [
+        (featured(apertures=(Aperture("rectangular", (4.0, 3.0)),)), "refused"),
+        (featured(apertures=(Aperture("circular", (0.0, 1.0), obscures=True),)), "refused"),
+        (featured(apertures=(Aperture("polygon", (-4.0, -4.0, 4.0, -4.0, 0.0, 4.0, -4.0, -4.0)),)), "polygons"),
+    ],
+    "temperature and pressure": [
+        (dataclasses.replace(featured(), environment=Environment(number(40.0), number(0.5))), "refused"),
+    ],
+}
+
+
+@pytest.mark.parametrize("row", FEATURES)
+def test_page_of_formats_states_what_is_written(row, tmp_path):
+    """The cells of formats that are written: what is not refused there comes back bit by bit."""
+    page = (ROOT / "docs" / "reference" / "formats.md").read_text("utf-8")
+    heads, *table = (line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| "))
+    (cells,) = (line[1:] for line in table if line[0] == row)
+    for suffix in WRITTEN:
+        (cell,) = (cell for head, cell in zip(heads[1:], cells, strict=True) if f"`{suffix}`" in head)
+        for lens, refusal in FEATURES[row]:
+            path = tmp_path / f"lens{suffix}"
+            if re.search(refusal, cell):
+                with pytest.raises(LensFileError):
+                    write_lens(lens, path)
+            else:
+                write_lens(lens, path)
+                again = read_lens(path)
+                assert leaves(again.surfaces) == leaves(lens.surfaces), (suffix, cell)
+                assert leaves(again.environment) == leaves(lens.environment), (suffix, cell)

@@ -36,17 +36,18 @@ FLOORS = {
     "analysis": 7,
     "wave_optics": 7,
     "optimization": 8,
-    "imaging": 9,
-    "viewer": 10,
+    "tolerancing": 9,
+    "imaging": 10,
+    "viewer": 11,
     # pages of experiments
-    "experiments": 11,
-    "cli": 12,
+    "experiments": 12,
+    "cli": 13,
     # measurements: nothing imports them
-    "bench": 13,
+    "bench": 14,
     # the public API
-    "public": 14,
-    "__init__": 14,
-    "__main__": 14,
+    "public": 15,
+    "__init__": 15,
+    "__main__": 15,
 }
 
 #: Commands, whose imports may wait until they run.

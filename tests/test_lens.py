@@ -8,9 +8,17 @@ import pytest
 import torch
 from problems import lens, surface, vector
 
-from raytrace import distortion
+from raytrace import distortion, refractive_index, spot
 from raytrace.io import LensFileError, read_lens, write_lens
-from raytrace.materials.glass import MIRROR, ImplausibleWavelength, InvalidIndex, OutOfRange, check_unit
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import (
+    MIRROR,
+    ImplausibleWavelength,
+    InvalidIndex,
+    OutOfRange,
+    check_unit,
+    model_glass,
+)
 from raytrace.materials.glass import constant as medium
 from raytrace.system.lens import check, check_media, with_wavelengths
 
@@ -102,3 +110,32 @@ def test_wavelengths_of_files_are_accepted_and_impossible_ones_refused(tmp_path)
         with pytest.raises(LensFileError, match="a wavelength of 0 µm"):
             write_lens(dataclasses.replace(CONSTANT, wavelengths=vector(0.0)), tmp_path / name)
         assert not (tmp_path / name).exists()
+
+
+def test_a_glass_is_replaced_by_its_name_index_or_nd_and_vd():
+    triplet = read_lens(LENSES / "cooke_triplet.zmx")
+    named = triplet.replace(1, glass="S-BSM16").surfaces[1].glass
+    assert (named.name, named.catalog) == ("S-BSM16", "OHARA")
+    assert triplet.replace(1, glass="mirror").surfaces[1].is_mirror
+    assert float(refractive_index(triplet.replace(1, glass=1.5).surfaces[1].glass, vector(0.55))) == 1.5
+    model = triplet.replace(1, glass=(1.62, 60.3)).surfaces[1].glass
+    assert torch.equal(refractive_index(model, vector(0.55)), refractive_index(model_glass(1.62, 60.3), vector(0.55)))
+    with pytest.raises(UnknownGlass, match=r"surface 1: unknown glass 'S-BSM166'.*S-BSM16 "):
+        triplet.replace(1, glass="S-BSM166")
+
+
+def test_weights_and_the_primary_wavelength_are_conditions():
+    triplet = read_lens(LENSES / "cooke_triplet.zmx")
+    found = triplet.at(wavelengths=[0.6, 0.5], wavelength_weights=[1, 3], primary_wavelength=2, field_weights=[1, 2, 0])
+    assert found.wavelength_weights.tolist() == [1, 3]
+    assert float(found.primary) == 0.5
+    assert found.fields.weight.tolist() == [1, 2, 0]
+    assert torch.equal(found.fields.vignetting, triplet.fields.vignetting)
+    heavy = spot(found).whole.rms_radius
+    assert not torch.allclose(heavy, spot(found.at(wavelength_weights=[1, 1])).whole.rms_radius)
+    with pytest.raises(ValueError, match="`wavelength_weights`: 2 found; expected 3, one for each wavelength"):
+        triplet.at(wavelength_weights=[1, 2])
+    with pytest.raises(ValueError, match=r"`field_weights` .*expected numbers from 0 up"):
+        triplet.at(field_weights=[1, -1, 0])
+    with pytest.raises(ValueError, match="primary wavelength number 3; expected one from 1 to 2"):
+        found.at(primary_wavelength=3)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.variables import Model
@@ -70,3 +71,17 @@ def test_the_jacobian_is_that_of_finite_differences(name):
         size = np.abs(difference).max()
         kinks = np.abs(found.jacobian @ along - difference) > 1e-4 * size + 1e-9
         assert kinks.mean() < 0.01
+
+
+def test_a_file_holds_an_equality_as_a_row_of_negative_weight(tmp_path):
+    """The constraint of `hold` in a file: met exactly in the optimisation that stores it and in that of its file."""
+    lens, path = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial"), tmp_path / "held.zmx"
+    spot = rt.Merit.default(lens, "spot", rings=2)
+    merit = rt.Merit([*spot.rows, rt.Row("EFFL", target=100.0, weight=-1.0)])
+    first = rt.optimize(lens, merit=merit, vary="curvature sensor", cycles=6)
+    first.save(path)
+    again = rt.optimize(path, vary="thickness:2,6 curvature:1-4 sensor", cycles=6)
+    by_words = rt.optimize(lens, merit=spot, vary="curvature sensor", hold="efl=100", cycles=6)
+    assert first.merit_after == pytest.approx(by_words.merit_after, rel=1e-9)
+    for found in (first, again, by_words):
+        assert float(rt.first_order(found.lens).effective_focal_length) == pytest.approx(100, rel=1e-7)

@@ -5,6 +5,7 @@ another file of that schema. THEIRS are the cases that differ, each with the rea
 """
 
 import re
+from pathlib import Path
 
 import opticstudio_answers
 import pytest
@@ -58,6 +59,27 @@ def test_figure(case):
         tolerance = torch.full_like(off, size)
     assert torch.isfinite(off).all()
     assert (off <= tolerance).all(), f"off by {off.max():.3g}, {float((off / tolerance).max()):.3g} tolerances"
+
+
+@pytest.mark.skipif(bool(ELSEWHERE), reason="of the shipped cases")
+def test_pages_state_the_counts_of_the_cases():
+    compared = [case for case in CASES if case["call"] != "none"]
+    differ = sum(listed(THEIRS, case) is not None for case in compared)
+    counts = len(compared) - differ, len(compared), differ
+    agree, total, theirs = map(str, counts)
+    root = Path(__file__).parents[1]
+    for page, words in (
+        ("docs/opticstudio.md", f"{agree} of {total} figures"),
+        (
+            "docs/reference/accuracy.md",
+            f"{total} figures of OpticStudio: {agree} agree to the digits printed, {theirs} ",
+        ),
+        ("README.md", f"of {total} figures that it printed, {agree} agree"),
+    ):
+        assert words in (root / page).read_text("utf-8"), page
+    table = (root / "docs" / "opticstudio.md").read_text("utf-8")
+    rows = re.findall(r"^\|[^|]+\| (\d+) \| (\d+) \| (\d*) *\|$", table, re.M)
+    assert tuple(sum(int(row[k] or 0) for row in rows) for k in (1, 0, 2)) == counts
 
 
 @pytest.mark.skipif(bool(ELSEWHERE), reason="of the shipped cases")

@@ -460,3 +460,35 @@ def test_cycles_are_limited_where_neither_they_nor_the_time_are(monkeypatch):
     assert (found.cycles, found.stopped) == (3, "cycles")
     assert paths.best_of_paths(state, start, lower=-ends, upper=ends, seconds=60).cycles > 3
     assert paths.best_of_paths(state, start, lower=-ends, upper=ends, cycles=5).cycles == 5
+
+
+def test_each_cycle_is_watched_with_its_lens_and_an_interrupt_keeps_the_last():
+    lens, seen = rt.read_lens("cooke_triplet"), []
+
+    def watch(cycle, shown):
+        seen.append((cycle, shown))
+        if cycle.number == 3:
+            raise KeyboardInterrupt
+
+    found = rt.optimize(lens, merit="spot", vary="curvature", watch=watch)
+    assert (found.stopped, found.cycles) == ("interrupted", 3)
+    assert [cycle.merit for cycle, _ in seen] == found.history[:, 0].tolist()
+    last = seen[-1][1]
+    for a, b in zip(last.surfaces, found.lens.surfaces, strict=True):
+        assert a.curvature is b.curvature is None or float(a.curvature) == float(b.curvature)
+    assert last.optimization_data.variables == found.lens.optimization_data.variables
+    assert float(rt.evaluate(last, merit="spot").merit) == pytest.approx(seen[-1][0].merit, rel=1e-9)
+
+
+def test_an_mtf_that_starts_near_zero_is_reported():
+    """Through spots first the same merit function ends far lower, and the line is gone."""
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial", fields=[0.0, 8.4])
+    unsharp = lens.at(sensor_distance=lens.surfaces[-2].thickness + 2)
+    mtf = dict(merit=rt.DefaultMerit("mtf", frequencies=[20]), vary="sensor")
+    stuck = rt.optimize(unsharp, **mtf)
+    better = rt.optimize(rt.optimize(unsharp, merit="spot", vary="sensor").lens, **mtf)
+    assert "2 of 2 rows of the MTF start below 0.1, where it hardly has a slope: minimise `merit=spot` first" in str(
+        stuck
+    )
+    assert stuck.merit_after > 0.9 * stuck.merit_before > 1.2 * better.merit_after
+    assert "rows of the MTF start" not in str(better)

@@ -56,8 +56,29 @@ def test_a_start_that_loses_most_rays_is_opened_until_all_pass():
 def test_never_more_light_is_lost_and_a_lens_that_loses_none_stays():
     lens = rt.read_lens("double_gauss")
     problem, bounds = problem_of(lens)
-    assert opened(problem, problem.model.start, **bounds) is problem.model.start
+    assert opened(problem, problem.model.start, **bounds).x is problem.model.start
     problem, bounds = problem_of(lens.at(f_number=0.6), "thickness:5..5.1")
     x = np.clip(problem.model.start, bounds["lower"], bounds["upper"])
-    found = opened(problem, x, **bounds)
+    found = opened(problem, x, **bounds).x
     assert problem.state(found, False).lost <= problem.state(x, False).lost
+
+
+def test_an_opening_is_watched_and_stopped_with_the_best_lens_so_far():
+    lens, seen = bent(), []
+
+    def watch(cycle, shown):
+        seen.append((cycle, shown))
+        if len(seen) == 15:  # in the second part of pupil and field, at the latest
+            raise KeyboardInterrupt
+
+    how = {"merit": "spot", "vary": "curvature thickness", "bounds": "thickness:0.5..90"}
+    found = rt.optimize(lens, **how, watch=watch)
+    assert found.stopped == "interrupted"
+    assert found.cycles == len(seen) == 15
+    assert [cycle.number for cycle, _ in seen] == [*range(1, 16)]
+    problem, _ = problem_of(lens)
+    x = found.variables_after.numpy()
+    assert problem.state(x, False).lost < problem.state(found.variables_before.numpy(), False).lost
+    for k, surface in enumerate(seen[-1][1].surfaces):
+        assert surface.curvature is None or surface.curvature == found.lens.surfaces[k].curvature
+    assert seen[-1][0].merit == pytest.approx(np.sqrt(problem.state(x, False).cost), rel=1e-9)

@@ -314,3 +314,12 @@ def test_info_prints_the_working_f_number_of_real_light_and_the_paraxial_one_und
     lines = {line.split("  ")[1].strip(): line for line in text.splitlines() if "working F/#" in line}
     assert f"{real:.9g}" in lines["working F/#"]
     assert " 1 " in lines["paraxial working F/#"]
+
+
+def test_first_order_data_are_a_table_with_a_row_for_each_wavelength():
+    triplet = read_lens("cooke_triplet")
+    found = first_order(triplet, vector(0.5, 0.6))
+    frame = found.to_frame()
+    assert frame["effective_focal_length"].tolist() == found.effective_focal_length.tolist()
+    assert frame["f_number"].tolist() == found.f_number.tolist()
+    assert len(first_order(triplet).to_frame()) == 1

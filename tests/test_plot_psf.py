@@ -68,6 +68,21 @@ def test_windows_are_alike_unless_the_light_is_not():
     assert {tuple(np.round(panel.get_xlim(), 9)) for panel in axes if panel.images} == {(-0.0525, 0.0525)}
 
 
+def test_fields_are_rows_and_wavelengths_are_columns():
+    result = psf(
+        read_lens("cooke_triplet"),
+        "gaussian",
+        fields=number([[0.0, 0.0], [0.0, 8.4]]),
+        per_wavelength=True,
+        pixel=0.004,
+        size=9,
+    )
+    titles = [panel.get_title() for panel in psf_grid(result).axes if panel.images]
+    assert [title.split(", ")[0] for title in titles] == ["0°"] * 3 + ["8.4°"] * 3
+    places = [panel.get_subplotspec().colspan.start for panel in psf_grid(result).axes if panel.images]
+    assert places == [0, 1, 2, 0, 1, 2]
+
+
 @pytest.fixture(scope="module")
 def phone():
     return seen("phone", "wave", fields=number([[0.0, 0.0], [0.0, 26.0]]), tol=0.1)

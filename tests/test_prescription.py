@@ -1,6 +1,9 @@
-"""Remarks of the prescription on surfaces that are not conics."""
+"""Remarks of the prescription on surfaces that are not conics; poses of typed rows."""
+
+from functools import partial
 
 import pytest
+import torch
 from test_zemax_types import CASES, read, text
 
 import raytrace as rt
@@ -72,3 +75,35 @@ def test_the_glass_column_of_info_has_the_figures_of_a_medium_without_a_name():
     assert found.words()["glass"] == ["", "1.62/36.4", "n 1.5", "N-BK7", "", ""]
     assert [row["glass"] for row in found.document()["surfaces"]] == [None, "1.62/36.4", "n 1.5", "N-BK7", None, None]
     assert all(label in str(found) for label in ("1.62/36.4 ", "n 1.5 ", "N-BK7 "))
+
+
+def test_a_typed_row_takes_the_numbers_of_its_poses():
+    """By the names of variables; the same lens as with values of Pose, and its derivatives."""
+    tilt = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+    posed = dict(x=0.2, y=-0.3, tilt_x=tilt, tilt_z=20, tilts_first=True, y_after=0.3, tilt_x_after=-1.5)
+    rows = [dict(radius=50, thickness=5, glass="N-BK7", **posed), dict(radius=-60, thickness=70)]
+    lens = rt.lens(rows, stop=1, f_number=9, fields=[0, 2])
+    number = partial(torch.tensor, dtype=torch.float64)
+    before = rt.Pose(x=number(0.2), y=number(-0.3), tilt_x=tilt, tilt_z=number(20.0), tilts_first=True)
+    after = rt.Pose(y=number(0.3), tilt_x=number(-1.5))
+    plain = rt.lens(
+        [{k: v for k, v in row.items() if k not in posed} for row in rows], stop=1, f_number=9, fields=[0, 2]
+    )
+    expected = plain.replace(1, before=before, after=after)
+    assert lens.surfaces[1].before.tilts_first
+    centroid, wanted = (rt.spot(one).whole.centroid for one in (lens, expected))
+    assert centroid.equal(wanted)
+    (slope,), (like,) = (torch.autograd.grad(part.sum(), tilt) for part in (centroid, wanted))
+    assert slope == like != 0
+    turned = lens.replace(1, tilt_x=2.5)  # the other numbers of the pose stay
+    assert (float(turned.surfaces[1].before.tilt_x), float(turned.surfaces[1].before.y)) == (2.5, -0.3)
+
+
+def test_impossible_poses_of_a_typed_row_are_refused():
+    row = dict(radius=50, thickness=5)
+    with pytest.raises(rt.BadPrescription, match=r"surface 1: both before and tilt_x are given; leave one out"):
+        rt.lens([row | dict(before=rt.Pose(), tilt_x=2)], stop=1, f_number=9)
+    with pytest.raises(rt.BadPrescription, match=r"surface 1 has no 'tiltx'; did you mean tilt_x\?"):
+        rt.lens([row | dict(tiltx=2)], stop=1, f_number=9)
+    with pytest.raises(rt.BadPrescription, match="'steep' is not a number"):
+        rt.lens([row | dict(tilt_x="steep")], stop=1, f_number=9)

@@ -142,6 +142,7 @@ def test_an_unknown_option_names_the_nearest(singlet):
         (lambda lens: rt.gauss_rings(0), "gauss_rings: `rings` is 0; expected 1 or more"),
         (lambda lens: rt.sobol(0), "sobol: `count` is 0; expected 1 or more"),
         (lambda lens: rt.spot(lens, [0, 5]), "spot: a list is given without a name; write name=value (options: fields"),
+        (lambda lens: rt.wiener(torch.ones(2, 2), 0.1, 5), "wiener: 5 is given without a name; it takes no further"),
         (lambda lens: rt.spot(lens, lens=lens), "spot: `lens` is given twice, with and without its name"),
     ],
 )

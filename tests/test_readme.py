@@ -19,7 +19,7 @@ PYTHON = [
 ]
 #: Pages of every public name with an example each.
 API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def first_block(heading: str) -> list[str]:
@@ -145,11 +145,26 @@ def test_every_command_is_shown():
     assert {command.name for command in COMMANDS} <= shown
 
 
+def without_blocks(page: Path) -> str:
+    """The text of a page without its code blocks."""
+    return re.sub(r"^(`{3,}).*?^\1$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of the headings of a page, as web hosts of repositories and the book make them."""
+    headings = re.findall(r"^#+ (.*)$", without_blocks(page), re.M)
+    return {re.sub(r"[^\w -]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_and_pictures_exist(page):
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    text = without_blocks(page)
     targets = re.findall(r"\]\(<?([^)>\s]+)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
     for target in targets:
-        if re.match(r"[a-z]+:|#", target):
+        path, _, anchor = target.partition("#")
+        if re.match(r"[a-z]+:", target):
             continue
-        assert (page.parent / target.split("#")[0]).exists(), f"{page.name}: {target}"
+        file = page.parent / path if path else page
+        assert file.exists() or file.parent.name == "generated", f"{page.name}: {target}"
+        if anchor and file.exists():
+            assert anchor in anchors(file), f"{page.name}: {target}"

@@ -14,7 +14,7 @@ import torch
 import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, least_squares
-from raytrace.optimization.merit import DefaultMerit
+from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, conditions_of
@@ -94,7 +94,7 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
     lost = []
 
     def recorded(problem, x, **bounds):
-        there = opened(problem, x, **bounds)
+        there = opened(problem, x, **bounds).x
         lost.append([problem.state(one, False).lost for one in (x, there)])
         return there
 
@@ -418,3 +418,20 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
 def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_path):
     rt.write_lens(plate, tmp_path / "plate.csv")
     assert said in command_line("search", "plate.csv", *words).error
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_plane_plates_have_no_focal_length_and_no_warning():
+    """Of a plate f = ∞ without a derivative, in a row and in a search, where the power that f has is held."""
+    rows = [dict(radius=torch.inf, thickness=4, glass="N-BK7"), dict(radius=torch.inf, thickness=95)]
+    plate = rt.lens(rows, stop=1, entrance_pupil_diameter=10, fields=[0, 1])
+    free = freedom(plate, "curvature sensor")
+    model = Model(free.lens, free.variables)
+    for name in ("EFFL", "ISFN"):
+        found = Evaluation(model, [rt.Row(name, (0, 1) if name == "EFFL" else (0, 0), weight=1.0)])(
+            model.start, derivatives=True
+        )
+        assert np.isinf(found.values).all()
+        assert not found.jacobian.any()
+    found = rt.search(plate, merit="spot", vary="curvature sensor", hold="efl=100", starts=1, seed=0)
+    assert float(rt.first_order(found.lenses[0]).effective_focal_length) == pytest.approx(100, rel=1e-9)

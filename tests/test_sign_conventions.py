@@ -4,14 +4,16 @@ import math
 
 import pytest
 import torch
-from problems import double_gauss, fields, lens, surface, vector, vignetting_aperture
+from problems import double_gauss, fields, lens, scalar, surface, vector, vignetting_aperture
 
+import raytrace as rt
 from raytrace.materials.glass import MIRROR, refractive_index, sellmeier
 from raytrace.system.lens import check, media
+from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.rays import start
 from raytrace.tracing.launch import launch
-from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.trace import steps, trace_lens
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.tracing.trace import steps, trace_lens, trace_surfaces
 
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 
@@ -101,6 +103,39 @@ def test_thickness_behind_a_mirror_is_negative_and_light_returns():
     out = trace_lens(system, launch(system, vector(0.0, 0.1).reshape(2, 1)), system.wavelengths[0])
     assert out.direction[2] < 0
     assert out.position[2] == 0
+
+
+@pytest.mark.parametrize(("tilt", "point", "sign"), [("tilt_x", (0.0, 5.0), 1), ("tilt_y", (5.0, 0.0), -1)])
+def test_tilts_are_right_handed(tilt, point, sign):
+    """About x from y to z, about y from z to x: the side of +x or +y of a plane turns towards +z, or away from it."""
+    pose = Pose(**{tilt: scalar(10.0)})
+    rays = start(vector(*point, 0.0)[:, None], vector(0.0, 0.0, 1.0)[:, None], vector(0.0))
+    out = trace_surfaces([surface(None, 1.0, before=pose)], rays, indices=vector(1.0, 1.0).unbind(), gap=None)
+    assert float(out.opl) == pytest.approx(sign * 5 * math.tan(math.radians(10)), rel=1e-14)
+
+
+def test_a_pose_decentres_and_then_tilts_unless_tilts_are_first():
+    """Behind a tilt by 90° about x, y lies along z; axes turn about x, then about the new y and z, or about z, y, x."""
+    vertex = [scalar(0.0)] * 3
+    for tilts_first, expected in ((False, (0.0, 1.0, 0.0)), (True, (0.0, 0.0, 1.0))):
+        pose = Pose(y=scalar(1.0), tilt_x=scalar(90.0), tilts_first=tilts_first)
+        assert [float(x) for x in point_out(pose, vertex)] == pytest.approx(expected, abs=1e-15)
+    y_axis = [scalar(0.0), scalar(1.0), scalar(0.0)]
+    for tilts_first, expected in ((False, (-1.0, 0.0, 0.0)), (True, (0.0, 0.0, 1.0))):
+        pose = Pose(tilt_x=scalar(90.0), tilt_z=scalar(90.0), tilts_first=tilts_first)
+        found = [float(x) for x in direction_out(pose, y_axis)]
+        assert found == pytest.approx(expected, abs=1e-15), tilts_first
+
+
+def test_a_virtual_object_has_a_negative_distance():
+    """1/s′ = 1/f - 1/s of a thin lens, f = 100 mm and s = -100 mm."""
+    thin = lens([surface(0.01, 1e-12, 1.5), surface(-0.01, 50.0)])
+    assert float(paraxial_image_distance(thin, scalar(-100.0))) == pytest.approx(50.0, rel=1e-12)
+
+
+def test_axial_colour_of_a_single_positive_lens_is_negative():
+    colours = rt.seidel(rt.read_lens("singlet"))
+    assert float(colours.contributions[colours.names.index("C1")].sum()) < 0
 
 
 def test_check_refuses_untraceable_lenses():

@@ -1,7 +1,11 @@
 """Values: frozen, walked by torch.func and pytree, moved as a whole, never compared by ==."""
 
+import copy
 import dataclasses
+import os
 import pickle
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -9,10 +13,13 @@ from problems import aspheric_singlet, double_gauss, surface
 from torch.utils import _pytree as pytree
 
 import raytrace as rt
+from raytrace.materials.environment import Environment
 from raytrace.materials.glass import AIR
 from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import OptimizationData, Solve
 from raytrace.system.rays import Rays
+from raytrace.system.sag_terms import TiltSag
 from raytrace.tracing.trace import trace_lens
 
 
@@ -82,3 +89,38 @@ def test_a_value_survives_pickling_between_processes():
     """Data loaders send values to workers; a checkpoint should be a lens file all the same."""
     lens = pickle.loads(pickle.dumps(aspheric_singlet()))
     assert torch.equal(lens.surfaces[1].coefficients, aspheric_singlet().surfaces[1].coefficients)
+
+
+LOADED = """
+import sys, torch
+from raytrace import Lens
+lens = torch.load(sys.argv[1])
+assert type(lens) is Lens
+torch.save([leaf.detach() for leaf in torch.utils._pytree.tree_leaves(lens)], sys.argv[2])
+"""
+
+
+def test_a_lens_of_torch_save_is_loaded_by_default_in_another_process(tmp_path):
+    """With poses, phases, sag terms, apertures, configurations, an environment, variables and a merit function."""
+    lens = dataclasses.replace(double_gauss(), notes=("a note",)).with_configurations(thickness={6: [12.0, 16.0]})
+    lens = dataclasses.replace(lens, environment=Environment(torch.tensor(40.0), torch.tensor(1.0))).replace(
+        3, tilt_x=1.0, apertures=(rt.Aperture("circular", (0.0, 20.0)),)
+    )
+    lens = lens.replace(
+        5,
+        phase=rt.Grating(frequency=torch.tensor(0.01), order=torch.tensor(1.0)),
+        sag_terms=TiltSag(torch.tensor(0.1), torch.tensor(0.2)),
+    )
+    merit = (rt.Row("EFFL", (0, 1), target=100.0, weight=1.0),)
+    data = OptimizationData((rt.Vary(1, "curvature"),), (Solve(11, "thickness", "marginal_height", (0.0, 0.0)),), merit)
+    lens = dataclasses.replace(lens, optimization_data=data)
+    torch.save(lens, tmp_path / "lens.pt")
+    again = torch.load(tmp_path / "lens.pt")
+    assert again.optimization_data == data
+    words = [sys.executable, "-c", LOADED, str(tmp_path / "lens.pt"), str(tmp_path / "leaves.pt")]
+    subprocess.run(words, check=True, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))})
+    for copied in (again, copy.deepcopy(lens)):
+        for one, other in zip(pytree.tree_leaves(lens), pytree.tree_leaves(copied), strict=True):
+            assert one is None or torch.equal(one, other)
+    for one, other in zip(pytree.tree_leaves(lens), torch.load(tmp_path / "leaves.pt"), strict=True):
+        assert torch.equal(one, other)

@@ -1,5 +1,6 @@
 """Syntax of variables, solves and pickups."""
 
+import math
 import re
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 import raytrace as rt
 from raytrace.materials.glass import abbe_number, nd
+from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.variables import Model, VariedGlass, bounds_of, freedom, name_of
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables
@@ -52,6 +54,36 @@ def test_absent_terms_vary_from_zero(lens):
     assert float(at.surfaces[5].before.tilt_y) == 0.02
     same, other = (rt.spot(one, fields=[7]).rms_radius for one in (lens, model.lens_at(model.start)))
     assert float((same - other).abs().max()) < 1e-12
+
+
+def test_pose_and_shape_of_the_image_vary(lens):
+    """With the derivatives of differences, of rays on the image, their path and their wavefront."""
+    words = "tilt:12 decentre:12 tilt_z:12 z:12 curvature:12 conic:12"
+    lens = lens.replace(12, tilt_x=1.0, x=0.1, curvature=1e-3)
+    found = freedom(lens, words)
+    assert [name_of(one) for one in found.variables][:4] == ["tilt_x_12", "tilt_y_12", "x_12", "y_12"]
+    model = Model(found.lens, found.variables)
+    rays = [rt.Row(name, (12, 1), (0.3, 1.0, 0.2, 0.5), weight=1.0) for name in ("REAX", "REAY", "REAZ", "RAID")]
+    evaluation = Evaluation(model, [*rays, rt.Row("OPDC", (0, 1), (0.0, 1.0, 0.2, 0.5), weight=1.0)])
+    step = 1e-5
+    for k, by in enumerate(evaluation(model.start, derivatives=True).jacobian.T):
+        ends = [evaluation(model.start + side * step * np.eye(len(model.start))[k]).residuals for side in (1, -1)]
+        assert by == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-6), found.variables[k]
+
+
+def test_the_image_of_a_tilted_lens_follows_scheimpflug():
+    """An object at d, a lens tilted by θ: u = d/cos θ along its axis, and tan θ′ = (v/u) tan θ of the image."""
+    distance, focal, tilt = 150.0, 50.0, math.radians(10.0)
+    row = dict(curvature=0.0, thickness=70.0, tilt_x=math.degrees(tilt), phase=rt.IdealLens(1 / focal, 1 / focal))
+    lens = rt.lens([row], stop=1, entrance_pupil_diameter=10.0, object_distance=distance, fields=[-5.0, 0.0, 5.0])
+    found = rt.optimize(lens, merit="spot", vary="tilt_x:2 sensor").lens
+    u = distance / math.cos(tilt)
+    v = 1 / (1 / focal - 1 / u)
+    assert float(found.surfaces[1].thickness) == pytest.approx(v, rel=1e-6)
+    assert abs(float(found.surfaces[2].before.tilt_x)) == pytest.approx(
+        math.degrees(math.atan(v / u * math.tan(tilt))), rel=1e-6
+    )
+    assert float(rt.spot(found).rms_radius.max()) < 1e-6
 
 
 def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
@@ -123,6 +155,7 @@ def test_variables_of_the_file_apply_unless_specified_otherwise(lens):
         ("radius:3", "did you mean curvature?"),
         ("focus", "did you mean sensor?"),
         ("conic", "name surfaces, as conic:3"),
+        ("curvature:13", "this lens has surfaces 1 to 12 to vary"),
         ("thickness:12", "this lens has surfaces 1 to 11 to vary"),
         ("thickness:0", "surface 0"),
         ("a3:3", "no 'a3'"),

@@ -10,6 +10,7 @@ import torch
 from problems import scalar
 from torch.utils import _pytree as pytree
 
+import raytrace as rt
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.variables import (
     Limits,
@@ -412,3 +413,11 @@ def test_variable_syntax_is_that_of_optimize():
     bounded = Variables(lens, "curvature sensor", bounds="curvature:-0.1..0.1 sensor:70..")
     assert bounded.bounds["curvature_1"] == (-0.1, 0.1)
     assert bounded.bounds["sensor"] == (70.0, math.inf)
+
+
+def test_variables_and_words_may_be_given_together():
+    lens = rt.read_lens("cooke_triplet")
+    free = freedom(lens, [rt.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
+    assert [(one.surface, one.quantity) for one in free.variables] == [(1, "curvature"), (3, "conic"), (2, "thickness")]
+    assert free.variables[0].bounds == (0.01, 0.05)
+    assert float(free.lens.surfaces[3].conic) == 0

@@ -114,17 +114,21 @@ def settled(page) -> None:
     raise AssertionError("the viewer does not settle")
 
 
+def until(page, condition) -> None:
+    deadline = time.monotonic() + SECONDS / 1e3
+    while not condition():
+        assert time.monotonic() < deadline
+        page.wait_for_timeout(20)
+
+
 def changed(page, action) -> None:
     """Do something, and wait for the new numbers."""
     idle = f"{VIEWER}[aria-busy=false]"
     page.wait_for_selector(idle)
     before = count(page)
     action()
-    deadline = time.monotonic() + 60
-    while count(page) == before and time.monotonic() < deadline:
-        page.wait_for_timeout(20)
+    until(page, lambda: count(page) > before)
     page.wait_for_selector(idle)
-    assert count(page) > before
 
 
 def shown(page, name: str) -> float:
@@ -268,6 +272,18 @@ def test_save_writes_only_where_it_is_told(page, folder):
     (folder / "edited.seq").unlink()
 
 
+def test_a_duplicate_of_a_tab_has_a_session_of_its_own(page):
+    changed(page, lambda: typed(page, "thickness:2", "14"))
+    with page.context.expect_page() as opened:
+        page.evaluate("window.open(location.href)")  # with a copy of the storage of the tab
+    other = opened.value
+    other.wait_for_selector(f"{VIEWER}[data-count]", timeout=SECONDS)
+    assert cell(other, "thickness:2") == pytest.approx(12.93)
+    page.reload()
+    page.wait_for_selector(f"{VIEWER}[data-count]", timeout=SECONDS)
+    assert cell(page, "thickness:2") == 14
+
+
 def test_two_tabs_have_a_session_each_and_a_reload_resumes_its_own(page, browser, served):
     with browser.new_context(viewport={"width": 1280, "height": 720}) as context:
         other = context.new_page()
@@ -303,17 +319,28 @@ def test_variables_are_ticked_and_optimised(page):
     assert shown(page, "EFL") == optimised
 
 
-def test_an_optimisation_is_stopped(page):
+def test_an_optimisation_is_shown_stopped_and_undone_in_one_step(page):
     for name in ("curvature:1", "curvature:2", "curvature:3", "curvature:4", "curvature:6", "thickness:2"):
         page.check(f'[data-vary="{name}"]')
     settled(page)
     page.select_option('[aria-label="merit function"]', "mtf")
     settled(page)
-    page.click("text=Optimise")
+    glass = page.locator('svg[data-figure="layout"] path.glass').first
+    before, outline = shown(page, "EFL"), glass.get_attribute("d")
+    page.focus('[data-cell="thickness:2"]')
+    page.keyboard.press("Control+Enter")
     page.wait_for_selector(f"{VIEWER}.running")
-    page.click("text=Stop")
+    until(page, lambda: shown(page, "EFL") != before)
+    assert int(page.get_attribute(VIEWER, "data-cycles")) > 0
+    assert glass.get_attribute("d") != outline
+    assert page.evaluate("document.querySelector('.left').inert")
+    page.keyboard.press("Control+Enter")
     page.wait_for_selector(f"{VIEWER}:not(.running)", timeout=SECONDS)
-    assert re.search("interrupted|stopped before", page.inner_text(".message"))
+    assert re.search("stopped|→", page.inner_text(".message"))  # or its end came first
+    settled(page)
+    assert shown(page, "EFL") != before
+    changed(page, lambda: page.click("text=Undo"))
+    assert shown(page, "EFL") == before
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -380,6 +407,78 @@ def test_a_port_that_is_taken_is_one_message(served, folder):
     assert done.returncode == 1
     assert f"port {served.port} cannot be used" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+NOTEBOOK = """<!doctype html><body data-jp-theme-light="{light}"><div id="cell"></div><script type="module">
+import viewer from "./viewer.js";
+const handlers = new Set();
+const model = {{
+  on: (name, handler) => name === "msg:custom" && handlers.add(handler),
+  off: (name, handler) => handlers.delete(handler),
+  send: async (content) => {{
+    const reply = await window.kernel(content);
+    handlers.forEach((handler) => handler(reply, []));
+  }},
+}};
+window.clean = await viewer.render({{ model, el: document.getElementById("cell") }});
+window.handlers = handlers;
+</script></body>"""
+
+
+@pytest.fixture
+def notebook(browser):
+    """A page as a notebook renders the widget, and the widget: messages go to Python as a kernel passes them on."""
+    pytest.importorskip("anywidget", reason="needs anywidget: pip install '.[view]'")
+    from raytrace.viewer.widget import widget_of
+
+    widget, sent = widget_of(rt.read_lens("cooke_triplet")), []
+    widget.send = sent.append
+
+    def kernel(content: dict) -> dict:
+        widget._handle_custom_msg(json.loads(json.dumps(content)), [])
+        return json.loads(json.dumps(sent.pop()))
+
+    with browser.new_context(viewport={"width": 1280, "height": 720}) as context:
+        tab, errors = context.new_page(), []
+        tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        tab.on("pageerror", lambda error: errors.append(str(error)))
+        tab.expose_function("kernel", kernel)
+        page = NOTEBOOK.format(light="false")
+        tab.route("**/dark.html", lambda route: route.fulfill(body=page, content_type="text/html"))
+        tab.route("**/viewer.js", lambda route: route.fulfill(body=widget._esm, content_type="text/javascript"))
+        tab.goto("http://127.0.0.1:9/dark.html")
+        tab.add_style_tag(content=widget._css)
+        tab.wait_for_selector(f"{VIEWER}[data-count]", timeout=SECONDS)
+        yield tab, widget
+        assert errors == []
+
+
+@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
+def test_the_widget_is_rendered_and_answers_events(notebook):
+    tab, widget = notebook
+    agrees(tab, rt.read_lens("cooke_triplet"))
+    settled(tab)
+    changed(tab, lambda: typed(tab, "thickness:2", "13"))
+    assert float(widget.lens.surfaces[2].thickness) == 13
+    agrees(tab, widget.lens)
+    tab.focus('[data-slider="thickness:4"]')
+    changed(tab, lambda: tab.keyboard.press("ArrowRight"))
+    assert float(widget.lens.surfaces[4].thickness) > 2
+    changed(tab, lambda: tab.keyboard.press("Control+z"))
+    assert float(widget.lens.surfaces[4].thickness) == 2
+    for surface in (1, 2, 3):
+        tab.check(f'[data-vary="curvature:{surface}"]')
+    settled(tab)
+    tab.click("text=Optimise")
+    tab.wait_for_selector("text=optimised:", timeout=SECONDS)
+    settled(tab)
+    agrees(tab, widget.lens)
+    assert widget.state.vary == ("curvature:1", "curvature:2", "curvature:3")
+    ground = tab.evaluate("getComputedStyle(document.querySelector('.raytrace-viewer')).backgroundColor")
+    assert ground == "rgb(23, 25, 28)"  # the theme of the notebook goes before that of the system
+    tab.evaluate("document.body.dataset.jpThemeLight = 'true'")
+    tab.wait_for_selector(f"{VIEWER}:not(.dark)")
+    assert tab.evaluate("[window.clean(), window.handlers.size][1]") == 0
 
 
 def test_the_widget_answers_events():

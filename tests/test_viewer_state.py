@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import threading
 import time
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 import raytrace as rt
 from raytrace.viewer import compute
-from raytrace.viewer.session import Session
+from raytrace.viewer.session import Optimisation, Session
 from raytrace.viewer.state import initial, merit_of, reduce, shown_fields, variables
 
 
@@ -252,30 +253,57 @@ def test_a_session_saves_where_it_is_told_and_nowhere_else(triplet, tmp_path):
     assert float(rt.read_lens(file).surfaces[3].thickness) == 3
 
 
-def finished(session, until=60):
-    """The last reply of the optimisation of a session."""
+@pytest.fixture
+def held(monkeypatch):
+    """Optimisations wait behind their first cycle until this is set."""
+    gate, watch = threading.Event(), Optimisation._watch
+
+    def wait(work, cycle, lens):
+        watch(work, cycle, lens)
+        gate.wait(60)
+
+    monkeypatch.setattr(Optimisation, "_watch", wait)
+    yield gate
+    gate.set()
+
+
+def progress(session, ended=False, until=60):
+    """The first reply of the optimisation of a session with a lens of another cycle, or at its end."""
     ends = time.monotonic() + until
     while time.monotonic() < ends:
         reply = session.answer({"type": "progress"})
-        if not reply["optimisation"]["running"]:
+        if not reply["optimisation"]["running"] or (not ended and "analyses" in reply):
             return reply
-        time.sleep(0.05)
+        time.sleep(0.01)
     raise AssertionError("the optimisation does not end")
 
 
-def test_an_optimisation_runs_beside_the_session_stops_and_can_be_undone(triplet):
-    session = Session(triplet)
-    assert "nothing varies" in session.answer({"type": "optimise"})["message"]
+def ticked(lens):
+    session = Session(lens)
     for surface in (1, 2, 3, 4, 6, 7):
         session.answer({"type": "vary", "quantity": "curvature", "surface": surface, "on": True})
+    return session
+
+
+def test_an_optimisation_shows_the_lens_of_its_cycles_and_is_one_step_of_undo(triplet, held):
+    session = ticked(triplet)
+    before = session.state
     assert session.answer({"type": "optimise"})["optimisation"]["running"]
     refused = session.answer({"type": "edit", "surface": 3, "quantity": "thickness", "value": 3})
     assert "optimisation is running" in refused["message"]
-    session.answer({"type": "stop"})
-    reply = finished(session)
-    assert reply["optimisation"]["failure"] == ""
-    assert reply["optimisation"]["cycles"] <= 30
-    assert reply["analyses"]["spots"]["rms"][0] is not None
+    compared = session.answer({"type": "compare", "on": True})
+    assert compared["stored"]["spots"]["rms"] == compute.refresh(before)["analyses"]["spots"]["rms"]
+    shown = progress(session)
+    curvature = 1 / 37.4
+    assert shown["prescription"]["rows"][1]["cells"]["curvature"] != pytest.approx(curvature, rel=1e-6)
+    assert shown["analyses"]["spots"]["rms"] != compared["stored"]["spots"]["rms"]
+    reloaded = session.answer({"type": "open"})
+    assert "analyses" in reloaded
+    assert reloaded["optimisation"]["running"]
+    assert "path" in reloaded
+    held.set()
+    last = progress(session, ended=True)
+    assert last["optimisation"]["cycles"] == len(last["optimisation"]["merits"]) > 3
     assert session.optimisation is None
     optimised = session.state.lens
     assert session.answer({"type": "undo"})["message"] == ""
@@ -284,13 +312,87 @@ def test_an_optimisation_runs_beside_the_session_stops_and_can_be_undone(triplet
     assert session.state.lens is optimised
 
 
+def test_stop_acts_at_once_and_keeps_the_last_lens_also_while_rays_fail(triplet, held):
+    session = ticked(triplet)
+    session.answer({"type": "edit", "surface": 1, "quantity": "radius", "value": 5})
+    start = session.state.lens
+    session.answer({"type": "optimise"})
+    work = session.optimisation
+    shown = progress(session)  # of the opening, which has cycles of its own
+    assert shown["optimisation"]["running"]
+    reply = session.answer({"type": "stop"})
+    assert not reply["optimisation"]["running"]
+    assert "stopped" in reply["optimisation"]["words"]
+    assert session.optimisation is None
+    assert session.answer({"type": "stop"})["optimisation"] is None
+    stopped = session.state.lens
+    assert stopped is work.lens
+    assert reply["prescription"]["rows"][1]["cells"]["curvature"] == float(stopped.surfaces[1].curvature) != 1 / 5
+    held.set()
+    work.thread.join(60)
+    assert not work.thread.is_alive()
+    assert session.state.lens is stopped
+    session.answer({"type": "undo"})
+    assert session.state.lens is start
+
+
+def test_variables_of_an_optimised_lens_and_new_ones_vary_together(triplet):
+    found = rt.optimize(triplet, merit="spot", vary="curvature:1 thickness:2", bounds="thickness:10,15", cycles=1)
+    session = Session(found.lens)
+    session.answer({"type": "vary", "quantity": "curvature", "surface": 3, "on": True})
+    session.answer({"type": "optimise"})
+    reply = progress(session, ended=True)
+    assert reply["message"] == ""
+    assert float(session.state.lens.surfaces[3].curvature) != float(found.lens.surfaces[3].curvature)
+    assert 10 <= float(session.state.lens.surfaces[2].thickness) <= 15
+
+
 def test_a_failure_of_an_optimisation_is_one_message(triplet):
     session = Session(triplet)
     session.answer({"type": "vary", "quantity": "curvature", "surface": 1, "on": True})
-    session.answer({"type": "edit", "surface": 1, "quantity": "radius", "value": 0.5})
+    session.state = dataclasses.replace(session.state, vary=("curvature:99",))
     session.answer({"type": "optimise"})
-    reply = finished(session)
-    assert reply["optimisation"]["failure"] or "analyses" in reply
+    reply = progress(session, ended=True)
+    assert "99" in reply["message"]
+    assert session.state.lens is triplet
+    assert session.optimisation is None
+
+
+def test_a_lens_with_solves_and_without_variables_is_edited(triplet):
+    data = rt.optimize(triplet, merit="spot", vary="curvature:1 sensor=marginal_height(0)", cycles=1).lens
+    solves = dataclasses.replace(data.optimization_data, variables=())
+    state = initial(dataclasses.replace(data, optimization_data=solves))
+    found = edit(state, "radius", 1, 40)
+    assert found.message == ""
+    axial = rt.first_order(found.lens).paraxial_image_distance
+    assert float(found.lens.surfaces[-2].thickness) == pytest.approx(float(axial), abs=1e-9)
+
+
+def test_fields_of_another_number_keep_x_weights_and_vignetting_factors(triplet):
+    y, like = triplet.fields.y, triplet.fields.y
+    vignetting = like.new_tensor([[0, 0.0, 0.1], [0, 0.1, 0.2], [0, 0.1, 0.3], [0, 0.2, 0.4], [0, 0, 0]])
+    fields = dataclasses.replace(triplet.fields, x=y / 2, weight=like.new_tensor([1.0, 2, 3]), vignetting=vignetting)
+    state = initial(dataclasses.replace(triplet, fields=fields))
+    between = float(y[1] + y[2]) / 2
+    more = reduce(state, {"type": "fields", "values": [*y.tolist(), between]}).lens.fields
+    assert more.x.tolist() == pytest.approx([*fields.x.tolist(), between / 2])
+    assert more.weight.tolist() == [1, 2, 3, 1]
+    assert torch.equal(more.vignetting[:, :3], vignetting)
+    assert torch.allclose(more.vignetting[:, 3], vignetting[:, 1:].mean(1), atol=1e-12)  # one line from the axis
+    fewer = reduce(state, {"type": "fields", "values": y[[2, 0]].tolist()}).lens.fields
+    assert fewer.x.tolist() == fields.x[[2, 0]].tolist()
+    assert torch.equal(fewer.vignetting, vignetting[:, [2, 0]])
+    moved = reduce(state, {"type": "fields", "axis": "x", "values": "1 2 3"})
+    assert moved.lens.fields.x.tolist() == [1, 2, 3]
+    assert torch.equal(moved.lens.fields.vignetting, vignetting)
+    assert "3 fields" in reduce(state, {"type": "fields", "axis": "x", "values": "1 2"}).message
+    assert "below 90 degrees" in reduce(state, {"type": "fields", "axis": "x", "values": "1 2 95"}).message
+
+
+def test_fields_of_one_y_are_told_apart_by_their_order(triplet):
+    points = [(0.0, 0.0), (4.0, 0.0), (8.0, 0.0)]
+    fewer = reduce(initial(triplet.at(fields=points)), {"type": "fields", "values": "0 0"}).lens.fields
+    assert fewer.x.tolist() == [0, 4]
 
 
 def test_the_working_f_number_is_that_of_the_real_marginal_ray():

@@ -11,7 +11,7 @@ from problems import double_gauss, fields, vector
 from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.maths.sampling import gauss_rings, hexapolar
-from raytrace.tracing.launch import launch, vignette
+from raytrace.tracing.launch import factors_at, launch, vignette
 from raytrace.tracing.spot import spot_of
 from raytrace.tracing.trace import trace_lens
 
@@ -130,3 +130,18 @@ def test_close_fields_of_the_cooke_triplet_have_close_spots():
     rays = trace_lens(lens, launch(lens, points, fields=field), lens.wavelengths[:, None])
     radius = spot_of(rays, weights).rms_radius
     assert (radius[0] / radius[1] - 1).abs().max() <= 5e-3
+
+
+def test_factors_between_fields_are_those_of_the_launched_pupil():
+    lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
+    like = lens.fields.y
+    factors = like.new_tensor([[0, 0.0, 0.1], [0, 0.1, 0.2], [0, 0.1, 0.3], [0, 0.2, 0.4], [0, 25.0, 40.0]])
+    lens = dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=factors))
+    points = like.new_tensor([[0.0, 0.0, 3.0], [10.0, 8.4, -5.0]])
+    at = factors_at(lens, points)
+    assert torch.equal(at[:, 1], factors[:, 1])
+    fields = dataclasses.replace(lens.fields, x=points[0], y=points[1], weight=torch.ones_like(like), vignetting=at)
+    pupil = like.new_tensor([[0.3, -1.0, 0.0, 0.6], [0.2, 0.0, 1.0, -0.8]])
+    expected = vignette(lens, points[:, :, None], pupil)
+    found = vignette(dataclasses.replace(lens, fields=fields), points[:, :, None], pupil)
+    assert torch.allclose(found, expected, atol=1e-14)

@@ -1,12 +1,15 @@
 """The element: heights become paths, wrapping and steps, and where pixels and rings lie."""
 
 import math
+import re
 
+import numpy as np
 import pytest
 import torch
 from differences import gradcheck
 from problems import number
 
+import raytrace as rt
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
 from raytrace.maths.numerics import to
@@ -272,3 +275,76 @@ def test_second_derivatives_in_the_points_are_those_of_the_lens():
     h = designed_height(element(EvenPowers(number([-0.03])), PMMA), x, torch.zeros(3, dtype=torch.float64))
     slope = torch.autograd.grad(h.sum(), x, create_graph=True)[0]
     assert (torch.autograd.grad(slope.sum(), x)[0] + 0.06).abs().max() < ROUNDING
+
+
+# An element of an array.
+
+
+def test_an_element_of_an_array_is_that_of_its_file(tmp_path):
+    x = 0.02 * (np.arange(60) - 29.5)
+    heights = 1e-3 * (x[:, None] ** 3 + 0.5 * x)
+    np.save(tmp_path / "map.npy", heights)
+    options = {"aperture": 1.0, "pitch": 0.02, "glass": "F_SILICA", "design_wavelength": 0.55, "levels": 8}
+    one, other = rt.element(heights, **options), rt.read_element(tmp_path / "map.npy", **options)
+    assert torch.equal(one.numbers, other.numbers)
+    assert torch.equal(one.period, other.period)
+    assert one.levels == other.levels == 8
+    assert repr(one) == repr(other)
+    assert "60 × 60 pixels of 20 µm, wrapped at 1.196 µm in 8 steps, of F_SILICA" in repr(one)
+
+
+def test_a_wedge_moves_the_light_towards_its_thick_side():
+    x = 0.01 * (np.arange(100) - 49.5)
+    rows, slope = np.repeat(x[:, None], 100, 1), 0.004
+    (focusing,) = rt.elements("ideal", aperture=1.0)
+    for heights, axis in ((slope * rows, 0), (slope * rows.T, 1)):
+        wedge = rt.element(heights, aperture=1.0, pitch=0.01, glass=1.5)
+        kernel = rt.wave_psf([focusing, wedge], depths=[1000], wavelengths=[0.55], pixel=0.01, size=41).kernel[0, 0]
+        brightest = np.unravel_index(int(kernel.argmax()), kernel.shape)
+        expected = 20 + round(0.5 * slope * 35.5 / 0.01)  # (n - 1) slope z, in pixels
+        assert brightest[axis] == expected
+        assert brightest[1 - axis] == 20
+
+
+def test_derivatives_by_zernike_coefficients_of_an_array():
+    (focusing,) = rt.elements("ideal", aperture=1.0)
+
+    def peak(coefficients):
+        plate = rt.element(coefficients, profile="zernike", aperture=1.0, glass="F_SILICA")
+        return rt.wave_psf([focusing, plate], depths=[1000], wavelengths=[0.55], size=15, samples=64).kernel.max()
+
+    start = torch.tensor([0, 0, 0, 1e-4, 0, 0, 1e-4], dtype=torch.float64)
+    step = torch.tensor([0, 0, 0, 1e-7, 0, 0, -2e-7], dtype=torch.float64)
+    (slope,) = torch.autograd.grad(peak(coefficients := start.clone().requires_grad_()), coefficients)
+    assert float(slope @ step) == pytest.approx(float(peak(start + step) - peak(start - step)) / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "options", "message"),
+    [
+        (np.zeros((9, 9)), {}, "needs `pitch`"),
+        (np.zeros(9), {"pitch": 0.1}, "expected (rows, columns)"),
+        (np.zeros(9), {"profile": "zernike", "pitch": 0.1}, "has no `pitch`"),
+        (np.full((30, 30), np.nan), {"pitch": 0.1}, "900 of 900 numbers of the element are not finite"),
+        (np.zeros((9, 9)), {"pitch": 0.05}, "give `aperture=0.45`"),
+        (np.zeros((30, 30)), {"pitch": 0.1, "levels": 8}, "give `design_wavelength`"),
+        (np.zeros(9), {"profile": "zernikes"}, "expected one of pixels, rings, zernike, powers"),
+    ],
+)
+def test_wrong_arrays_are_refused(numbers, options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rt.element(numbers, aperture=1.0, glass="PMMA", **options)
+
+
+def test_an_array_alone_is_no_element():
+    with pytest.raises(TypeError, match=r"an? ndarray is no phase element; expected .*rt\.element\(heights"):
+        rt.wave_psf(np.zeros((9, 9)))
+    with pytest.raises(TypeError, match=r"`elements` is 'cubic'; expected .*rt\.elements"):
+        rt.hybrid_psf("double_gauss", "cubic")
+
+
+@pytest.mark.parametrize("option", [{"levels": 8}, {"aperture": 3.0}, {"glass": "PMMA"}, {"design_wavelength": 0.5}])
+def test_options_of_a_name_are_refused_for_an_element(option):
+    (element,) = rt.elements("singlet", aperture=2.0)
+    with pytest.raises(ValueError, match=f"`{next(iter(option))}` belongs to an element by name or from a file"):
+        rt.wave_psf(element, **option)

@@ -8,6 +8,7 @@ import torch
 from differences import gradcheck
 from problems import vector
 
+import raytrace as rt
 from raytrace.maths.numerics import dot
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import with_sensor_distance
@@ -192,3 +193,12 @@ def test_a_small_part_of_the_pupil_gives_no_coefficients():
     assert zernike_coefficients(slow).isfinite().all()
     with pytest.raises(EmptySpot):
         zernike_coefficients(fast, empty="error")
+
+
+def test_coefficients_of_a_beam_that_fills_too_little_of_the_pupil_are_nan_with_a_warning():
+    lens = rt.read_lens("cooke_triplet")
+    lens = lens.replace(lens.stop, apertures=(rt.Aperture("circular", (0.0, 1.5)),))
+    with pytest.warns(rt.Incomplete, match="field 0 degrees: the light fills too little of the entrance pupil"):
+        found = rt.wavefront(lens, fields=[0], wavelengths=[0.55])
+    assert bool(found.coefficients.isnan().all())
+    assert bool(found.rms.isfinite().all())

@@ -70,6 +70,7 @@ class _Parser(argparse.ArgumentParser):
             known = self._option_string_actions
             drawn = name in ("-o", "--output") and "--plot" in known
             meant = "; figures are saved by --plot" if drawn else did_you_mean(name, known)
+            meant = "; tables are saved by -o FILE.csv" if name == "--csv" and "-o" in known else meant
             self.error(f"unknown option {name}{meant}")
         return found, unknown
 

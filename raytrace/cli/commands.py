@@ -50,6 +50,9 @@ from raytrace.cli.types import (
 )
 from raytrace.cli.wave_options import camera, element, engine, light, pixels
 
+#: -o of an analysis: `Result.save`.
+table = output("table to write (.csv), or the document of --json (.json)", (".csv", ".json"))
+
 
 @dataclass(frozen=True)
 class Command:
@@ -308,8 +311,9 @@ COMMANDS = (
         """
         double_gauss
         lenses/double_gauss.zmx --object-distance 25000 --f-number 4
-        lens.zmx --json | python3 -m json.tool""",
-        lens, conditions,
+        lens.zmx --json | python3 -m json.tool
+        lens.zmx -o prescription.csv""",
+        lens, conditions, table,
     ),
     _command(
         "check",
@@ -455,7 +459,7 @@ COMMANDS = (
         double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
         tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
         zoom.zmx --configuration 2 --skip-unknown""",
-        lens, conditions, *MERIT, plot("the contributions to the merit, by operand and field"),
+        lens, conditions, *MERIT, plot("the contributions to the merit, by operand and field"), table,
         each="list every row, also the rays of one field",
     ),
     _command(
@@ -624,7 +628,7 @@ COMMANDS = (
         double_gauss --object-distance 25000 --plot mtf.png
         tessar --frequency 10 20 40 --geometric --json
         tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "ray-fan",
@@ -633,7 +637,7 @@ COMMANDS = (
         """
         tessar --plot fan.png
         double_gauss --field 0 14 -10,5 --points 21 --json""",
-        lens, conditions, plot("the fans"),
+        lens, conditions, plot("the fans"), table,
     ),
     _command(
         "opd-fan",
@@ -643,7 +647,7 @@ COMMANDS = (
         """
         tessar --plot opd.png
         double_gauss --object-distance 25000 --reference own --json""",
-        lens, conditions, plot("the fans"),
+        lens, conditions, plot("the fans"), table,
     ),
     _command(
         "wavefront",
@@ -655,7 +659,7 @@ COMMANDS = (
         tessar --plot wavefront.png
         double_gauss --field 0 14 --numbering fringe --terms 16
         double_gauss --field 0 --json""",
-        lens, conditions, plot("the maps"),
+        lens, conditions, plot("the maps"), table,
     ),
     _command(
         "distortion",
@@ -664,7 +668,7 @@ COMMANDS = (
         """
         phone --plot distortion.png
         double_gauss --field 5 10 14 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "field-curvature",
@@ -673,7 +677,7 @@ COMMANDS = (
         """
         tessar --plot curvature.png
         double_gauss --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "lateral-colour",
@@ -682,7 +686,7 @@ COMMANDS = (
         """
         tessar --plot lateral.png
         double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "relative-illumination",
@@ -691,7 +695,7 @@ COMMANDS = (
         """
         phone --plot illumination.png
         double_gauss --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "seidel",
@@ -700,9 +704,9 @@ COMMANDS = (
         "colour) of every surface and their sums, with y n i of the marginal and chief ray, at the largest field or "
         "those of --field.",
         """
-        tessar --plot seidel.png
+        tessar --plot seidel.png -o seidel.csv
         double_gauss --kind waves --field 10 14 --json""",
-        lens, conditions, plot("a bar for each surface"),
+        lens, conditions, plot("a bar for each surface"), table,
     ),
     _command(
         "longitudinal-aberration",
@@ -711,7 +715,7 @@ COMMANDS = (
         """
         tessar --plot longitudinal.png
         cooke_triplet --wavelength 0.55 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "chromatic-focal-shift",
@@ -720,7 +724,7 @@ COMMANDS = (
         """
         cemented_achromat --plot shift.png
         singlet --wavelength 0.45 0.65 --json""",
-        lens, conditions, plot("the curve"), samples="wavelengths of the curve",
+        lens, conditions, plot("the curve"), table, samples="wavelengths of the curve",
     ),
     _command(
         "distortion-grid",
@@ -729,7 +733,7 @@ COMMANDS = (
         """
         phone --plot grid.png --exaggerate 10
         retrofocus --points 5 --json""",
-        lens, conditions, plot("the ideal and the real grid"),
+        lens, conditions, plot("the ideal and the real grid"), table,
         option(
             "--exaggerate", dest="plot_exaggerate", metavar="N", type=positive_finite, default=1.0,
             help="draw the distortion N times as large",
@@ -743,7 +747,7 @@ COMMANDS = (
         """
         phone --plot incidence.png
         double_gauss --field 0 14 --surfaces --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "rms-over-field",
@@ -753,7 +757,7 @@ COMMANDS = (
         """
         tessar --plot rms.png
         double_gauss --spot --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _command(
         "encircled-energy",
@@ -762,7 +766,7 @@ COMMANDS = (
         """
         tessar --plot encircled.png
         double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
-        lens, conditions, plot("the curves"),
+        lens, conditions, plot("the curves"), table,
     ),
     _of_module("codesign", codesign, _codesign),
     Command(

@@ -77,7 +77,8 @@ LENS_SUFFIXES = Names(_written_formats)
 
 #: Parameters that are no options: arguments of the runner, and objects.
 NO_OPTIONS = (
-    *("lens", "path", "catalogs", "progress", "share", "execution", "grid", "window", "pupil", "folder", "merit"),
+    *("lens", "path", "catalogs", "progress", "watch", "share", "execution", "grid", "window", "pupil", "folder"),
+    "merit",
 )
 
 _MM, _UM = {"metavar": "MM"}, {"metavar": "UM", "type": positive_finite, "nargs": "+"}

@@ -15,13 +15,14 @@ A training step of lens and network:
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.image import add_noise, as_picture, blur
-from raytrace.imaging.variables import Variables
+from raytrace.imaging.variables import Variables, converted
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, model_of, psf
@@ -81,6 +82,12 @@ class Camera(nn.Module):
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self.pupil_points, self._order = pupil_points, None
         self._memo = Memo(object_distances=object_distances)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        values = self.fields, self.pixels, self.pupil_points
+        self.fields, self.pixels, self.pupil_points = converted(values, fn)
+        self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
+        return super()._apply(fn, recurse)
 
     @property
     def margin(self) -> int:

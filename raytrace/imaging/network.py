@@ -1,7 +1,7 @@
 """RED-Net, a convolutional network for image restoration.
 
 Mao, Shen and Yang, "Image Restoration Using Very Deep Convolutional Encoder-Decoder Networks with Symmetric Skip
-Connections", NIPS 2016 (arXiv:1606.08921).
+Connections", NIPS 2016 (arXiv:1603.09056).
 """
 
 import dataclasses

@@ -20,14 +20,17 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
+from raytrace.maths.numerics import to
 from raytrace.optimization.variables import (
     GLASS,
     BadHold,
@@ -190,6 +193,19 @@ class Owned(nn.Module, abc.ABC):
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *lists)
 
 
+def converted(values: tuple, fn: Callable[[Tensor], Tensor]) -> tuple:
+    """Values of tensors in the dtype and on the device that `fn` of `nn.Module._apply` gives floating-point numbers.
+
+    `to` converts them: a lens keeps its numbers where `fn` makes empty tensors, and a coarse dtype is refused.
+    """
+    like = fn(torch.zeros((), dtype=_floating(values).dtype, device=_floating(values).device))
+    return to(values, dtype=like.dtype, device=like.device)
+
+
+def _floating(values: tuple) -> Tensor:
+    return next(leaf for leaf in pytree.tree_leaves(values) if isinstance(leaf, Tensor) and leaf.is_floating_point())
+
+
 # -- variables of a lens -----------------------------------------------------------------------------------------------
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
@@ -234,6 +250,7 @@ class Variables(Owned):
         it is then not a parameter but solved for, and its bounds count in `violation`.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
+    `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
     `state_dict` carries the lens that the parameters are offsets from, and loads into that one alone (`Owned`).
     Raises BadVariables.
     """
@@ -269,6 +286,14 @@ class Variables(Owned):
             raise BadVariables(
                 f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
             )
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
+        self.lens, self._modelled = converted((self.lens, self._modelled), fn)
+        return super()._apply(fn, recurse)
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name}={value:.6g}" for name, value in self.numbers().items())
 
     def _held(self, hold: str, variables: Sequence[Variable]) -> Held | None:
         """The focal length of "efl" or "efl=100", and the last variable that changes it. Raises BadVariables."""
@@ -476,6 +501,11 @@ class PhaseVariables(Owned):
                 f"{(*self.start.shape, 'K')}"
             )
         self.change = nn.Parameter(torch.zeros(shape, dtype=self.start.dtype, device=self.start.device))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        values = self.element, self.others, self.start, self.basis
+        self.element, self.others, self.start, self.basis = converted(values, fn)
+        return super()._apply(fn, recurse)
 
     def identity(self) -> dict:
         """The element: its profile, shape, glass, aperture in mm, the unit in mm; digests of its initial numbers, the

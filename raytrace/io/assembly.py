@@ -16,7 +16,6 @@ from torch.utils import _pytree as pytree
 from raytrace.io.source import FORMULA, NEAREST, Draft, LensFileError, Place, double, shown
 from raytrace.materials.catalogs import (
     SAME_INDEX,
-    SHIPPED,
     AmbiguousGlass,
     Catalog,
     CatalogError,
@@ -24,7 +23,7 @@ from raytrace.materials.catalogs import (
     find_glass,
     load,
     missing_catalogs,
-    shipped_catalog,
+    nearest_glasses,
     shipped_difference,
     user_catalogs,
 )
@@ -39,9 +38,6 @@ from raytrace.system.surface import SHAPE, Surface
 
 #: More characters than the name of any glass has.
 _LONGEST = 80
-
-#: Weight of a difference in V_d relative to one in n_d, for the nearest glass.
-_PER_ABBE = 0.01
 
 #: Catalogs that come with a lens, by name in capitals: a description of their source, and a function that reads them.
 CatalogSources = Mapping[str, tuple[str, Callable[[], Catalog]]]
@@ -75,7 +71,7 @@ def listed_glass(
     except UnknownGlass as error:
         if (other == NEAREST or nearest) and figures is not None:
             nd, vd = figures
-            glass = nearest_glass(nd, vd, user=user)
+            (glass,) = nearest_glasses((nd, vd), user=user, count=1)
             off = f"its nd differs by {glass.nd_listed - nd:+.1e}, its Vd by {glass.abbe_listed - vd:+.2g}"
             reason = f"the nearest to nd {nd:.7g}, Vd {vd:.5g} of the file"
             report.warn(f"{glass_words(glass)} is taken for the unknown glass {name}: {reason}; {off}", place)
@@ -84,19 +80,6 @@ def listed_glass(
         lacks = "the file has no nd and Vd to find the nearest glass by; " if nearest or other else ""
         hint = f"{lacks}specify a substitute by --substitute {name}=OTHER (`substitute`)"
         raise UnknownGlass(error.name, error.where, error.suggestions, error.searched, hint) from None
-
-
-def nearest_glass(nd: float, vd: float, *, user: Sequence[Path] = ()) -> Glass:
-    """The glass of the user's catalogs and the shipped ones that is nearest to n_d and V_d; the first of equals."""
-
-    def distance(glass: Glass) -> float:
-        if glass.nd_listed is None or not glass.abbe_listed:
-            return float("inf")
-        return (glass.nd_listed - nd) ** 2 + (_PER_ABBE * (glass.abbe_listed - vd)) ** 2
-
-    catalogs: list[Catalog] = [load(path) for path in user_catalogs(user)]
-    catalogs += [shipped_catalog(name) for name in SHIPPED if name != "BIREFRINGENT"]  # holds one ray of a crystal each
-    return min((glass for catalog in catalogs for glass in catalog.glasses.values()), key=distance)
 
 
 def glass_words(glass: Glass) -> str:

@@ -14,6 +14,7 @@ catalog's spelling.
 
 import csv
 import difflib
+import math
 import os
 import re
 import warnings
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from raytrace.files import shipped
 from raytrace.materials import agf
@@ -33,7 +35,7 @@ from raytrace.materials.agf import CatalogWarning as CatalogWarning
 from raytrace.materials.agf import read_agf as read_agf
 from raytrace.materials.agf import read_text
 from raytrace.materials.agf import write_agf as write_agf
-from raytrace.materials.glass import LINES, Glass, refractive_index
+from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, abbe_number, constant, model_glass, nd, refractive_index
 from raytrace.words import calling_level
 
 #: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
@@ -52,6 +54,8 @@ OLDER_EDITIONS = {
     ("CDGM", "H-ZBAF20"): ("CDGM of 2023-09", 5.3e-5),
     ("CDGM", "H-ZBAF1"): ("CDGM of 2023-09", 3.0e-5),
 }
+#: Weight of a difference in V_d relative to one in n_d, for the nearest glasses.
+_PER_ABBE = 0.01
 #: Glasses of one name whose indices differ by more than this are different glasses.
 SAME_INDEX = 1e-6
 
@@ -113,6 +117,66 @@ def find_glass(
         return replace(_shipped_glass(alias.glass, alias.catalog), name=name)
     supplied = of_user + [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
     raise UnknownGlass(name, where, _nearest(wanted, supplied), [*(catalog.name for catalog in supplied), *SHIPPED])
+
+
+def medium(glass: Glass | str | float | Sequence[float], catalogs: Sequence[str] = (), where: str = "") -> Glass:
+    """A glass by its name, its index, (nd, Vd) or (nd, Vd, ΔPgF); a Glass passes as it is."""
+    if isinstance(glass, Glass):
+        return glass
+    if isinstance(glass, str):
+        word = glass.strip().upper()
+        known = {"": AIR, "AIR": AIR, "MIRROR": MIRROR}
+        return known[word] if word in known else find_glass(glass.strip(), catalogs=catalogs, where=where)
+    if isinstance(glass, Sequence):
+        return model_glass(*glass)
+    return AIR if not isinstance(glass, Tensor) and float(glass) == 1 else constant(glass)
+
+
+def nearest_glasses(
+    glass: Glass | str | Sequence[float],
+    *,
+    catalogs: Sequence[str | Catalog] = (),
+    count: int = 5,
+    user: Sequence[str | Path] = (),
+) -> tuple[Glass, ...]:
+    """The catalog glasses nearest to a glass by n_d and V_d, the nearest first: √(Δn_d² + (ΔV_d/100)²).
+
+    glass: a Glass, a name or (nd, Vd); it is not among the results. catalogs: names of the vendors, as ["OHARA"], and
+    catalogs that came with a lens; by default the user's and all shipped ones. user: AGF files, searched first. Raises
+    UnknownGlass, CatalogError for an unknown catalog, ValueError for a medium without n_d and V_d.
+    """
+    of_user = [load(path) for path in user_catalogs(user)]
+    sought = [catalog if isinstance(catalog, Catalog) else _named_catalog(catalog, of_user) for catalog in catalogs]
+    if not catalogs:  # BIREFRINGENT holds one ray of a crystal each
+        sought = of_user + [shipped_catalog(name) for name in SHIPPED if name != "BIREFRINGENT"]
+    if isinstance(glass, str):
+        glass = find_glass(glass, user=user)
+    index, dispersion = _nd_and_vd(glass) if isinstance(glass, Glass) else map(float, glass)
+
+    def distance(other: Glass) -> float:
+        if other.nd_listed is None or not other.abbe_listed:
+            return float("inf")
+        return (other.nd_listed - index) ** 2 + (_PER_ABBE * (other.abbe_listed - dispersion)) ** 2
+
+    def is_same(other: Glass) -> bool:
+        name = glass.listed_name or glass.name if isinstance(glass, Glass) else ""
+        return name == other.name and same_catalog(glass.catalog, other.catalog)
+
+    others = (other for catalog in sought for other in catalog.glasses.values() if not is_same(other))
+    return tuple(sorted(others, key=distance)[:count])
+
+
+def _named_catalog(name: str, of_user: Sequence[Catalog]) -> Catalog:
+    return next((catalog for catalog in of_user if catalog.name.upper() == name.upper()), None) or shipped_catalog(name)
+
+
+def _nd_and_vd(glass: Glass) -> tuple[float, float]:
+    if glass.nd_listed is not None and glass.abbe_listed:
+        return glass.nd_listed, glass.abbe_listed
+    found = float(nd(glass)), float(abbe_number(glass))
+    if not math.isfinite(found[0]) or not found[1]:
+        raise ValueError(f"{glass.name or 'this medium'} has no nd and Vd; give a pair (nd, Vd)")
+    return found
 
 
 def edition(glass: Glass) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.materials.glass import FORMULAS, Glass, is_air, refractive_index
+from raytrace.materials.glass import FORMULAS, WITH_ERRORS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide, value
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
@@ -66,7 +66,8 @@ def thermal(glass: Glass) -> Thermal:
 
 def is_model(glass: Glass) -> bool:
     """Whether a medium is a constant index, a model glass or a six-digit code, without a catalog's formula."""
-    return glass.formula in FORMULAS and FORMULAS[glass.formula].number is None
+    formula = glass.formula.removesuffix(WITH_ERRORS)
+    return formula in FORMULAS and FORMULAS[formula].number is None
 
 
 def air_index(wavelength: Tensor, temperature: Tensor | float, pressure: Tensor | float) -> Tensor:

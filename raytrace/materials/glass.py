@@ -9,6 +9,8 @@ Wavelengths in µm, indices relative to air at the catalog's reference temperatu
 at others).
 """
 
+import dataclasses
+import functools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -196,6 +198,27 @@ FORMULAS = {
 BY_NUMBER = {formula.number: name for name, formula in FORMULAS.items() if formula.number}
 
 
+#: Behind the name of a formula: the same with errors of manufacture, by so many further coefficients.
+WITH_ERRORS, _ERRORS = " with errors", 5
+
+
+@functools.cache
+def formula_of(name: str) -> Formula:
+    """The formula of a name that `Glass.formula` holds."""
+    if name in FORMULAS:
+        return FORMULAS[name]
+    own = FORMULAS[name.removesuffix(WITH_ERRORS)]
+    return Formula(f"{own.coefficients} Δn nd Vd ΔVd ΔPgF", partial(_with_errors, own))
+
+
+def _with_errors(formula: Formula, coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n + Δn + M(n_d, V_d + ΔV_d, ΔP_gF) - M(n_d, V_d, ΔP_gF), M the model glass."""
+    n = formula.index(coefficients[:-_ERRORS], wavelength)
+    change, nd, vd, abbe_change, dpgf = coefficients[-_ERRORS:].unbind(0)
+    changed, nominal = (_model(torch.stack([nd, v, dpgf]), wavelength) for v in (vd + abbe_change, vd))
+    return torch.where(n > 0, n + change + (changed - nominal), n)
+
+
 # -- glasses -----------------------------------------------------------------------------------------------------------
 
 #: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
@@ -228,7 +251,8 @@ class Glass:
     """A refracting medium: a dispersion formula with its coefficients.
 
     name: as written in the lens file, "" for air.
-    formula: key of FORMULAS ("constant", "model", "schott", "sellmeier_1", ...), or "mirror".
+    formula: key of FORMULAS ("constant", "model", "schott", "sellmeier_1", ...), or "mirror"; behind it WITH_ERRORS for
+        a glass with errors of manufacture.
     coefficients: (m, ...) of the formula, float64; trailing axes broadcast against the wavelength.
     catalog: name of the catalog the glass came from, "" if none.
     wavelength_range: µm (shortest, longest) or None.
@@ -273,7 +297,7 @@ def refractive_index(glass: Glass, wavelength: Tensor | float) -> Tensor:
     coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
     count, *batch = coefficients.shape
     coefficients = coefficients.reshape(count, *[1] * (exact.dim() - len(batch)), *batch)
-    formula = FORMULAS[glass.formula]
+    formula = formula_of(glass.formula)
     if formula.wavelengths is None:  # air is half of all media: no formula, no wavelength
         n = formula.index(coefficients, exact)
         return torch.where((n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
@@ -408,6 +432,39 @@ def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0
     if not (torch.isfinite(coefficients).all() and (numbers[0] > 0).all() and (numbers[1] >= 0).all()):
         raise ValueError(f"a model glass needs finite nd > 0, Vd ≥ 0 and ΔPgF; found {nd}, {vd}, {dpgf}")
     return Glass(name, "model", coefficients)
+
+
+def with_index_errors(
+    glass: Glass, index: Tensor | None = None, abbe: Tensor | None = None, *, percent: bool = False
+) -> Glass:
+    """A medium whose index is higher by `index` at all wavelengths, and its Abbe number by `abbe`, or `abbe` per cent.
+
+        n′(λ) = n(λ) + Δn + M(n_d, V_d + ΔV_d, ΔP_gF; λ) - M(n_d, V_d, ΔP_gF; λ)
+
+    M: the model glass (`FORMULAS["model"]`), by whose dispersion a changed Abbe number changes the index and which is 0
+    at the d line; the dispersion formula of the glass stays. ΔP_gF: that of a model glass, 0 of others.
+    index, abbe: (...) with trailing axes as those of a lens's numbers. Errors of a medium with errors are added.
+    Raises InvalidIndex for a mirror, and for an Abbe number of a medium that has none: a constant index, or a glass
+    that is opaque at the lines d, F and C.
+    """
+    if glass.formula == "mirror":
+        raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
+    own = glass.coefficients.double()
+    if not glass.formula.endswith(WITH_ERRORS):
+        numbers = torch.stack([refractive_index(glass, LINES[line]) for line in "dFC"])
+        n, v = numbers[0], safe_divide(numbers[0] - 1.0, numbers[1] - numbers[2])
+        deviation = own[2] if glass.formula == "model" else torch.zeros_like(n)
+        parts = torch.broadcast_tensors(*own.unbind(0), 0 * n, n, v, 0 * n, deviation)
+        name = f"{glass.formula}{WITH_ERRORS}"
+        glass = dataclasses.replace(glass, formula=name, coefficients=torch.stack(parts), catalog="", status="")
+    parts = list(glass.coefficients.unbind(0))
+    if index is not None:
+        parts[-5] = parts[-5] + index
+    if abbe is not None:
+        if not bool((parts[-3].detach() > 0).all()):
+            raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
+        parts[-2] = parts[-2] + (parts[-3] * abbe / 100 if percent else abbe)
+    return dataclasses.replace(glass, coefficients=torch.stack(torch.broadcast_tensors(*parts)))
 
 
 def label(glass: Glass) -> str:

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,21 @@ def _horner(coefficients: list[Tensor], x: Tensor, highest: int) -> tuple[Tensor
             dp = torch.addcmul(p, dp, x)
         p = torch.addcmul(c, p, x)
     return p, dp, 2 * half
+
+
+def shifted(coefficients: Sequence[Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Σ c_k x^i y^j about a centre x_0, y_0 (...): the value there, and the coefficients of powers of x - x_0, y - y_0.
+
+    coefficients: (...) each, in the order of `powers`, as those of the result.
+    """
+    order, sums = powers(len(coefficients)), {}
+    for (i, j), c in zip(order, coefficients, strict=True):
+        for p in range(i + 1):
+            for q in range(j + 1):
+                part = math.comb(i, p) * math.comb(j, q) * c * x ** (i - p) * y ** (j - q)
+                sums[p, q] = sums[p, q] + part if (p, q) in sums else part
+    zero = torch.zeros_like(x)
+    return sums.get((0, 0), zero), [sums.get(power, zero) for power in order]
 
 
 def fringe_to_powers(count: int) -> tuple[np.ndarray, np.ndarray]:

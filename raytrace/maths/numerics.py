@@ -74,6 +74,16 @@ def varies(number: Tensor | float | None) -> bool:
     return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None
 
 
+def is_any(mask: Tensor) -> bool:
+    """Whether any entry of a mask (...) is true; inside `torch.func.vmap`, of any element of its batch.
+
+    A search that ends early then ends when all elements have: `bool(mask.any())` raises an error there.
+    """
+    while is_functorch_wrapped_tensor(mask):
+        mask = torch._C._functorch.get_unwrapped(mask)
+    return bool(mask.any())
+
+
 def with_batch_axes(vector: Tensor, count: int) -> Tensor:
     """The vector (3, ...) with at least `count` batch axes: axes of length 1 are put in behind its components.
 
@@ -363,7 +373,7 @@ def value(cls: type) -> type:
     that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
     `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would raise
     on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
-    A class with a `__repr__` keeps it.
+    A class with a `__repr__` keeps it. `torch.load` accepts it: restoring its fields executes nothing.
     """
     shown = cls.__repr__ is object.__repr__
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
@@ -386,6 +396,7 @@ def value(cls: type) -> type:
 
     pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
     _VALUE_TYPES.add(cls)
+    torch.serialization.add_safe_globals([cls])
     return cls
 
 

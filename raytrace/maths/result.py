@@ -126,7 +126,11 @@ class Result:
         raise TypeError(f"{type(self).__name__} has no figure")
 
     def plot(self, path: str | PathLike | None = None, **options):
-        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given."""
+        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given.
+
+        It is not a figure of pyplot: `plt.show` and `plt.savefig` do not show it. A notebook shows it where it is the
+        value of a cell; `figure.savefig(…)` saves it.
+        """
         figure = self.draw(**options)
         if path is not None:
             style.save(figure, path)

@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from os import PathLike
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,11 +42,13 @@ from raytrace.optimization.least_squares import (
     Cycle,
     PathState,
     SolverOptions,
+    SolverState,
     best_of_paths,
     least_squares,
     minimise,
 )
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, arguments, configurations_of, merit_for
+from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import (
     RELATIONS,
@@ -519,6 +522,7 @@ def _groups(found) -> list[tuple[int, str]]:
 # -- result ------------------------------------------------------------------------------------------------------------
 
 _SHOWN = 12  # rows of the merit function in the text, those of largest contribution
+_UNSHARP = 0.1  # MTF, of a start from which an MTF merit function is far from its maximum
 
 
 def _glass_table(steps: Sequence[GlassStep]) -> Table:
@@ -637,6 +641,7 @@ class Optimized(Result):
             f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            *self._unsharp_start(),
             "",
         ]
         variables = {
@@ -649,6 +654,15 @@ class Optimized(Result):
         rows = rows._replace(notes=[*rows.notes, *(["", *conditions] if conditions else [])])
         glasses = [_glass_table(self.glasses)] if self.glasses else []
         return [Table(variables, head), *glasses, *([self._lengths()] if self.has_configurations else []), rows]
+
+    def _unsharp_start(self) -> list[str]:
+        """A line where most rows of the MTF start near zero: there it has side lobes, and hardly a slope."""
+        rows = [k for k, row in enumerate(self.merit) if row.operand in MODULATION and row.weight != 0]
+        low = int((self.values_before[rows].abs() < _UNSHARP).sum())
+        if 2 * low <= len(rows):
+            return []
+        hint = "minimise `merit=spot` first, then the MTF from its result"
+        return [f"  {low} of {len(rows)} rows of the MTF start below {_UNSHARP:g}, where it hardly has a slope: {hint}"]
 
     def _lengths(self) -> Table:
         """Focal lengths of every configuration, and its part of the merit that is left."""
@@ -708,7 +722,7 @@ class Optimized(Result):
         return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def save(self, path: str | PathLike) -> None:
-        """Write the lens, with its variables and its merit function."""
+        """Write the lens, with its variables and its merit function; a file does not hold the constraints of `hold`."""
         write_lens(self.lens, path)
 
 
@@ -723,6 +737,14 @@ _STEEPEST = 9.0  # curvature in units of the typical one: 0.9 over the radius of
 _DAMPED = SolverOptions(damping=0.1, bends=False)
 
 
+class Opened(NamedTuple):
+    """Variables (n,) at which fewer rays fail, cycles, and whether a KeyboardInterrupt ended them."""
+
+    x: np.ndarray
+    cycles: int = 0
+    interrupted: bool = False
+
+
 def opened(
     problem: Problem,
     x: np.ndarray,
@@ -731,16 +753,17 @@ def opened(
     upper: np.ndarray,
     typical: np.ndarray | None = None,
     until: float = np.inf,
-    watch: Callable[[Cycle], None] | None = None,
-) -> np.ndarray:
-    """Variables (n,) at which fewer rays fail than at x; x itself where nearly none do, or no such variables are found.
+    watch: Callable[[Cycle, np.ndarray], None] | None = None,
+) -> Opened:
+    """Variables at which fewer rays fail than at x; x itself where nearly none do, or no such variables are found.
 
     lower, upper, typical: as for `least_squares`. until: of `time.monotonic`, when it ends; watch: invoked after each
-    cycle.
+    cycle with its report and the best variables so far.
     """
-    best = problem.state(x, False)
+    best = shown = problem.state(x, False)
+    count = 0
     if best.lost <= _FEW * (problem.evaluation.weights != 0).sum():
-        return x
+        return Opened(x)
     # the axial beam meets every sphere within these bounds: a narrow part of it would let any curvature grow
     curved = np.array([one.quantity == "curvature" for one in problem.model.variables])
     steepest = np.where(curved, _STEEPEST * typical_of(problem.model), np.inf)
@@ -750,24 +773,34 @@ def opened(
         "typical": typical,
     }
     stages = [*(problem.through(part) for part in PARTS[:-1]), problem]
+
+    def each(cycle: Cycle, solver: SolverState) -> None:
+        nonlocal shown
+        whole = problem.state(solver.x, False)
+        shown = whole if whole.is_finite and whole.is_better(shown) else shown
+        cycle = dataclasses.replace(cycle, number=count + cycle.number, merit=float(np.sqrt(shown.cost)))
+        watch(cycle, shown.x)
+
     for stage, wider in pairwise(stages):
         if time.monotonic() > until:
             break
         try:
             with np.errstate(all="ignore"):
-                trial = least_squares(
-                    stage.state, x, options=_DAMPED, cycles=_CYCLES, until=until,
-                    watch=watch and (lambda cycle, state: watch(cycle)), **bounds,
-                ).state  # fmt: skip
+                descent = least_squares(
+                    stage.state, x, options=_DAMPED, cycles=_CYCLES, until=until, watch=watch and each, **bounds
+                )
         except np.linalg.LinAlgError:  # numbers overflow
             continue
+        trial, count = descent.state, count + len(descent.cycles)
+        if descent.stopped == "interrupted":
+            return Opened((shown if shown.is_better(best) else best).x, count, True)
         if not trial.is_finite or wider.state(trial.x, False).lost > wider.state(x, False).lost:
             continue
         x, whole = trial.x, problem.state(trial.x, False)
         best = whole if whole.is_finite and whole.is_better(best) else best
         if best.lost == 0:
             break
-    return best.x
+    return Opened(best.x, count)
 
 
 # -- optimising --------------------------------------------------------------------------------------------------------
@@ -791,6 +824,7 @@ def optimize(
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
     progress: Callable | None = None,
+    watch: Callable[[Cycle, Lens], object] | None = None,
 ) -> Optimized:
     """The lens at a minimum of its merit function, by damped least squares with the exact derivatives of every row.
 
@@ -802,8 +836,9 @@ def optimize(
     AGF files for variable glasses, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
     lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
-    rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. Ctrl-C ends with
-    the best lens.
+    rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
+    after each cycle, except those of the choice of glasses, with its report and lens, while the system is opened the
+    best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable).
@@ -843,19 +878,19 @@ def optimize(
         start = np.clip(model.start, lower, upper)
         if not names:
             raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
-        with _Observer(
-            log, Checkpoint(checkpoint, of, names), progress and progress(cycles, "cycle"), None
-        ) as observer:
+        bar, seen = progress and progress(cycles, "cycle"), watch and (lambda one, x: watch(one, _lens_at(model, x)))
+        with _Observer(log, Checkpoint(checkpoint, of, names), bar, None, seen) as observer:
             before = function(model.start)[0]
             if not np.isfinite(before):
                 raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
             left = None if np.isinf(until) else until - time.monotonic()
-            watch = lambda cycle, x: observer.after_cycle(cycle, x, evaluated=function.evaluated)  # noqa: E731
-            x, stopped, history = minimise(function, start, watch=watch, seconds=left, **settings)
+            each = lambda cycle, x: observer.after_cycle(cycle, x, evaluated=function.evaluated)  # noqa: E731
+            x, stopped, history = minimise(function, start, watch=each, seconds=left, **settings)
             after = function(x)[0]
             observer.checkpoint.write(x, after, len(history), evaluated=function.evaluated, now=True)
         descent = BestDescent(x, tuple(history), stopped, len(history), function.evaluations)
-        return _warned(_optimized(lens, model, names, x, descent, started, merits=(before, after)))
+        result = _lens_at(model, x)
+        return _warned(_optimized(lens, result, model, names, x, descent, started, merits=(before, after)))
     function = merit_for(lens, merit)
     conditions = conditions_in_unit(lens, hold, function.unit)
     of_rows = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
@@ -864,22 +899,29 @@ def optimize(
     resumed = stored()
     if set(resumed.glasses) - set(glasses):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
-    start, choice, opening = np.clip(resumed.x, lower, upper), None, []
+    start, choice, opening = np.clip(resumed.x, lower, upper), None, Opened(resumed.x)
+    ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
+    bounded = {name: pair for name, pair in ends.items() if not np.isinf(pair).all()}
+
+    def lens_at(x: np.ndarray) -> Lens:
+        return _lens_at(problem.model, x, rows=problem.rows, unit=problem.unit, bounded=bounded)
+
+    seen = watch and (lambda cycle, x: watch(cycle, lens_at(x)))
     refuse_contradictions(problem, start, lower=lower, upper=upper)
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
     seconds_of_end = time.monotonic() - evaluating
     if not resumed.glasses and resumed.descent is None:
-        start = opened(
-            problem, start, lower=lower, upper=upper, typical=settings["typical"], until=until, watch=opening.append
-        )
+        opening = opened(problem, start, lower=lower, upper=upper, typical=settings["typical"], until=until, watch=seen)
+        start = opening.x
+        settings |= {"cycles": 0} if opening.interrupted else {}
         evaluating = time.monotonic()
         _refuse_undefined(problem, problem.evaluated(start, True))
         seconds_of_end = min(seconds_of_end, time.monotonic() - evaluating)  # the first evaluation takes longer
     until -= seconds_of_end  # the result is evaluated once more
     bar = progress and progress(cycles, "cycle")
-    with _Observer(log, Checkpoint(checkpoint, of, names), bar, resumed.descent) as observer:
-        if glasses:
+    with _Observer(log, Checkpoint(checkpoint, of, names), bar, resumed.descent, seen) as observer:
+        if glasses and not opening.interrupted:
             pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
             of_choice = {"cycles": cycles, "until": until, "keep": observer.checkpoint.write_glasses, **of_rows}
             choice = Choice(free, glasses, pool, function.rows, conditions, limits, **of_choice)
@@ -898,30 +940,27 @@ def optimize(
     x, count = descent.state.x, len(problem.rows)
     descent = dataclasses.replace(
         descent,
-        cycles=descent.cycles + len(opening) + (choice.descended if choice else 0),
+        stopped="interrupted" if opening.interrupted else descent.stopped,
+        cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
         evaluations=descent.evaluations + (choice.evaluations if choice else 0),
     )
     after = problem.evaluated(x)
     result = _optimized(
-        lens, problem.model, names, x, descent, started, rows=problem.rows, unit=problem.unit,
+        lens, lens_at(x), problem.model, names, x, descent, started, rows=problem.rows,
         merits=(problem.merit(before), problem.merit(after)), values=(before.values[:count], after.values[:count]),
         contributions=tuple(end.contributions(np.arange(count)) for end in (before, after)),
         glasses=tuple(choice.steps) if choice else (), conditions=reached(problem, x, lower=lower, upper=upper),
     )  # fmt: skip
-    ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
-    bounded = {name: pair for name, pair in ends.items() if not np.isinf(pair).all()}
-    data = result.lens.optimization_data  # its variables have the bounds of this optimisation
-    variables = tuple(dataclasses.replace(one, bounds=bounded.get(name_of(one), one.bounds)) for one in data.variables)
-    data = dataclasses.replace(data, variables=variables)
-    return _warned(dataclasses.replace(result, lens=dataclasses.replace(result.lens, optimization_data=data)))
+    return _warned(result)
 
 
 class _Observer:
-    """Log, checkpoint and progress bar of an optimisation; descent: the state that is resumed, then the last one."""
+    """Log, checkpoint, progress bar, `watch` of an optimisation; descent: the state that is resumed, then the last."""
 
-    def __init__(self, log, checkpoint: Checkpoint, bar, descent: PathState | None):
+    def __init__(self, log, checkpoint: Checkpoint, bar, descent: PathState | None, watch):
         cycles = () if descent is None else descent.history
         self.log, self.checkpoint, self.bar, self.descent = Log(log, cycles), checkpoint, bar, descent
+        self.watch = watch
         if bar is not None and cycles:
             bar.update(len(cycles))
 
@@ -938,6 +977,8 @@ class _Observer:
             words += [f"held to {cycle.missed:.1e}"] if cycle.missed > 1e-9 else []
             self.bar.update(1)
             self.bar.set_postfix_str(", ".join([*words, *filter(None, [cycle.limits])]))
+        if self.watch is not None:
+            self.watch(cycle, x)
 
     def __enter__(self) -> "_Observer":
         return self
@@ -965,8 +1006,20 @@ def _refuse_undefined(problem: Problem, start: Evaluated) -> None:
         raise NoProblem("no row of the merit function has a value: no ray of them gets through the lens as it is")
 
 
+def _lens_at(
+    model: Model, x: np.ndarray, *, rows: Sequence[Row] = (), unit: float = 1.0, bounded: dict[str, tuple] | None = None
+) -> Lens:
+    """The lens with its optimisation data; bounded: the bounds of this optimisation, by variable."""
+    lens = model.lens_at(x)
+    data = lens.optimization_data or optimization_data_of(model, rows, unit)
+    bounds = bounded or {}
+    variables = tuple(dataclasses.replace(one, bounds=bounds.get(name_of(one), one.bounds)) for one in data.variables)
+    return dataclasses.replace(lens, optimization_data=dataclasses.replace(data, variables=variables))
+
+
 def _optimized(
     lens: Lens,
+    after: Lens,
     model: Model,
     names: tuple[str, ...],
     x: np.ndarray,
@@ -975,7 +1028,6 @@ def _optimized(
     *,
     merits: tuple[float, float],
     rows: tuple[Row, ...] = (),
-    unit: float = 1.0,
     values: tuple = ((), ()),
     contributions: tuple = ((), ()),
     **more,
@@ -983,9 +1035,6 @@ def _optimized(
     def tensor(numbers) -> torch.Tensor:
         return torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)
 
-    after = model.lens_at(x)
-    if after.optimization_data is None:  # its file has none
-        after = dataclasses.replace(after, optimization_data=optimization_data_of(model, rows, unit))
     history = [[c.merit, c.missed, c.step, c.damping, c.seconds] for c in descent.history]
     return Optimized(
         lens=after,

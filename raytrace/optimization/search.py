@@ -399,8 +399,9 @@ class _Run:
             if best is None or rank < worth:
                 best, worth = x, rank
         if worth[0]:
-            best = opened(self.whole, best, lower=self.space.lower, upper=self.space.upper, until=self.journal.until)
-            if time.monotonic() > self.journal.until:
+            bounds = {"lower": self.space.lower, "upper": self.space.upper}
+            best, _, interrupted = opened(self.whole, best, until=self.journal.until, **bounds)
+            if interrupted or time.monotonic() > self.journal.until:
                 raise SearchStopped
         stages = [
             Stage(self.narrow, _SHORT[0], _DAMPED, *self.bounds),

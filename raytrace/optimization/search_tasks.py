@@ -329,11 +329,7 @@ def length_of(model: Model, rows: Sequence[Row], unit: float, conditions: Sequen
     if targets:
         return abs(targets[0].target * unit)
     state = model.views[model.lens.current_configuration - 1].state(model.start)
-    data = state.gaussian(state.primary)
-    if float(data.C) == 0:
-        return None
-    with np.errstate(divide="ignore"):
-        length = abs(float(data.effective_focal_length))
+    length = abs(float(state.gaussian(state.primary).effective_focal_length))
     return length if np.isfinite(length) else None
 
 

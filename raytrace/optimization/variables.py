@@ -2,7 +2,7 @@
 
 curvature thickness           all refracting and reflecting surfaces; all gaps from surface 1 to the image
 curvature:1-4,7 conic:3 a4:3  of some surfaces
-tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose
+tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose; of the image, too
 sensor                        the last gap
 index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
 thickness:6@2                 in configuration 2, of a number that differs between configurations
@@ -147,18 +147,19 @@ def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freed
         if data is None or not data.variables:
             raise BadVariables("the file has no variables: `vary` names them, as 'curvature thickness'")
         return Freedom(lens, data.variables, of_file)
-    if not isinstance(vary, str) and not all(isinstance(one, str) for one in vary):
+    listed = [vary] if isinstance(vary, str) else vary
+    variables: dict[str, Vary] = {name_of(one): one for one in listed if not isinstance(one, str)}
+    words = split_words([one for one in listed if isinstance(one, str)])
+    if variables and not words:
         return Freedom(lens, tuple(vary), of_file)
-    words = split_words(vary)
     new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
-    variables: dict[str, Vary] = {}
     for word in words:
         if "=" not in word:
             solved = set() if ":" in word or word == "sensor" else _addresses((*new, *of_file))
             variables |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & solved}
     if not variables:
         raise BadVariables(
-            f"`vary={joined(vary)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
+            f"`vary={joined(words)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
         )
     free, solved = _addresses(variables.values()), _addresses(new)
     for surface, quantity, *_ in free & solved:
@@ -314,8 +315,9 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
     """The numbers of a surface that a kind stands for."""
     if kind == "thickness" and k == 0 and bool(torch.isfinite(lens.surfaces[0].thickness)):
         return [kind]
-    if not 1 <= k <= sensor(lens):
-        raise BadVariables(f"{word!r}: surface {k}; this lens has surfaces 1 to {sensor(lens)} to vary")
+    last = sensor(lens) if kind in ("thickness", *MEDIA) else sensor(lens) + 1  # nothing is behind the image
+    if not 1 <= k <= last:
+        raise BadVariables(f"{word!r}: surface {k}; this lens has surfaces 1 to {last} to vary")
     surface = lens.surfaces[k]
     if kind in MEDIA:
         if surface.is_mirror or surface.is_break or is_air(surface.glass):

@@ -99,6 +99,7 @@ def _windows(psfs: Psf) -> tuple[Tensor, Tensor]:
 
 DECADES = 4  # of light on a logarithmic scale
 _MOST_PIXELS = 16  # across a panel, whose edges are drawn
+_LINE = 4  # kernels of one distance in a line
 
 
 @styled
@@ -107,13 +108,14 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
 
     Where its pixels were specified, or rays are independent, pixels are drawn; else the light itself in windows that
     it fills, with the edges of the pixels. close_up: that light, if it is already computed. Kernels of each wavelength
-    have a row each, fields outermost. log: four decades of brightness below the peak. Below each: the energy inside the
-    window, and that of the brightest pixel.
+    have a row each, fields outermost; of one distance, fields are rows and wavelengths are columns. log: four decades
+    of brightness below the peak. Below each: the energy inside the window, and that of the brightest pixel.
     """
     if close_up is None and not psfs.framed and psfs.order is not None:
         close_up = close_up_of(psfs)
     distances = psfs.object_distances.tolist()
     labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
+    line = _LINE if psfs.wavelengths_summed or len(psfs.wavelengths) > 2 * _LINE else len(psfs.wavelengths)
     if not psfs.wavelengths_summed:
         labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in psfs.wavelengths.tolist()]
     title = ": ".join(filter(None, (psfs.lens.name, f"{psfs.model} PSF")))
@@ -125,11 +127,11 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     pitch = float(psfs.grid.pitch)
     half = 0.5 * pitch * psfs.grid.columns
     if close_up is None:
-        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log, line)
         return worded(figure, title, [f"{window(psfs.grid)}; max: light of the brightest pixel", brightness(log)])
     drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
-    figure, axes = panels(drawn, halves, distances, labels, notes, log)
+    figure, axes = panels(drawn, halves, distances, labels, notes, log, line)
     centre = array(psfs.grid.centre).reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
@@ -146,17 +148,17 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
     return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
 
 
-def panels(kernels, halves, distances, labels, notes, log: bool):
+def panels(kernels, halves, distances, labels, notes, log: bool, line: int = _LINE):
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
-    Distances are above and labels on the left; kernels of one distance follow each other in lines of four, each under
-    its label.
+    Distances are above and labels on the left; kernels of one distance follow each other in lines of `line`, each
+    under its label.
     """
     from matplotlib.colors import LogNorm, Normalize
 
     rows, columns = len(labels), len(distances)
     flows = columns == 1 and rows > 1
-    shape = (-(-rows // 4), min(rows, 4)) if flows else (rows, columns)
+    shape = (-(-rows // line), min(rows, line)) if flows else (rows, columns)
     figure = new_figure(max(4.4, 1.75 * shape[1] + 0.7), (1.85 if max(shape) > 1 else 2.6) * shape[0] + 0.9)
     grid = figure.subplots(*shape, squeeze=False)
     axes = grid.reshape(-1, 1)[:rows] if flows else grid
@@ -178,7 +180,7 @@ def panels(kernels, halves, distances, labels, notes, log: bool):
         elif row == 0:
             panel.set_title(_distance(distances[column]), color=INK)
         if column == 0:
-            panel.set_ylabel((_distance(distances[0]) if row % 4 == 0 else "") if flows else labels[row])
+            panel.set_ylabel((_distance(distances[0]) if row % line == 0 else "") if flows else labels[row])
     for panel in grid.flat[rows:] if flows else ():
         panel.axis("off")
     return figure, axes

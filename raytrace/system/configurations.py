@@ -144,6 +144,7 @@ def freed(lens: Whole, **conditions) -> Whole:
         "f_number": (("aperture",),),
         "entrance_pupil_diameter": (("aperture",),),
         **{name: (("environment", name),) for name in ("temperature", "pressure")},
+        "field_weights": (("fields", "weight"),),
         "wavelengths": (("wavelengths",), ("wavelength_weights",), ("primary_wavelength",)),
     }
     names = [name for name, condition in conditions.items() if condition is not None]

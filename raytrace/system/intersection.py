@@ -312,8 +312,15 @@ def first_crossing(
 
 @torch.library.register_fake("raytrace::first_crossing")
 def _(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
-    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
+    batch = _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms)
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
+
+
+def _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms: str) -> torch.Size:
+    """The shape that the arguments of the operator broadcast to."""
+    varied = Relief(sag_terms, numbers).batch if sag_terms else ()
+    rays = foot.shape[1:], direction.shape[1:]
+    return broadcast_shape(*rays, curvature.shape, conic.shape, coefficients.shape[1:], varied)
 
 
 @torch.library.register_vmap("raytrace::first_crossing")
@@ -346,8 +353,8 @@ def search(
     rim: float,
 ) -> tuple[Tensor, Tensor]:
     """The operator outside of transforms."""
-    relief = Relief(sag_terms, numbers) if sag_terms else None
-    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
+    batch = _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms)
+    relief = Relief(sag_terms, numbers).flat(batch) if sag_terms else None
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)
     coefficients = coefficients.double()
@@ -425,7 +432,8 @@ class _Rays(NamedTuple):
 
     def of(self, few: Tensor) -> "_Rays":
         a = self.a if self.a.shape[1] == 1 else self.a[:, few]
-        return self._replace(p=self.p[:, few], d=self.d[:, few], c=self.c[few], k=self.k[few], a=a)
+        relief = None if self.relief is None else self.relief.of(few)
+        return self._replace(p=self.p[:, few], d=self.d[:, few], c=self.c[few], k=self.k[few], a=a, relief=relief)
 
     def sag(self, u: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
         return sag_and_derivatives(u, self.c, self.k, self.a, highest, kind=self.kind)

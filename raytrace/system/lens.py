@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from raytrace.materials.catalogs import medium
 from raytrace.materials.environment import (
     REFERENCE,
     Environment,
@@ -20,8 +21,9 @@ from raytrace.maths.numerics import check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
-from raytrace.system.configurations import Operand
-from raytrace.system.optimization_data import OptimizationData
+from raytrace.system.configurations import Operand, ScaledPath
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean
@@ -78,6 +80,19 @@ class Fields:
         return FIELD_UNITS[self.kind]
 
 
+#: Methods of modules and tensors of torch that a lens, a value, lacks: the function in their place.
+_IN_TORCH = {
+    **dict.fromkeys(
+        ("to", "cpu", "cuda", "float", "double", "dtype", "device"),
+        "; `rt.to(lens, dtype=…, device=…)` converts it, and its tensors have dtype and device",
+    ),
+    **dict.fromkeys(
+        ("parameters", "named_parameters", "requires_grad_", "train", "state_dict", "load_state_dict"),
+        '; it is a value: `rt.Variables(lens, "curvature thickness")` is the module of its numbers',
+    ),
+}
+
+
 @value
 class Lens:
     """A sequential lens in mm and µm. `lens.surfaces[k]` is surface k of the file: 0 the object, the last the image.
@@ -122,6 +137,9 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
+    def __getattr__(self, name: str):
+        raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
+
     def __str__(self) -> str:
         from raytrace.tracing.lens_report import text
 
@@ -141,7 +159,10 @@ class Lens:
         f_number: Tensor | float | None = None,
         entrance_pupil_diameter: Tensor | float | None = None,
         wavelengths: Tensor | Sequence[float] | None = None,
+        wavelength_weights: Tensor | Sequence[float] | None = None,
+        primary_wavelength: int | None = None,
         fields: Tensor | Sequence | None = None,
+        field_weights: Tensor | Sequence[float] | None = None,
         ray_aiming: str | None = None,
         temperature: Tensor | float | None = None,
         pressure: Tensor | float | None = None,
@@ -151,7 +172,9 @@ class Lens:
 
         object_distance: mm from the object to surface 1, inf allowed; sensor_distance: mm from the last surface before
         the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
-        weight, the first one primary; fields: y, or (x, y), in the lens's own kind, without vignetting factors;
+        weight and the first one primary unless wavelength_weights (W,) and primary_wavelength, its number from 1, are
+        given; fields: y, or (x, y), in the lens's own kind, without vignetting factors, alike in weight unless
+        field_weights (F,) are given; weights: relative;
         temperature: °C, pressure: atm, 0 in vacuum: what is not given of the two stays, or is 20 °C and 1 atm. Warns
         NoThermalCoefficients. configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
         Raises ValueError for conditions that no lens has.
@@ -161,7 +184,9 @@ class Lens:
             found,
             **dict(object_distance=object_distance, sensor_distance=sensor_distance, f_number=f_number),
             **dict(entrance_pupil_diameter=entrance_pupil_diameter, wavelengths=wavelengths),
-            **dict(fields=fields, ray_aiming=ray_aiming, temperature=temperature, pressure=pressure),
+            **dict(wavelength_weights=wavelength_weights, primary_wavelength=primary_wavelength),
+            **dict(fields=fields, field_weights=field_weights),
+            **dict(ray_aiming=ray_aiming, temperature=temperature, pressure=pressure),
         )
         if object_distance is not None:
             found = with_object_distance(found, object_distance)
@@ -178,6 +203,14 @@ class Lens:
             x, y = field_points(fields, like=self.fields.y)
             kept = dataclasses.replace(self.fields, x=x, y=y, weight=torch.ones_like(y), vignetting=None)
             found = dataclasses.replace(found, fields=kept)
+        if wavelength_weights is not None:
+            weights = _weights("wavelength", wavelength_weights, like=found.wavelengths)
+            found = dataclasses.replace(found, wavelength_weights=weights)
+        if primary_wavelength is not None:
+            found = dataclasses.replace(found, primary_wavelength=int(primary_wavelength))
+        if field_weights is not None:
+            weights = _weights("field", field_weights, like=found.fields.y)
+            found = dataclasses.replace(found, fields=dataclasses.replace(found.fields, weight=weights))
         if ray_aiming is not None:
             found = dataclasses.replace(found, ray_aiming=ray_aiming)
         if temperature is not None or pressure is not None:
@@ -188,26 +221,51 @@ class Lens:
     def replace(self, surface: int, **numbers) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
-        surface: its number in the file, 0 the object; numbers: fields of Surface, or radius (mm); plain numbers, or
-        tensors that may require a gradient; glass: a Glass. Raises ValueError naming what the surface does not have.
+        surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
+        x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
+        tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
+        Raises ValueError naming what the surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
         surfaces = list(self.surfaces)
-        surfaces[surface] = changed(surfaces[surface], numbers, f"surface {surface}", like=self.wavelengths)
+        where = f"surface {surface}"
+        if "glass" in numbers:
+            numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
+        surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
         found = dataclasses.replace(self, surfaces=tuple(surfaces))
         return multiple.kept(found) if self.operands else found
 
 
+#: Fields of a surface and of its pose, by the name of a number of a pose: tilt_x; behind the surface, tilt_x_after.
+_POSED = {
+    field.name + behind: (side, field.name)
+    for side, behind in (("before", ""), ("after", "_after"))
+    for field in dataclasses.fields(Pose)
+}
+
+# Plain data of a lens, for torch.load; values are known to it already (`numerics.value`).
+torch.serialization.add_safe_globals([OptimizationData, Row, ScaledPath, Solve, Vary])
+
+
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
-    """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature."""
+    """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature;
+    tilt_x, … and tilt_x_after, …: of its poses, whose other numbers stay."""
     known = [field.name for field in dataclasses.fields(Surface)]
     numeric = {field.name for field in dataclasses.fields(Surface) if field.type in (Tensor, Tensor | None)}
     given = dict(numbers)
     for name in given:
-        if name not in (*known, "radius"):
-            meant = did_you_mean(name, [*known, "radius"])
-            raise ValueError(f"{where} has no {name!r}{meant} (it has {', '.join(known)}, radius)")
+        if name not in (*known, "radius", *_POSED):
+            meant = did_you_mean(name, [*known, "radius", *_POSED])
+            listed = ", ".join([*known, "radius", *_POSED])
+            raise ValueError(f"{where} has no {name!r}{meant} (it has {listed})")
+    for name in [name for name in given if name in _POSED]:
+        side, field = _POSED[name]
+        if side in numbers:
+            raise ValueError(f"{where}: both {side} and {name} are given; leave one out")
+        given[side] = dataclasses.replace(
+            given.get(side) or getattr(surface, side) or Pose(), **{field: given.pop(name)}
+        )
     if "radius" in given:
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")
@@ -274,6 +332,16 @@ def _with_tensors(part, like: Tensor):
     numeric = {field.name for field in dataclasses.fields(part) if field.type in (Tensor, Tensor | None)}
     found = {name: getattr(part, name) for name in numeric}
     return dataclasses.replace(part, **{name: _like(v, like) for name, v in found.items() if v is not None})
+
+
+def _weights(of: str, weights: Tensor | Sequence[float], *, like: Tensor) -> Tensor:
+    """Weights of the wavelengths or fields `like`, one for each. Raises ValueError."""
+    found = _like(weights, like)
+    if found.shape != like.shape:
+        raise ValueError(f"`{of}_weights`: {found.numel()} found; expected {len(like)}, one for each {of}")
+    if not bool((torch.isfinite(found) & (found >= 0)).all() and (found > 0).any()):
+        raise ValueError(f"`{of}_weights` {found.tolist()}: expected numbers from 0 up, at least one above 0")
+    return found
 
 
 def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:
@@ -369,9 +437,9 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
 def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:
     """`refractive_index` of each glass; glasses of one formula are evaluated together."""
     groups: dict[object, list[int]] = {}
-    for number, medium in enumerate(glasses):
-        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
-        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    for number, glass in enumerate(glasses):
+        together = glass.formula not in ("mirror", "constant") and glass.coefficients.dim() == 1
+        groups.setdefault((glass.formula, len(glass.coefficients)) if together else number, []).append(number)
     indices: dict[int, Tensor] = {}
     for numbers in groups.values():
         if len(numbers) == 1:
@@ -422,12 +490,12 @@ def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
     media = [surface.glass for surface in lens.surfaces[:-1]]
     check_unit(wavelengths, media, believed=lens.wavelengths, where=where)
     seen = set()
-    for number, medium in enumerate(media):
-        key = (medium.name, medium.catalog)
-        if medium.formula != "constant" and key not in seen:
+    for number, glass in enumerate(media):
+        key = (glass.name, glass.catalog)
+        if glass.formula != "constant" and key not in seen:
             seen.add(key)
             place = f"{where}, surface {number}" if where else f"surface {number}"
-            check_wavelengths(medium, wavelengths, where=place)
+            check_wavelengths(glass, wavelengths, where=place)
 
 
 def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:

@@ -21,6 +21,7 @@ from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
 
+_PLAIN = 2  # axes of a tensor of one lens at most: heights; more vary from lens to lens, behind that of the entries
 _POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
 
 
@@ -74,7 +75,9 @@ def number_at(part, place: ParameterPath) -> Tensor | None:
     """The number at a path; None where it is not modelled."""
     for name in place.path:
         part = getattr(part, name)
-    return part if place.entry is None else part.reshape(-1)[place.entry]
+    if place.entry is None:
+        return part
+    return part[place.entry] if part.dim() > _PLAIN else part.reshape(-1)[place.entry]
 
 
 def with_number(part, place: ParameterPath, number: Tensor):
@@ -83,6 +86,10 @@ def with_number(part, place: ParameterPath, number: Tensor):
     old = getattr(part, name)
     if rest:
         number = with_number(old, ParameterPath(tuple(rest), place.entry), number)
+    elif place.entry is not None and max(number.dim(), old.dim()) > _PLAIN:
+        entries = list(old.unbind(0))
+        entries[place.entry] = number
+        number = torch.stack(torch.broadcast_tensors(*entries))
     elif place.entry is not None:
         flat = old.reshape(-1)
         number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)

@@ -114,22 +114,87 @@ def cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
 Number = float | Tensor
 
 
-def passage(gap: Tensor | Gap | None, before: Pose | None) -> list[list[Number]]:
+#: New = rotation · old + shift as rows (3, 4); entries that are 0 or 1 for all angles stay constants.
+Rows = list[list[Number]]
+
+
+def passage(gap: Tensor | Gap | None, before: Pose | None) -> Rows:
     """`point_in` along a gap and a pose as the rows of rotation and shift (3, 4): [x, y, z, 1] -> new.
 
     Entries that are 0 or 1 for all angles stay constants, without operators.
     """
-    rows: list[list[Number]] = [[1.0 if i == j else 0.0 for j in range(4)] for i in range(3)]
-    if isinstance(gap, Gap):
-        rows = _through(gap.pose, rows)
-    thickness = gap.thickness if isinstance(gap, Gap) else gap
-    if thickness is not None:
-        rows[2] = [*rows[2][:3], _sum(rows[2][3], -thickness)]
-    return rows if before is None else _through(before, rows)
+    steps = [gap.pose, gap.thickness] if isinstance(gap, Gap) else [gap]
+    return rows_along([*steps, before])
 
 
-def _through(pose: Pose, rows: list[list[Number]]) -> list[list[Number]]:
-    def shifted(rows: list[list[Number]]) -> list[list[Number]]:
+def rows_along(steps: Sequence[Pose | Tensor | None]) -> Rows:
+    """The rows of poses and thicknesses (...) mm in sequence; None is no step."""
+    rows: Rows = [[1.0 if i == j else 0.0 for j in range(4)] for i in range(3)]
+    for step in steps:
+        if isinstance(step, Pose):
+            rows = _through(step, rows)
+        elif step is not None:
+            rows[2] = [*rows[2][:3], _sum(rows[2][3], -step)]
+    return rows
+
+
+def rows_back(rows: Rows) -> Rows:
+    """The rows that lead back: new = rotationᵀ · (old - shift)."""
+    turned = [[rows[j][i] for j in range(3)] for i in range(3)]
+    return [[*row, _negative(_dot(row, [entry[3] for entry in rows]))] for row in turned]
+
+
+def rows_of_both(first: Rows, second: Rows) -> Rows:
+    """The rows of one passage and then another."""
+    columns = list(zip(*first, strict=True))
+    return [
+        [_sum(_dot(row[:3], column), row[3] if j == 3 else 0.0) for j, column in enumerate(columns)] for row in second
+    ]
+
+
+def pose_of(rows: Rows) -> Pose:
+    """The pose, decentred first, of a passage: old = d + A new, A = Rx Ry Rz.
+
+        d = -A shift,  tan tilt_x = -A_yz/A_zz,  tan tilt_y = A_xz/√(A_xx² + A_xy²),  tan tilt_z = -A_xy/A_xx
+
+    Numbers that are 0 for all angles are None. At tilt_y = ±90° the tilts are not unique and have no derivative.
+    """
+    back = rows_back(rows)
+    (xx, xy, xz, x), (_, _, yz, y), (_, _, zz, z) = back
+    across = xx if isinstance(xy, float) and xy == 0.0 else torch.hypot(*torch.broadcast_tensors(*_tensors(xx, xy)))
+    return Pose(
+        *(step if isinstance(step, Tensor) else None for step in (x, y, z)),
+        _angle(_negative(yz), zz),
+        _angle(xz, across),
+        _angle(_negative(xy), xx),
+    )
+
+
+def _angle(sine: Number, cosine: Number) -> Tensor | None:
+    """The angle in degrees; None where it is 0 for all."""
+    if isinstance(sine, float) and sine == 0.0:
+        return None
+    return torch.rad2deg(torch.atan2(*torch.broadcast_tensors(*_tensors(sine, cosine))))
+
+
+def _tensors(*numbers: Number) -> list[Tensor]:
+    like = next(number for number in numbers if isinstance(number, Tensor))
+    return [number if isinstance(number, Tensor) else like.new_tensor(number) for number in numbers]
+
+
+def _negative(number: Number) -> Number:
+    return 0.0 if isinstance(number, float) and number == 0.0 else -number
+
+
+def _dot(row: Sequence[Number], column: Sequence[Number]) -> Number:
+    total: Number = 0.0
+    for a, b in zip(row, column, strict=True):
+        total = _sum(total, (b if a == 1.0 else 0.0) if isinstance(a, float) else _product(a, b))
+    return total
+
+
+def _through(pose: Pose, rows: Rows) -> Rows:
+    def shifted(rows: Rows) -> Rows:
         steps = [0.0 if step is None else -step for step in (pose.x, pose.y, pose.z)]
         return [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.catalogs import find_glass
-from raytrace.materials.glass import AIR, MIRROR, Glass, check_unit, constant, model_glass
+from raytrace.materials.catalogs import medium
+from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
 from raytrace.words import named_value
@@ -39,8 +39,9 @@ def lens(
 
     rows: mappings, or a DataFrame: radius (mm, inf is a plane) or curvature (1/mm), thickness (mm to the next vertex,
     of the last row to the sensor), glass (a name, an index, (nd, Vd) or a Glass behind the surface; air by default,
-    "MIRROR" reflects), conic, coefficients (of r², r⁴, … in mm^(1-2j)), semi_diameter, apertures, comment; numbers may
-    be tensors that require a gradient.
+    "MIRROR" reflects), conic, coefficients (of r², r⁴, … in mm^(1-2j)), semi_diameter, apertures, comment; decentres
+    x, y, z (mm) and tilts tilt_x, tilt_y, tilt_z (degrees) of its axes, and x_after, … of the axes behind it, each pose
+    also as a Pose, before or after; numbers may be tensors that require a gradient.
     stop: number of the stop surface, counted from 1. One aperture by name, as f_number=3.5 or
     entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
@@ -97,19 +98,6 @@ def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surf
         return changed(Surface(_tensor(0.0)), cells, where, like=_tensor(0.0))
     except (TypeError, ValueError) as error:
         raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
-
-
-def medium(glass: Glass | str | float | Sequence[float], catalogs: Sequence[str] = (), where: str = "") -> Glass:
-    """A glass by its name, its index, (nd, Vd) or (nd, Vd, ΔPgF); a Glass passes as it is."""
-    if isinstance(glass, Glass):
-        return glass
-    if isinstance(glass, str):
-        word = glass.strip().upper()
-        known = {"": AIR, "AIR": AIR, "MIRROR": MIRROR}
-        return known[word] if word in known else find_glass(glass.strip(), catalogs=catalogs, where=where)
-    if isinstance(glass, Sequence):
-        return model_glass(*glass)
-    return AIR if not isinstance(glass, Tensor) and float(glass) == 1 else constant(glass)
 
 
 def _aperture(apertures: Mapping[str, float]) -> SystemAperture:

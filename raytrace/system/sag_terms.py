@@ -16,14 +16,15 @@ PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linea
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import Sag, polynomial_xy, powers, zernike_to_powers
-from raytrace.maths.numerics import polynomial, value
+from raytrace.maths.bivariate import Sag, polynomial_xy, powers, shifted, zernike_to_powers
+from raytrace.maths.numerics import broadcast_shape, polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
 
@@ -290,7 +291,7 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     """A bound on |D| up to a radius (...) mm: Σ |c| (r/R)^degree."""
     c, unit = numbers
     degrees = [sum(power) for power in powers(len(c))]
-    sums = [c.new_zeros(())] * (max(degrees, default=0) + 1)
+    sums = [torch.zeros_like(c[0])] * (max(degrees, default=0) + 1) if len(c) else [c.new_zeros(())]
     for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
         sums[degree] = sums[degree] + a
     return polynomial(torch.stack(sums), radius / unit.abs())
@@ -345,6 +346,7 @@ class SagTermKind:
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
     prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
+    axes: of each of its numbers itself; further ones vary from lens to lens, and from ray to ray.
     powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
     traced by torch alone.
     """
@@ -354,19 +356,20 @@ class SagTermKind:
     covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda _, x, y: torch.ones_like(x, dtype=torch.bool)
     prepare: Callable = lambda sag_terms: sag_terms
     is_round: bool = False
+    axes: tuple[int, ...] = (1, 0)
     powers: Callable | None = None
     compiled: int | None = None
 
 
 SAG_TERMS = {
-    "GridSag": SagTermKind(spline_sag, spline_size, spline_covers, prepare=spline),
-    "SplineSag": SagTermKind(spline_sag, spline_size, spline_covers),
+    "GridSag": SagTermKind(spline_sag, spline_size, spline_covers, prepare=spline, axes=(2, 0)),
+    "SplineSag": SagTermKind(spline_sag, spline_size, spline_covers, axes=(2, 0)),
     "ZernikeSag": SagTermKind(zernike_sag, zernike_size, powers=powers_of_zernike, compiled=91),
-    "FringeSag": SagTermKind(fringe_sag, fringe_size, powers=powers_of_fringe, compiled=37),
+    "FringeSag": SagTermKind(fringe_sag, fringe_size, axes=(1, 0, 0, 0), powers=powers_of_fringe, compiled=37),
     "PolynomialSag": SagTermKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
     "IrregularSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
     "TiltSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "PowerSag": SagTermKind(power_sag, power_size, powers=lambda sag_terms: sag_terms),
+    "PowerSag": SagTermKind(power_sag, power_size, axes=(0, 0, 0, 0, 1), powers=lambda sag_terms: sag_terms),
 }
 
 SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
@@ -391,8 +394,77 @@ class Relief:
         """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
         return SAG_TERMS[self.kind].size(self.numbers, radius)
 
+    @property
+    def batch(self) -> torch.Size:
+        """The shape of the axes along which its numbers vary."""
+        return broadcast_shape(*(number.shape[axes:] for number, axes in self._with_axes()))
+
+    def flat(self, batch: Sequence[int]) -> "Relief":
+        """The same with the numbers that vary for the rays of a batch in one axis."""
+        numbers = []
+        for number, axes in self._with_axes():
+            if number.dim() > axes:
+                own, trailing = number.shape[:axes], number.shape[axes:]
+                number = number.reshape(*own, *(1,) * (len(batch) - len(trailing)), *trailing)
+                number = number.expand(*own, *batch).reshape(*own, -1)
+            numbers.append(number)
+        return Relief(self.kind, numbers)
+
+    def of(self, few: Tensor) -> "Relief":
+        """The same for few of the rays of one axis."""
+        numbers = [number[..., few] if number.dim() > axes else number for number, axes in self._with_axes()]
+        return Relief(self.kind, numbers)
+
+    def _with_axes(self) -> list[tuple[Tensor, int]]:
+        return list(zip(self.numbers, SAG_TERMS[self.kind].axes, strict=True))
+
 
 def relief(sag_terms: SagTerms) -> Relief:
     """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
     name = type(sag_terms).__name__
     return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])
+
+
+def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor) -> SagTerms:
+    """Sag terms, or None, with further powers of x/R and y/R about the vertex added.
+
+    coefficients: (J, ...) mm, in the order of `PolynomialSag`, trailing axes as those of a lens's numbers; radius: () R
+    mm. Sums of powers and of Zernike's terms become powers about their centre. A grid gets the heights of the powers at
+    its points: the spline through them is that of the sum, exact for powers of degree 3 and fewer. Raises ValueError
+    for a grid in a batch of lenses.
+    """
+    if isinstance(sag_terms, GridSag | SplineSag):
+        return _with_heights(sag_terms, coefficients, radius)
+    zero = torch.zeros_like(radius)
+    if sag_terms is None:
+        return PowerSag(zero, zero, radius, zero, coefficients)
+    given = SAG_TERMS[type(sag_terms).__name__].powers(sag_terms)
+    terms = _scaled(coefficients, given.radius / radius)
+    if isinstance(sag_terms, FringeSag | PowerSag):
+        height, terms = shifted(terms, given.centre_x / given.radius, given.centre_y / given.radius)
+        given = dataclasses.replace(given, height=given.height + height)
+    entries = itertools.zip_longest(given.coefficients.unbind(0), terms, fillvalue=zero)
+    sums = [a if b is zero else b if a is zero else a + b for a, b in entries]
+    return dataclasses.replace(given, coefficients=torch.stack(torch.broadcast_tensors(*sums)))
+
+
+def _scaled(coefficients: Tensor, factor: Tensor) -> list[Tensor]:
+    """The coefficients of powers of x/(f R) in place of x/R."""
+    degrees = [sum(power) for power in powers(len(coefficients))]
+    return [a * factor**degree for degree, a in zip(degrees, coefficients.unbind(0), strict=True)]
+
+
+def _with_heights(grid: GridSag | SplineSag, coefficients: Tensor, radius: Tensor) -> GridSag | SplineSag:
+    """A grid with the heights of powers at its points."""
+    if coefficients.dim() > 1:
+        raise ValueError("a surface with a grid of heights cannot vary from lens to lens; expected one lens at a time")
+    is_grid = isinstance(grid, GridSag)
+    rows, columns = grid.heights.shape if is_grid else (count - 2 for count in grid.coefficients.shape)
+    y, x = (
+        (torch.arange(count, dtype=coefficients.dtype, device=coefficients.device) - 0.5 * (count - 1)) * grid.pitch
+        for count in (rows, columns)
+    )
+    heights = polynomial_xy(coefficients, x / radius, y[:, None] / radius, 0).z
+    if is_grid:
+        return dataclasses.replace(grid, heights=grid.heights + heights)
+    return dataclasses.replace(grid, coefficients=grid.coefficients + spline(GridSag(heights, grid.pitch)).coefficients)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, safe_divide, varies, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, is_any, safe_divide, varies, with_batch_axes
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at
@@ -115,7 +115,7 @@ def _root(
         close = (worst <= tolerance) & ~found
         root, last_step = torch.where(close, followed, root), torch.where(close, step, last_step)
         found = found | close
-        if bool(found.all()):
+        if not is_any(~found):
             break
     root = root - last_step
     if not any(map(varies, pytree.tree_leaves(given))):  # else the last step is attached: first derivatives are exact
@@ -143,7 +143,7 @@ def _followed(
         share = torch.ones_like(root[0])
         for _ in range(_STEPS):
             moving = sought & (_length(error) > close)
-            if not bool(moving.any()):
+            if not is_any(moving):
                 break
             trial = root - share * step
             trial_error, trial_step = _error_and_step(residual, trial, fraction)
@@ -151,7 +151,7 @@ def _followed(
             root, error = torch.where(better, trial, root), torch.where(better, trial_error, error)
             step, share = torch.where(better, trial_step, step), torch.where(better, 1.0, share / 4)
         sought = sought & (_length(error) <= _LOST)
-        if not bool(sought.any()):
+        if not is_any(sought):
             break
     worst = error.abs().amax(0)
     return root, worst if stage == stages else torch.full_like(worst, torch.inf), step

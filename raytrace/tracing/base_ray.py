@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit, value, varies
+from raytrace.maths.numerics import broadcast_shape, dot, is_any, safe_sqrt, unit, value, varies
 from raytrace.system.lens import Lens, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
@@ -96,7 +96,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     exit_pupil, image = _closest(chief), _closest(fan)
     across = _at(rim, exit_pupil)
     magnification = torch.zeros_like(image)
-    if bool((kappa != 0).any()):  # by chief rays of object points 1 mm off the base ray
+    if is_any(kappa != 0):  # by chief rays of object points 1 mm off the base ray
         turn = -kappa * _inverse(one + kappa * near.E)
         height = _at(near.behind(-near.E @ turn, turn), image)
         magnification = _sign(near.carried, height) * _length(height)

@@ -170,7 +170,7 @@ def is_expressible(surface: Surface) -> bool:
     if surface.sag_terms is not None:
         kind, numbers = SAG_TERMS[type(surface.sag_terms).__name__], tree_leaves(surface.sag_terms)
         few = kind.compiled is None or all(number.numel() <= kind.compiled for number in numbers)
-        alike = all(number.dim() <= 1 for number in numbers)  # for all rays
+        alike = isinstance(surface.sag_terms, PowerSag) or all(number.dim() <= 1 for number in numbers)  # for all rays
         if not (surface.kind == EVEN and kind.powers is not None and few and alike):
             return False
     kind = KINDS[surface.kind]
@@ -349,10 +349,10 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
         curvature, conic, *terms = numbers[row.phase_numbers : row.phase_numbers + row.phase_terms]
     else:
         phase = _phase_of(row, numbers)
-    if row.kind == _WITH_SAG_TERMS:  # alike in every row of a table: those of the first
-        last = row.sag_term_numbers + _FRAME + row.sag_term_count
-        entries = torch.stack([number.reshape(-1)[0] for number in numbers[row.sag_term_numbers : last]])
-        sag_terms = PowerSag(*entries[:_FRAME].unbind(0), entries[_FRAME:])
+    if row.kind == _WITH_SAG_TERMS:
+        first, last = row.sag_term_numbers, row.sag_term_numbers + _FRAME + row.sag_term_count
+        frame, entries = numbers[first : first + _FRAME], numbers[first + _FRAME : last]
+        sag_terms = PowerSag(*frame, torch.stack(list(entries)) if entries else frame[0].new_zeros(0))
     return dataclasses.replace(
         surface,
         curvature=curvature,

@@ -148,6 +148,7 @@ FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno
 _THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
 _TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
 _COMPILERS = ("c++", "g++", "clang++")
+_TAKES = "10 to 60 s"  # of a processor that is free, with g++
 _BUILDING = "building-"
 _DAY = 24 * 3600.0  # s
 _LONG = 90 * _DAY
@@ -219,7 +220,7 @@ def run_compiler(*words: str, folder: Path) -> subprocess.CompletedProcess:
     """Run a program of `compiler` in a private folder, so that no relative path leads elsewhere."""
     environment = os.environ | {"PATH": _safe_path()}
     return subprocess.run(
-        words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600
+        words, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=1800
     )
 
 
@@ -308,7 +309,7 @@ def _processor(*only: str) -> str:
 def _build(folder: Path) -> Path:
     """The trace, compiled into a private folder. Raises NoCompiler, and OSError where it cannot be written."""
     program, source = compiler(), CPP / "trace.cpp"
-    note = threading.Timer(1.0, _say, ["compiling the trace, once for this machine …"])
+    note = threading.Timer(2.0, _say, [f"compiling the trace for this machine (once, {_TAKES}) …"])
     note.daemon = True
     note.start()
     made, compiled = folder / _file_name(), folder / "trace.o"

@@ -53,7 +53,7 @@ class Defect:
 def defects(lens: Lens) -> tuple[Defect, ...]:
     """Everything of a lens, in its configuration, that cannot be made."""
     lens = detached(lens)
-    heights, found = _semi_diameters(lens), []
+    heights, found = semi_diameters(lens), []
     for k, (surface, height) in enumerate(zip(lens.surfaces, heights, strict=True)):
         edge = math.inf if k == 0 or surface.is_break else _edge_radius(surface)
         if math.isfinite(edge) and height >= edge:
@@ -75,7 +75,7 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
     return found
 
 
-def _semi_diameters(lens: Lens) -> list[float]:
+def semi_diameters(lens: Lens) -> list[float]:
     """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
     optimization_data, last = lens.optimization_data, len(lens.surfaces) - 1
     given = range(last + 1) if optimization_data is None else optimization_data.semi_diameters

@@ -28,6 +28,7 @@ from raytrace.maths.numerics import (
     detached,
     dot,
     dot_2,
+    is_any,
     safe_divide,
     safe_sqrt,
     select,
@@ -173,9 +174,9 @@ def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays
 def is_at_infinity(lens: Lens) -> bool:
     """Whether the object, or every object of a batch, is at infinity. Raises ValueError for a batch that mixes."""
     infinite = torch.isinf(lens.surfaces[0].thickness.detach())
-    if bool(infinite.all()):
+    if not is_any(~infinite):
         return True
-    if bool(infinite.any()):
+    if is_any(infinite):
         raise ValueError("object distances mix infinity and finite ones in one batch: trace them in two")
     return False
 
@@ -290,7 +291,7 @@ def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> 
 def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
     """As `_signed`; warns MarginalRayLost."""
     radius, arrives = _stop_radius(lens, paraxial, entrance)
-    if arrives is not None and not bool(arrives.all()):
+    if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=calling_level())
     return _signed(radius, paraxial, entrance)
@@ -354,6 +355,20 @@ def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
         return torch.stack([p.expand(broadcast_shape(field.shape[1:], p.shape)) for p in pupil])
     x, y, xx, xy, yy = _map_of(lens, field)
     return torch.stack([x + (xx * pupil[0] + xy * pupil[1]), y + (xy * pupil[0] + yy * pupil[1])])
+
+
+def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
+    """Vignetting factors (5, F) of fields (2, F), as of `Fields`: those of the lens at its own fields, else of the map
+    between them, whose matrix is turned to be diagonal by tan 2 VAN = 2 M_xy / (M_xx - M_yy); None without factors."""
+    if lens.fields.vignetting is None:
+        return None
+    maps = _map_of(lens, fields)
+    xx, xy, yy = maps[2:]
+    angle = torch.where(xy.abs() > 1e-12, 0.5 * torch.atan2(2 * xy, xx - yy), 0.0)
+    x, y, xx, _, yy = _rotated(maps, torch.cos(angle), -torch.sin(angle))
+    between = torch.stack([x, y, 1 - xx, 1 - yy, torch.rad2deg(angle)])
+    same = (torch.stack([lens.fields.x, lens.fields.y])[:, :, None] == fields[:, None]).all(0)
+    return torch.where(same.any(0), lens.fields.vignetting[:, same.to(torch.int64).argmax(0)], between)
 
 
 def _map_of(lens: Lens, field: Tensor) -> Tensor:

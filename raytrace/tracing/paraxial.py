@@ -3,6 +3,7 @@
 A ray is (y, ω) with ω = n u, u = dy/dz the slope and n the *signed* index, negative while light travels towards -z.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
+from raytrace.maths.result import flat
 from raytrace.system.lens import Lens, is_round_about_axis, media
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
@@ -57,6 +59,12 @@ class FirstOrder:
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
 
+    def to_frame(self):
+        """The data for pandas, a row for each wavelength; lengths in mm."""
+        import pandas
+
+        return pandas.DataFrame(flat({entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}))
+
 
 def brackets(powers: Sequence, gaps: Sequence) -> tuple:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω; arguments as for `ynu`. Gauss's brackets (Herzberger 1943)."""
@@ -83,7 +91,7 @@ class Gaussian(NamedTuple):
 
     @property
     def effective_focal_length(self):
-        return -abs(self.n_image) / self.C
+        return quotient(-abs(self.n_image), self.C)
 
     @property
     def entrance_pupil_position(self):

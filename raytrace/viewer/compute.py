@@ -7,7 +7,7 @@ the warnings of the analyses, `remarks`.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -30,24 +30,13 @@ from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.paraxial import FirstOrder, first_order
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
 from raytrace.viewer.state import State, shown_fields, word_of
 
 #: Rays of a fan and of a field in the layout, rings of dots, fields of a curve, frequencies of the MTF.
 FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
-_DIGITS = 5  # of drawings
-
-#: First-order data: words, unit, and the number.
-FIRST_ORDER: tuple[tuple[str, str, Callable[[Lens, FirstOrder], Tensor]], ...] = (
-    ("EFL", "mm", lambda lens, one: one.effective_focal_length),
-    ("BFD", "mm", lambda lens, one: one.back_focal_distance),
-    ("F/#", "", lambda lens, one: one.f_number),
-    ("working F/#", "", lambda lens, one: working_f_number(lens)),
-    ("EPD", "mm", lambda lens, one: one.entrance_pupil_diameter),
-    ("m", "", lambda lens, one: one.magnification),
-    ("image at", "mm", lambda lens, one: one.paraxial_image_distance),
-)
+_DIGITS = 5  # of the cross section
 
 
 def plain(numbers) -> list | float | None:
@@ -59,13 +48,12 @@ def plain(numbers) -> list | float | None:
     return numbers if math.isfinite(numbers) else None
 
 
-def rounded(numbers: np.ndarray, digits: int = _DIGITS) -> list:
-    """Numbers of a drawing, to so many digits of the largest; None for nan."""
-    numbers = np.asarray(numbers, dtype=float)
+def curves(values: Tensor) -> list:
+    """Numbers of a drawing, to six digits of the largest; None for nan."""
+    numbers = style.array(values)
     there = np.isfinite(numbers)
     largest = np.abs(numbers[there]).max(initial=0.0)
-    places = digits - 1 - math.floor(math.log10(largest)) if largest > 0 else 0
-    found = numbers.round(places).tolist()
+    found = numbers.round(5 - math.floor(math.log10(largest)) if largest > 0 else 0).tolist()
     return found if there.all() else plain(found)
 
 
@@ -155,11 +143,7 @@ def fans_of(lens: Lens, fields: Tensor) -> dict:
     """Ray fans in µm, (F, W, P) each; None where no ray arrives."""
     fan = ray_fan_of(lens, fields, FAN)
     tangential, sagittal = masked(fan.tangential, fan.tangential_valid), masked(fan.sagittal, fan.sagittal_valid)
-    return {"pupil": plain(fan.pupil), "tangential": _curves(1e3 * tangential), "sagittal": _curves(1e3 * sagittal)}
-
-
-def _curves(values: Tensor) -> list:
-    return rounded(style.array(values), 6)
+    return {"pupil": plain(fan.pupil), "tangential": curves(1e3 * tangential), "sagittal": curves(1e3 * sagittal)}
 
 
 def curvature_of(lens: Lens) -> dict:
@@ -167,7 +151,7 @@ def curvature_of(lens: Lens) -> dict:
     fields = field_range(lens, FIELDS)
     found = field_curvature_of(lens, fields)
     tangential, sagittal = (masked(curve, found.valid).T for curve in (found.tangential, found.sagittal))
-    return {"field": plain(fields[1]), "tangential": _curves(tangential), "sagittal": _curves(sagittal)}
+    return {"field": plain(fields[1]), "tangential": curves(tangential), "sagittal": curves(sagittal)}
 
 
 def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = False) -> dict:
@@ -176,17 +160,26 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
     found = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
     return {
         "frequency": plain(frequencies),
-        "tangential": _curves(found.tangential),
-        "sagittal": _curves(found.sagittal),
-        "limit": None if found.limit is None else _curves(found.limit),
+        "tangential": curves(found.tangential),
+        "sagittal": curves(found.sagittal),
+        "limit": None if found.limit is None else curves(found.limit),
         "transfer": transfer(found),
     }
 
 
 def first_order_of(lens: Lens) -> list[dict]:
+    """First-order data and the working F/#: name, value and unit."""
     data = first_order(lens)
-    rows = ((words, unit, float(number(lens, data))) for words, unit, number in FIRST_ORDER)
-    return [{"name": words, "value": plain(value), "unit": unit} for words, unit, value in rows]
+    rows = (
+        ("EFL", data.effective_focal_length, "mm"),
+        ("BFD", data.back_focal_distance, "mm"),
+        ("F/#", data.f_number, ""),
+        ("working F/#", working_f_number(lens), ""),
+        ("EPD", data.entrance_pupil_diameter, "mm"),
+        ("m", data.magnification, ""),
+        ("image at", data.paraxial_image_distance, "mm"),
+    )
+    return [{"name": name, "value": plain(float(value)), "unit": unit} for name, value, unit in rows]
 
 
 def refresh(state: State) -> dict:
@@ -245,20 +238,15 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 
 def mtf_of_field(state: State, field: int) -> dict:
     """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
-    with torch.no_grad(), warnings.catch_warnings():
+    found = {"field": field, "mtf": None}
+    with torch.no_grad(), warnings.catch_warnings(), suppress(ValueError, RuntimeError):  # as `refresh` reports
         warnings.simplefilter("ignore")
         lens = _simple(state.lens)
-        fields = shown_fields(lens)[:, field : field + 1]
-        if not fields.shape[1]:
-            return {"message": f"field {field}: this lens has fewer fields"}
-        found = {"field": field, "mtf": None}
-        whole = field_spots(lens, fields=shown_fields(lens), rings=1)[0]
-        if least_reach(float(whole.geometric_radius.nan_to_num(0.0).max())) < state.frequency / 3:
-            return found  # of so large a blur diffraction shows nothing
-        try:
-            return {**found, "mtf": mtf_of(lens, fields, state.frequency, diffraction=True)}
-        except (ValueError, RuntimeError):  # as `refresh` reports
-            return found
+        fields = shown_fields(lens)
+        radius = field_spots(lens, fields=fields, rings=1)[0].geometric_radius.nan_to_num(0.0).max()
+        if field < fields.shape[1] and least_reach(float(radius)) >= state.frequency / 3:
+            found["mtf"] = mtf_of(lens, fields[:, field : field + 1], state.frequency, diffraction=True)
+    return found
 
 
 def remarks(state: State) -> list[str]:
@@ -303,7 +291,7 @@ def prescription(state: State) -> dict:
     return {
         "name": lens.name,
         "rows": rows,
-        "fields": {"unit": lens.fields.unit, "y": plain(lens.fields.y)},
+        "fields": {"unit": lens.fields.unit, "x": plain(lens.fields.x), "y": plain(lens.fields.y)},
         "wavelengths": plain(lens.wavelengths),
         "primary": lens.primary_wavelength,
         "aperture": {

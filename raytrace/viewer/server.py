@@ -5,6 +5,7 @@ here from outside is served; an event also needs the page's own `Origin`. Events
 """
 
 import contextlib
+import html
 import json
 import secrets
 import socket
@@ -21,17 +22,6 @@ from raytrace.viewer.session import Session
 STATIC = Path(__file__).parent / "static"
 _TYPES = {"viewer.js": "text/javascript", "viewer.css": "text/css"}
 _MOST_SESSIONS, _MOST_BYTES = 32, 1_000_000
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>raytrace view</title><link rel="icon" href="data:,">
-<link rel="stylesheet" href="viewer.css?token={token}"></head>
-<body class="page"><main id="viewer"></main>
-<script type="module" nonce="{nonce}">
-import {{ page }} from "./viewer.js?token={token}";
-page(document.getElementById("viewer"), "{token}");
-</script></body></html>
-"""
 
 
 class MissingExtra(ImportError):
@@ -76,8 +66,11 @@ def application(lens: Lens, file: Path | None, token: str, port: int):
             f"default-src 'none'; script-src 'self' 'nonce-{nonce}'; style-src 'self'; connect-src 'self'; "
             "img-src data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
         )
-        text = _PAGE.format(token=token, nonce=nonce)
-        return HTMLResponse(text, headers={"Content-Security-Policy": policy})
+        text = (STATIC / "page.html").read_text(encoding="utf-8")
+        title = html.escape(f"{file.name if file else lens.name or 'lens'} – raytrace")
+        return HTMLResponse(
+            text.format(title=title, token=token, nonce=nonce), headers={"Content-Security-Policy": policy}
+        )
 
     def static(request: Request) -> Response:
         name = request.path_params["name"]

@@ -1,11 +1,14 @@
 """Session of the viewer: a state with its file and its optimisation. An event of the page gives a reply for it."""
 
+import dataclasses
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
 from raytrace.io import write_lens
+from raytrace.optimization.checkpoint import STOPPED
+from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.optimize import Optimized, optimize
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
@@ -14,13 +17,15 @@ from raytrace.viewer.state import State, edited, initial, merit_of, reduce, vari
 
 #: Analyses change the filters of warnings, which all threads share: one event is answered at a time.
 _ONE_AT_A_TIME = threading.Lock()
+#: Events that change what is shown but not the lens: they are answered while an optimisation runs.
+_VIEWS = ("open", "compare", "frequency")
 
 
 class Optimisation:
-    """An optimisation in a thread; it is its own progress bar, as `optimize` calls it."""
+    """An optimisation in a thread: `lens` of its last cycle, `merits` of all of them, and its result or failure."""
 
     def __init__(self, state: State):
-        self.cycles, self.merits, self.words, self.stopping = 0, [], "", False
+        self.lens, self.merits, self.is_stopped = state.lens, [], False
         self.result: Optimized | None = None
         self.failure = ""
         self.thread = threading.Thread(target=self._run, args=(state,), daemon=True)
@@ -28,34 +33,25 @@ class Optimisation:
 
     def _run(self, state: State) -> None:
         try:
-            self.result = optimize(
-                state.lens, merit=merit_of(state), vary=variables(state), progress=lambda work, unit: self
-            )
-        except KeyboardInterrupt:
-            self.failure = "stopped before the first cycle"
-        except (ValueError, RuntimeError, LookupError) as error:
-            self.failure = str(error)
+            self.result = optimize(state.lens, merit=merit_of(state), vary=variables(state), watch=self._watch)
+        except (Exception, KeyboardInterrupt) as error:  # whatever it is, the page shows it
+            self.failure = str(error) or type(error).__name__
 
-    def update(self, cycles: int) -> None:
-        self.cycles += cycles
-        if self.stopping:
-            raise KeyboardInterrupt  # ends the descent with its best lens
+    def _watch(self, cycle: Cycle, lens: Lens) -> None:
+        if self.is_stopped:
+            raise KeyboardInterrupt
+        self.lens = lens
+        self.merits.append(cycle.merit)
 
-    def set_postfix_str(self, words: str) -> None:
-        self.words = words
-        self.merits.append(float(words.split()[1].rstrip(",")))
-
-    def close(self) -> None:
-        """The descent has ended; its result is evaluated."""
-
-    def document(self) -> dict:
-        return {
-            "running": self.thread.is_alive(),
-            "cycles": self.cycles,
-            "words": self.words,
-            "merits": self.merits[-400:],
-            "failure": self.failure,
-        }
+    @property
+    def words(self) -> str:
+        count = f"{len(self.merits)} cycle{'' if len(self.merits) == 1 else 's'}"
+        if self.result is not None:
+            missed = [str(one) for one in self.result.conditions if not one.met]
+            before, after = self.result.merit_before, self.result.merit_after
+            reason = STOPPED[self.result.stopped]
+            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *missed])
+        return f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
 
 
 class Session:
@@ -72,44 +68,48 @@ class Session:
             reply = self._answer(event)
         return {"message": "", **reply, "milliseconds": 1e3 * (time.perf_counter() - started)}
 
+    @property
+    def shown(self) -> State:
+        """The state, with the lens of the optimisation that runs."""
+        return self.state if self.optimisation is None else dataclasses.replace(self.state, lens=self.optimisation.lens)
+
     def _answer(self, event: Mapping) -> dict:
         kind = event.get("type")
-        if kind == "progress":
-            return self._progress()
-        if kind == "stop":
-            if self.optimisation is not None:
-                self.optimisation.stopping = True
-            return self._progress()
         if kind == "save":
             return {"message": self.save(str(event.get("path") or ""), overwrite=bool(event.get("overwrite")))}
         if kind == "settle":  # field by field, so that no drag waits for long
             field = event.get("field")
             return {"remarks": remarks(self.state)} if field is None else mtf_of_field(self.state, int(field))
-        if self.optimisation is not None:
+        if kind in ("progress", "stop"):
+            return self._progress(int(event.get("cycles") or 0), stop=kind == "stop")
+        if self.optimisation is not None and kind not in _VIEWS:
             return {"message": "an optimisation is running: stop it, or wait for its end"}
         if kind == "optimise":
             if not self.state.vary:
                 return {"message": "nothing varies: tick the variables first"}
             self.optimisation = Optimisation(self.state)
-            return self._progress()
-        if kind != "open":
-            self.state = reduce(self.state, event)
-            if self.state.message:
-                return {"message": self.state.message, "refused": True, **refresh(self.state)}
-        saved = str(self.file.with_stem(f"{self.file.stem}_edited")) if self.file else "lens.zmx"
-        return {**refresh(self.state), **({"path": saved} if kind == "open" else {})}
+            return self._progress(0)
+        if kind == "open":
+            path = str(self.file.with_stem(f"{self.file.stem}_edited")) if self.file else "lens.zmx"
+            return {**refresh(self.shown), "path": path, **self._progress(0)}
+        self.state = reduce(self.state, event)
+        return {**refresh(self.shown), **({"refused": True} if self.state.message else {})}
 
-    def _progress(self) -> dict:
-        if self.optimisation is None:
+    def _progress(self, cycles: int, *, stop: bool = False) -> dict:
+        """The optimisation, with the numbers of its lens if it has passed more cycles; its end is one step of undo."""
+        work = self.optimisation
+        if work is None:
             return {"optimisation": None}
-        document = self.optimisation.document()
-        if document["running"]:
-            return {"optimisation": document}
-        result, self.optimisation = self.optimisation.result, None
-        if result is None:
-            return {"optimisation": document, "message": document["failure"]}
-        self.state = edited(self.state, result.lens)
-        document["words"] = f"merit {result.merit_before:.6g} → {result.merit_after:.6g}, {result.stopped}"
+        runs = work.thread.is_alive() and not stop
+        document = {"running": runs, "words": work.words, "merits": work.merits[-400:], "cycles": len(work.merits)}
+        if runs:
+            return {"optimisation": document, **(refresh(self.shown) if len(work.merits) > cycles else {})}
+        self.optimisation, work.is_stopped = None, True
+        if work.failure:
+            return {**refresh(self.state), "optimisation": document, "message": work.failure}
+        if work.merits or work.result:
+            self.state = edited(self.state, work.result.lens if work.result else work.lens)
+        document["words"] += "; stopped" if stop else ""
         return {"optimisation": document, **refresh(self.state)}
 
     def save(self, path: str, *, overwrite: bool = False) -> str:
@@ -117,7 +117,7 @@ class Session:
         target = Path(path).expanduser()
         if not path.strip():
             return "save: give the name of a file, as lens.zmx"
-        if target.exists() and not overwrite:
+        if target.is_file() and not overwrite:
             return f"save: {target} exists; tick “replace” to write over it, or give another name"
         try:
             write_lens(self.state.lens, target)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,10 +19,10 @@ from raytrace.optimization.merit import KINDS, DefaultMerit
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
-from raytrace.system.lens import Lens, SystemAperture, check, field_points
+from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Vary
-from raytrace.system.parameter_paths import modelled, with_number
-from raytrace.system.prescription import medium
+from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
+from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
 
 #: Steps of undo that are kept.
@@ -53,7 +54,7 @@ class State:
 def initial(lens: Lens) -> State:
     """The state of a lens as it was read, with the variables of its file."""
     data = lens.optimization_data
-    words = dict.fromkeys(map(word_of, data.variables if data else ()))
+    words = dict.fromkeys(word_of(one) for one in (data.variables if data else ()) if is_shown(lens, one))
     try:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
@@ -83,6 +84,11 @@ def reduce(state: State, event: Mapping) -> State:
 def word_of(one: Vary) -> str:
     """A variable as a word of the variable syntax, "curvature:3"; of all configurations."""
     return f"{one.quantity}:{one.surface}"
+
+
+def is_shown(lens: Lens, one: Vary) -> bool:
+    """Whether the table has the number of a variable or solve: it has none of glasses and of other conditions."""
+    return one.quantity == "thickness" or one.quantity in parameter_paths(lens.surfaces[one.surface])
 
 
 def variables(state: State) -> list[str | Vary]:
@@ -128,7 +134,7 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
     if not 0 <= surface < len(lens.surfaces):
         raise ValueError(f"{what}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
     if quantity == "glass":
-        lens = lens.replace(surface, glass=medium(str(text), lens.catalogs, f"surface {surface}"))
+        lens = lens.replace(surface, glass=str(text))
     elif quantity == "semi_diameter":
         size = number(text, what) if str(text).strip() else None
         if size is not None and not 0 <= size < math.inf:
@@ -154,10 +160,8 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
 
 def solved(lens: Lens) -> Lens:
     """The lens whose solves and pickups hold."""
-    if lens.optimization_data is None or not lens.optimization_data.solves:
-        return lens
-    free = freedom(lens)
-    return Model(free.lens, (), free.solves).lens_at(torch.zeros(0).numpy())
+    solves = lens.optimization_data.solves if lens.optimization_data else ()
+    return Model(lens, (), solves).lens_at(np.zeros(0)) if solves else lens
 
 
 def aperture_sizes(lens: Lens) -> dict[str, float]:
@@ -202,14 +206,30 @@ def _vary(state: State, event: Mapping) -> State:
 
 
 def _fields(state: State, event: Mapping) -> State:
-    """Fields along y; where as many are given as there are, x, weights and vignetting factors stay."""
-    lens, y = state.lens, numbers(event["values"], "fields")
-    if len(y) == len(lens.fields.y):
-        fields = dataclasses.replace(lens.fields, y=lens.fields.y.new_tensor(y))
-        lens = dataclasses.replace(freed(lens, fields=y), fields=fields)
-        check(lens)
-        return edited(state, solved(lens), drag="")
-    return edited(state, solved(lens.at(fields=y)))
+    """Fields by their y, or with `axis` "x" by their x. All else of them stays; of fewer or more y, those that the lens
+    does not have take x and vignetting factors between their neighbours."""
+    lens, axis, values = state.lens, event.get("axis", "y"), numbers(event["values"], "fields")
+    old = lens.fields
+    if len(values) == len(old.y):
+        fields = dataclasses.replace(old, **{axis: old.y.new_tensor(values)})
+    elif axis == "x":
+        raise ValueError(f"x of the fields: found {len(values)} numbers; this lens has {len(old.y)} fields")
+    else:
+        fields = _fields_at(lens, values)
+    field_points(torch.stack([fields.x, fields.y]).T.tolist(), like=lens)
+    lens = dataclasses.replace(freed(lens, fields=values), fields=fields)
+    check(lens)
+    return edited(state, solved(lens))
+
+
+def _fields_at(lens: Lens, values: Sequence[float]) -> Fields:
+    old, left = lens.fields, list(range(len(lens.fields.y)))
+    taken = [next((left.pop(i) for i, k in enumerate(left) if float(old.y[k]) == y), None) for y in values]
+    order = old.y.argsort(stable=True)
+    x = np.interp(values, old.y[order], old.x[order])
+    points = old.y.new_tensor([[x[i] if k is None else old.x[k] for i, k in enumerate(taken)], values])
+    weight = old.y.new_tensor([1.0 if k is None else old.weight[k] for k in taken])
+    return dataclasses.replace(old, x=points[0], y=points[1], weight=weight, vignetting=factors_at(lens, points))
 
 
 def _wavelengths(state: State, event: Mapping) -> State:
@@ -251,10 +271,6 @@ def _frequency(state: State, event: Mapping) -> State:
     return dataclasses.replace(state, frequency=highest)
 
 
-def _configuration(state: State, event: Mapping) -> State:
-    return edited(state, state.lens.configuration(int(event["number"])))
-
-
 def _step(state: State, source: str) -> State:
     """Undo, from "past", or redo, from "future"."""
     before = state.past if source == "past" else state.future
@@ -281,7 +297,7 @@ EVENTS: dict[str, Callable[[State, Mapping], State]] = {
     "wavelengths": _wavelengths,
     "primary": _primary,
     "aperture": _aperture,
-    "configuration": _configuration,
+    "configuration": lambda state, event: edited(state, state.lens.configuration(int(event["number"]))),
     "frequency": _frequency,
     "merit": _merit,
     "compare": lambda state, event: dataclasses.replace(state, compare=bool(event.get("on"))),

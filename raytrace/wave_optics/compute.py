@@ -25,7 +25,7 @@ from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, is_flat
+from raytrace.wave_optics.element import Element, EvenPowers, in_contact, is_flat
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
 from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
@@ -235,11 +235,17 @@ def wave_psf(
 ) -> ElementPsf:
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
-    element, and all up to catalog: as for `elements`; or an `Element`, or several in contact, in whose numbers the
-    kernels are differentiable. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window around
-    the axis. engine, samples, tol: as for `wave_optics.plan.plan`, which chooses the sampling and predicts its error.
+    element, and all up to catalog: as for `rt.elements`; or an Element (`rt.element` makes one of an array), or several
+    in contact, in whose numbers the kernels are differentiable; of the options up to catalog they use `sensor` (mm from
+    the element) and `exact` alone. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window
+    around the axis; with an even size the axis is a corner of four pixels. A kernel holds the light in each pixel, 1 is
+    all light through the aperture.
+    engine: "auto" takes "radial" (Hankel integrals) for round elements, else "pupil" (matrix Fourier transform);
+    "fresnel" and "angular_spectrum" propagate the field by FFT, as references. tol: bound on the predicted relative L2
+    error of a kernel; samples: across the aperture, instead. `.plan` of the result has both.
     Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
-    each other, budget.OverBudget where one kernel alone would take too much.
+    each other, AliasedSampling for samples that would repeat the kernel inside the window, budget.OverBudget where one
+    kernel alone would take too much.
     """
     if isinstance(element, str | os.PathLike):
         design = {"aperture": aperture, "sensor": sensor, "focus": focus, "exact": exact}
@@ -247,7 +253,13 @@ def wave_psf(
         wrap = {"design_wavelength": design_wavelength, "levels": levels, "wavelengths": wavelengths}
         parts, name = elements(element, **design, **material, **wrap), str(element)
     else:
-        parts = (element,) if isinstance(element, Element) else tuple(element)
+        parts = in_contact(element)
+        own = 2 * float(parts[0].radius.detach()) if parts else 0.0
+        fixed = {"glass": glass, "index": index, "pitch": pitch, "span": span, "levels": levels}
+        fixed |= {"design_wavelength": design_wavelength}
+        fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, own) else aperture}
+        if option := next((option for option, number in fixed.items() if number is not None), ""):
+            raise ValueError(f"`{option}` belongs to an element by name or from a file; an Element has its own")
         name = " + ".join(part.kind.words for part in parts)
     for glass in {id(part.glass.coefficients): part.glass for part in parts}.values():
         check_unit(torch.tensor(wavelengths), [glass])
@@ -283,7 +295,10 @@ def elements(
     span: Sequence[float] | None = None,
     catalog: Sequence[str | os.PathLike] = (),
 ) -> tuple[Element, ...]:
-    """The elements in contact of a name, one of `wave_optics.designs.BASELINES`, or of a file of heights.
+    """The elements in contact of a name, or of a file of heights.
+
+    Names: ideal, singlet, fresnel, multifocal, multifocal-refractive, cubic, cubic-refractive, achromat, hybrid; cubic
+    and hybrid are two elements, a lens and a plate. `rt.element` makes an element of an array.
 
     aperture: diameter, mm. Of a named element sensor, focus: mm, the distances of its design; design_wavelength: µm,
     0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file as for `read_element`; index:

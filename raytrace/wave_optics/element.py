@@ -11,14 +11,16 @@ differentiable.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from raytrace.materials.glass import Glass, index
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import Glass, constant, index
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.zernike import noll, polynomials
+from raytrace.words import with_article
 
 #: Sizes of features, mm: diamond turning of PMMA, and etching of fused silica.
 TURNED, ETCHED = 3.69e-3, 2e-3
@@ -118,6 +120,17 @@ class Element:
     period: Tensor | None = None
     levels: int = 0
 
+    def __repr__(self) -> str:
+        count, across = " × ".join(map(str, self.numbers.shape)), 2 * float(self.radius.detach())
+        if self.kind.is_flat:
+            words = f"{count} {self.kind.words} of {1e3 * float(self.profile.pitch.detach()):g} µm"
+        else:
+            words = f"{self.kind.words}, {count} coefficients"
+        if self.period is not None:
+            steps = f" in {self.levels} steps" if self.levels else ""
+            words += f", wrapped at {1e3 * float(self.period.detach()):.4g} µm{steps}"
+        return f"<Element: {words}, of {self.glass.name or 'constant index'}, ⌀ {across:g} mm>"
+
     @property
     def kind(self) -> Kind:
         return KINDS[type(self.profile)]
@@ -130,6 +143,91 @@ class Element:
     def with_numbers(self, numbers: Tensor) -> "Element":
         """The element with other heights or coefficients."""
         return dataclasses.replace(self, profile=dataclasses.replace(self.profile, **{self.kind.numbers: numbers}))
+
+
+#: Profiles of `element` by name: the value, the number of axes of its numbers.
+PROFILES = {"pixels": (Pixels, 2), "rings": (Rings, 1), "zernike": (Zernike, 1), "powers": (EvenPowers, 1)}
+
+
+def element(
+    numbers: Tensor | Sequence[float],
+    *,
+    aperture: float,
+    glass: str | Glass | float,
+    profile: Literal["pixels", "rings", "zernike", "powers"] = "pixels",
+    pitch: float | None = None,
+    design_wavelength: float | None = None,
+    levels: int = 0,
+) -> Element:
+    """A phase element of heights or coefficients in memory, in which its PSFs are differentiable.
+
+    It adds the path (n(λ) - 1) h relative to air: a converging element is thickest on its axis.
+
+    numbers: a tensor or an array, by the profile: "pixels" (rows, columns) mm, heights of flat squares of `pitch` mm
+        around the axis, row 0 at the smallest y, column 0 at the smallest x; "rings" (R,) mm, of flat rings of `pitch`
+        mm from the axis outwards; "zernike" (J,) mm RMS, Noll's from j = 1 (piston) on over the aperture, where
+        j = 2 is tilt along x; "powers" (K,) mm^(1 - 2k), of r², r⁴, …
+    aperture: diameter, mm. glass: a name, a Glass, or one index for all wavelengths. design_wavelength: µm, at which
+        the heights are wrapped, modulo one wave, in so many equal `levels` (0: any height); without it they are whole.
+    Raises ValueError for numbers of another shape or not finite, for heights that do not fill the aperture, and for
+    levels without a design wavelength; UnknownGlass.
+    """
+    if profile not in PROFILES:
+        raise ValueError(f"profile {profile!r} is not known; expected one of {', '.join(PROFILES)}")
+    kind, axes = PROFILES[profile]
+    numbers = torch.as_tensor(numbers)
+    numbers = numbers if numbers.is_floating_point() else numbers.to(torch.float64)
+    if numbers.dim() != axes or not numbers.numel():
+        shapes = {"pixels": "(rows, columns)", "rings": "(R,)", "zernike": "(J,)", "powers": "(K,)"}
+        raise ValueError(
+            f"{profile} of the shape {tuple(numbers.shape)}; expected {shapes[profile]}; "
+            f"`profile` is one of {', '.join(PROFILES)}"
+        )
+    if wrong := int((~torch.isfinite(numbers.detach())).sum()):
+        raise ValueError(f"{wrong} of {numbers.numel()} numbers of the element are not finite; replace them first")
+    if not aperture > 0:
+        raise ValueError(f"aperture {aperture:g} mm; expected a positive diameter")
+    if KINDS[kind].is_flat != (pitch is not None):
+        needs = "needs `pitch`, mm" if pitch is None else "is smooth and has no `pitch`"
+        raise ValueError(f"a profile of {profile} {needs}")
+    if pitch is not None and not pitch > 0:
+        raise ValueError(f"pitch {pitch:g} mm; expected a positive number")
+    if levels and not design_wavelength:
+        raise ValueError("`levels` are steps of one wave's height; give `design_wavelength`, µm")
+    if isinstance(glass, str):
+        glass = find_glass(glass)
+    elif not isinstance(glass, Glass):
+        glass = constant(float(glass))
+    shape = kind(numbers, *([] if pitch is None else [torch.as_tensor(pitch).to(numbers)]))
+    check_fills(shape, aperture)
+    wave = period(glass, design_wavelength).to(numbers) if design_wavelength else None
+    return Element(shape, torch.as_tensor(0.5 * aperture).to(numbers), glass, wave, levels)
+
+
+def check_fills(profile: Profile, aperture: float, place: str = "") -> None:
+    """Raise ValueError for heights that do not fill an aperture of so many mm, but for one feature at the rim."""
+    if not KINDS[type(profile)].is_flat:
+        return
+    counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
+    across = min(counts) * float(profile.pitch)
+    if across + 2 * float(profile.pitch) < aperture:
+        raise ValueError(
+            f"{place}the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
+            f"give `aperture={across:.6g}`"
+        )
+
+
+def in_contact(elements: Element | Sequence[Element]) -> tuple[Element, ...]:
+    """One element or several as a tuple. Raises TypeError for other values."""
+    parts = (elements,) if isinstance(elements, Element) else tuple(elements)
+    if any(not isinstance(part, Element) for part in parts):
+        wrong = next(part for part in parts if not isinstance(part, Element))
+        kind = with_article(type(wrong if isinstance(elements, tuple | list) else elements).__name__)
+        raise TypeError(
+            f"{kind} is no phase element; expected an Element or several: rt.elements(name or file) or, of an array "
+            "of heights, rt.element(heights, pitch=…, aperture=…, glass=…)"
+        )
+    return parts
 
 
 def is_radial(element: Element) -> bool:

@@ -17,7 +17,7 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import FORMULAS, Glass
 from raytrace.maths.numerics import to
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat
+from raytrace.wave_optics.element import Element, EvenPowers, Zernike, check_fills, is_flat
 from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
@@ -108,14 +108,7 @@ def read_element(
     else:
         profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
         profile = to(profile, dtype=torch.float64)
-        counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
-        across = min(counts) * float(profile.pitch)
-        # Heights cut to whole features may miss the rim by one feature.
-        if across + 2 * float(profile.pitch) < aperture:
-            raise ValueError(
-                f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
-                f"give `aperture={across:.6g}`"
-            )
+        check_fills(profile, aperture, f"{path}: ")
         if glass is None and label is None:
             raise ValueError(
                 f"{path}: has no material (there is no {_label_of(path).name}); give `glass=NAME`, as PMMA, or "

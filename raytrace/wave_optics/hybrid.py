@@ -24,7 +24,7 @@ from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.maths.zernike import noll
 from raytrace.psf_models.dft import rings_and_arms
-from raytrace.psf_models.result import Kernels
+from raytrace.psf_models.result import Kernels, Psf, polychromatic
 from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, media, with_object_distance
 from raytrace.system.sag_terms import GridSag, ZernikeSag, relief, spline
@@ -33,7 +33,17 @@ from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
 from raytrace.tracing.trace import at_stop
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
+from raytrace.wave_optics.element import (
+    Element,
+    EvenPowers,
+    Rings,
+    Zernike,
+    in_contact,
+    is_flat,
+    is_radial,
+    path,
+    slopes_of,
+)
 
 _MOST_RAYS = 400_000  # of one kernel
 
@@ -119,14 +129,24 @@ def hybrid_psf(
     pixel: float = 0.005,
     size: int | tuple[int, int] = 21,
     order: int = 0,
-) -> Kernels:
+) -> Psf:
     """PSFs (D, F, W, rows, columns) of a lens that carries phase elements in contact at its stop, by waves.
 
-    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; by
-    default those of the lens. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel, which
-    they follow in the derivatives too; for a sensor that does not move, give `kernels` a grid. order, derivatives and
-    errors: of `kernels`.
+    The path (n - 1) h of the elements at the ray's point of the stop is added to the traced wavefront. Aberrations,
+    vignetting, field and diffraction at the rim of the pupil and at the features of the heights are modelled. The
+    elements are thin: obliquity inside them, and the other way through the lens of rays that they deflect, are not,
+    nor are Fresnel losses; rays are not traced through them.
+
+    elements: of `rt.elements` or `rt.element`, at least as wide as the beam at the stop, which must lie in air. fields:
+    y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; by default
+    those of the lens. pixel, size: pitch in mm and number of pixels around the chief ray at the primary wavelength,
+    which they follow in the derivatives too. order: of the pupil sampling, -2 … 5 as for `rt.Wave`; a higher one checks
+    convergence, the error is not estimated. Differentiable in the numbers of the elements and of the lens.
+
+    Raises ValueError for a stop between other media than air and a beam wider than an element, TooCoarse where more
+    than 400,000 rays would be needed.
     """
+    parts = in_contact(elements)
     like = lens.wavelengths
     fields = field_points(fields, like=lens)
     distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
@@ -135,8 +155,20 @@ def hybrid_psf(
     )
     warn_of_filling(lens, fields)
     view = scene(lens, fields, distances, colours)
-    parts = (elements,) if isinstance(elements, Element) else tuple(elements)
-    return kernels(view, parts, make_grid(like.new_tensor(pixel), size, chief_landing(view)), order=order)
+    chief = chief_landing(dataclasses.replace(view, wavelengths=lens.primary[None]))
+    window = make_grid(like.new_tensor(pixel), size, chief.expand(*chief.shape[:-1], len(colours)))
+    psfs = polychromatic(kernels(view, parts, window, order=order), None, "hybrid")
+    weights = torch.ones_like(colours) if wavelengths is not None else lens.wavelength_weights
+    return dataclasses.replace(
+        psfs,
+        order=order,
+        reason=f"phase elements at the stop; σ of the light inside the window; order {order}, error not estimated",
+        lens=lens,
+        fields=fields,
+        object_distances=distances,
+        wavelengths=colours,
+        wavelength_weights=weights / weights.sum(),
+    )
 
 
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:

@@ -14,7 +14,7 @@ numbers that CODE V stored in public files, or against two other programs' reade
   DAR those of this surface alone, with REV those behind it, back. BEN tilts again behind a mirror.
 - DIF DOE with HCT R adds the path HOR λ/HWL Σ_j C_j r^2j, with C_j of HCO Cj in units of length and HWL in nm. A
   `RadialPhase` has A_j = 2π C_j radius^2j/HWL in radians at a radius of its own, rounded once; they come back.
-- Rays are aimed at the stop, along paraxial lines.
+- Rays are aimed at the stop, whose radius is that of the real marginal ray.
 - Of zoom positions (ZOO) the first is read.
 """
 

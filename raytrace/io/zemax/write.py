@@ -64,7 +64,7 @@ from raytrace.io.zemax.surfaces import (
     type_of,
     types,
 )
-from raytrace.materials.glass import Glass, mil_glass
+from raytrace.materials.glass import Glass, abbe_number, mil_glass, nd
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Operand, count, same, with_operands
 from raytrace.system.lens import Lens
@@ -260,7 +260,9 @@ def _glass(glass: Glass, place: Place) -> list[str]:
     elif glass.formula == "model":
         figures = exact_list(glass.coefficients, "model glass", place)
     else:
-        return [f"  GLAS {listed_name(glass, place)} 0 0 1.5 40 0 0 0 0 0 0"]
+        figures = glass.nd_listed or float(nd(glass)), glass.abbe_listed or float(abbe_number(glass))
+        words = " ".join(exact(number, "index or Abbe number", place) for number in figures)  # for a substitute
+        return [f"  GLAS {listed_name(glass, place)} 0 0 {words} 0 0 0 0 0 0"]
     flag, name = 1, listed_name(glass, place) if glass.name else BLANK
     if name.upper() in ("AIR", "MIRROR"):
         raise LensFileError(f"a glass of index {figures[0]} is named {name!r}; give it another name", place)

@@ -41,6 +41,7 @@ function words(value, digits = 4) {
 }
 
 // As it is typed into a field: enough digits to come back, and ∞.
+const unitOf = (lens) => lens.fields.unit.replace("degrees", "°");
 const typed = (value) => (value === null ? "∞" : String(+value.toPrecision(9)));
 
 function ticks(low, high, count) {
@@ -54,7 +55,7 @@ function ticks(low, high, count) {
 // -- figures ----------------------------------------------------------------------------------------------------------
 
 // Axes of a figure of width × height pixels; returns the group for curves and the scales.
-function axes(target, width, height, { x, y, left = 40, bottom = 26, top = 6, right = 8, xlabel = "", ylabel = "", ticksX = 5, ticksY = 4 }) {
+function axes(target, width, height, { x, y, left = 40, bottom = 26, top = 6, right = 12, xlabel = "", ylabel = "", ticksX = 5, ticksY = 4 }) {
   const at = (v) => left + ((v - x[0]) / (x[1] - x[0])) * (width - left - right);
   const up = (v) => height - bottom - ((v - y[0]) / (y[1] - y[0])) * (height - bottom - top);
   const frame = svg("g", { class: "axes" });
@@ -190,13 +191,13 @@ function drawFans(target, now, stored) {
       const part = svg("g", { transform: `translate(${s ? LEFT + (width - LEFT) / 2 : 0} 0)` });
       const last = f === rows - 1;
       const { at, up, curves } = axes(part, s ? (width - LEFT) / 2 : LEFT + (width - LEFT) / 2, height, {
-        x: [-1, 1], y: [-top, top], left: s ? 6 : LEFT, right: 3, top: 14, bottom: last ? 24 : 6,
-        ticksX: 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
+        x: [-1, 1], y: [-top, top], left: s ? 10 : LEFT, right: 8, top: 14, bottom: last ? 24 : 6,
+        ticksX: last ? 2 : 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
       });
       part.append(svg("line", { x1: at(0), x2: at(0), y1: 14, y2: height - (last ? 24 : 6), class: "zero" }), svg("line", { x1: at(-1), x2: at(1), y1: up(0), y2: up(0), class: "zero" }));
       if (stored && stored.fans && stored.fans[section][f]) stored.fans[section][f].forEach((values) => curves.append(line(curve(stored.fans.pupil, values, at, up), "var(--grey)", { "stroke-dasharray": "2 2" })));
       fans[section][f].forEach((values, w) => curves.append(line(curve(fans.pupil, values, at, up), now.wavelength_colours[w], { "stroke-width": 1.3, "data-curve": `${section}-${f}-${w}` })));
-      const title = svg("text", { x: s ? 8 : LEFT + 2, y: 10, class: "label" });
+      const title = svg("text", { x: s ? 10 : LEFT, y: 10, class: "label" });
       title.textContent = s ? "sagittal" : `${field} tangential`;
       part.append(title);
       picture.append(part);
@@ -222,15 +223,15 @@ function drawMtf(target, now, stored, highest) {
   target.replaceChildren(picture);
 }
 
-function drawCurvature(target, now, stored) {
+function drawCurvature(target, now, stored, unit) {
   const found = now.curvature;
-  if (!found) return empty(target, "curvature", "no field curves: the fields are on the axis");
+  if (!found || !found.field.at(-1)) return empty(target, "curvature", "no field curves: the fields are on the axis");
   const width = target.clientWidth || 300, height = target.clientHeight || 200;
   const sources = [found, stored && stored.curvature].filter(Boolean);
   const all = sources.flatMap((one) => [one.tangential, one.sagittal].flat(2)).filter((one) => one !== null).map(Math.abs);
-  const top = 1.05 * (Math.max(0, ...all) || 1), largest = found.field.at(-1) || 1;
+  const top = 1.05 * (Math.max(0, ...all) || 1), largest = found.field.at(-1);
   const picture = figure("curvature", "", width, height, `Field curvature within ±${words(top, 3)} mm`);
-  const { at, up, curves } = axes(picture, width, height, { x: [-top, top], y: [0, largest], left: 30, xlabel: "focus from the sensor, mm", ticksX: 4 });
+  const { at, up, curves } = axes(picture, width, height, { x: [-top, top], y: [Math.min(0, largest), Math.max(0, largest)], left: 40, xlabel: "focus from the sensor, mm", ylabel: `field, ${unit}`, ticksX: 4 });
   picture.append(svg("line", { x1: at(0), x2: at(0), y1: up(0), y2: up(largest), class: "zero" }));
   for (const [source, was] of [[stored && stored.curvature, true], [found, false]]) if (source) {
     ["tangential", "sagittal"].forEach((section, s) => source[section].forEach((values, w) => {
@@ -262,6 +263,7 @@ class Viewer {
     this.ranges = new Map();
     this.moreNumbers = false;
     this.build();
+    this.say("loading; the first time on a machine the trace is compiled, which takes a minute or two", false);
     this.event({ type: "open" });
   }
 
@@ -278,12 +280,13 @@ class Viewer {
     this.replace = make("input", { type: "checkbox" });
     this.message = make("div", { className: "message", role: "status", "aria-live": "polite" });
     this.latency = make("span", { className: "latency", title: "from event to new numbers" });
-    this.title = make("h1", { textContent: "…" });
+    this.title = make("h1", { textContent: "Lens" });
     this.conditions = make("div", { className: "conditions" });
     this.table = make("div", { className: "table" });
     this.more = make("input", { type: "checkbox", onchange: () => { this.moreNumbers = this.more.checked; this.signature = ""; this.prescription(this.last.prescription); } });
     this.paraxial = make("dl", { className: "paraxial" });
     this.figures = {};
+    const lines = () => make("span", { className: "grey", title: "tangential solid, sagittal dashed", textContent: "T ── S ╌╌" });
     const panel = (name, title, ...extra) => {
       this.figures[name] = make("div", { className: `figure ${name}` });
       return make("section", { className: `panel ${name}`, "aria-label": title }, make("h2", {}, make("span", { textContent: title }), ...extra), this.figures[name]);
@@ -294,6 +297,11 @@ class Viewer {
     this.fieldKey = make("span", { className: "key" });
     this.problems = make("ul", { className: "problems", "aria-label": "remarks" });
     this.root.classList.add("raytrace-viewer");
+    const system = matchMedia("(prefers-color-scheme: dark)"), { body } = document;
+    const paint = () => this.root.classList.toggle("dark", body.dataset.jpThemeLight ? body.dataset.jpThemeLight === "false" : system.matches || body.classList.contains("vscode-dark"));
+    system.addEventListener("change", paint);
+    new MutationObserver(paint).observe(body, { attributes: true, attributeFilter: ["data-jp-theme-light", "class"] });
+    paint();
     this.root.replaceChildren(
       make("header", {}, this.title,
         make("span", { className: "group" }, this.undo, this.redo, this.restore),
@@ -302,16 +310,17 @@ class Viewer {
         make("span", { className: "group save" }, this.path, button("Save", "Write the lens; the suffix selects the format: .zmx .seq .len .csv …", () => this.save()), make("label", { title: "write over a file that exists" }, this.replace, " replace"))),
       this.message,
       make("div", { className: "columns" },
-        make("div", { className: "left" }, this.conditions, this.table, this.problems),
+        this.left = make("div", { className: "left" }, this.conditions, this.table, this.problems),
         make("div", { className: "right" },
           panel("layout", "Layout", this.fieldKey),
           this.paraxial,
           make("div", { className: "panels" },
             panel("spots", "Spots"), panel("fans", "Ray fans, µm", this.wavelengthKey),
-            make("div", { className: "stack" }, panel("mtf", "MTF", this.transfer, this.frequency), panel("curvature", "Field curves", make("span", { className: "grey", textContent: "T solid, S dashed" })))))),
-      make("footer", {}, make("span", { textContent: "Tab moves, arrows turn a slider or step a number · Ctrl+Z undo · Ctrl+Enter optimise" }), this.latency));
+            make("div", { className: "stack" }, panel("mtf", "MTF", lines(), this.transfer, make("label", { className: "grey" }, "to", this.frequency, "/mm")), panel("curvature", "Field curves", lines()))))),
+      make("footer", {}, make("span", { textContent: "☑ variable, S solved · Tab moves, arrows turn a slider or step a number · Ctrl+Z undo · Ctrl+Enter optimise" }), this.latency));
     this.root.addEventListener("keydown", (e) => this.key(e));
-    if (window.ResizeObserver) new ResizeObserver(() => this.last && this.draw()).observe(this.root);
+    const observer = new ResizeObserver(() => this.last && this.draw());
+    for (const one of Object.values(this.figures)) observer.observe(one);
   }
 
   key(e) {
@@ -321,9 +330,11 @@ class Viewer {
       const { dataset, value } = e.target;
       if (dataset.shown !== undefined && dataset.shown !== value) return; // the text that is being typed
       e.preventDefault();
+      e.stopPropagation(); // a notebook has the same keys
       this.event({ type: key === "y" || e.shiftKey ? "redo" : "undo" });
     } else if (key === "enter") {
       e.preventDefault();
+      e.stopPropagation();
       this.toggleOptimise();
     }
   }
@@ -348,23 +359,26 @@ class Viewer {
       this.receive(reply, event, performance.now() - started);
     } catch (error) {
       this.say(`no answer: ${error.message}; has the server ended?`, true);
+      this.unsettled = undefined;
     }
     this.busy = false;
-    if (this.queue && this.queue.length) this.run(this.queue.shift());
-    else this.root.setAttribute("aria-busy", "false");
+    if (this.queue && this.queue.length) return this.run(this.queue.shift());
+    this.root.setAttribute("aria-busy", "false");
+    const settle = () => this.event({ type: "settle", field: this.unsettled });
+    if (this.unsettled !== undefined && !this.running) this.settling = setTimeout(settle, event.type === "settle" ? 0 : SETTLE);
   }
 
   receive(reply, event, waited) {
     if (reply.message || !["settle", "progress"].includes(event.type)) this.say(reply.message, !/^written/.test(reply.message));
-    if (reply.path) this.path.value = reply.path;
+    if (reply.path) this.path.value = this.path.title = reply.path;
     if (reply.analyses) {
       this.last = reply;
       this.prescription(reply.prescription, reply.refused);
       this.draw();
       this.latency.textContent = `${reply.milliseconds.toFixed(0)} ms numbers, ${waited.toFixed(0)} ms with the way there`;
       this.root.dataset.milliseconds = reply.milliseconds;
+      this.unsettled = 0; // the next field whose slower analyses are missing, null for the remarks
       this.root.dataset.count = 1 + Number(this.root.dataset.count || 0);
-      this.settling = setTimeout(() => this.event({ type: "settle", field: 0 }), SETTLE);
     }
     if (event.type === "settle") this.settled(reply, event);
     if ("optimisation" in reply) this.optimised(reply.optimisation);
@@ -384,13 +398,12 @@ class Viewer {
       }
     }
     if (reply.remarks) {
-      this.listProblems([...this.last.problems, ...reply.remarks]);
+      this.last.problems.push(...reply.remarks);
+      this.listProblems(this.last.problems);
       this.root.dataset.settled = this.root.dataset.count;
-      return;
     }
-    if (this.queue && this.queue.length) return;
     const next = event.field + 1;
-    this.event(next < this.last.analyses.fields.length ? { type: "settle", field: next } : { type: "settle", field: null });
+    this.unsettled = event.field === null ? undefined : next < this.last.analyses.fields.length ? next : null;
   }
 
   say(text, wrong = true) {
@@ -405,16 +418,22 @@ class Viewer {
   draw() {
     const now = this.last.analyses, stored = this.last.stored;
     this.listProblems(this.last.problems);
+    this.listParaxial(now, stored);
     drawLayout(this.figures.layout, now, stored);
     drawSpots(this.figures.spots, now, stored);
     drawFans(this.figures.fans, now, stored);
     drawMtf(this.figures.mtf, now, stored, this.last.prescription.frequency);
-    drawCurvature(this.figures.curvature, now, stored);
+    drawCurvature(this.figures.curvature, now, stored, unitOf(this.last.prescription));
     this.transfer.textContent = now.mtf ? now.mtf.transfer : "";
     const key = (names, colours) => names.map((name, k) => make("span", { style: `--colour:${colours[k]}`, textContent: name }));
-    this.fieldKey.replaceChildren(...key(now.fields, now.field_colours));
+    const all = this.last.prescription.fields.y.length, drawn = now.fields.length;
+    this.fieldKey.replaceChildren(drawn < all ? make("i", { textContent: `${drawn} of ${all} fields` }) : "", ...key(now.fields, now.field_colours));
     this.wavelengthKey.replaceChildren(...key(now.wavelengths.map((one) => `${words(one)}`), now.wavelength_colours));
+  }
+
+  listParaxial(now, stored) {
     this.paraxial.replaceChildren(...(now.first_order || []).map((one, k) => {
+      if (one.name === "m" && one.value === 0) return ""; // the object is at infinity
       const was = stored && stored.first_order ? stored.first_order[k].value : undefined;
       const value = make("dd", { textContent: `${words(one.value, 5)} ${one.unit}`, "data-number": one.name, "data-value": one.value ?? "" });
       if (was !== undefined && was !== one.value) value.append(make("span", { className: "was", textContent: ` (${words(was, 4)})` }));
@@ -426,13 +445,13 @@ class Viewer {
 
   prescription(lens, refused = false) {
     const columns = this.columnsOf(lens);
-    const signature = JSON.stringify([columns, lens.rows.length, lens.aperture.kinds, lens.configurations, lens.rows.map((row) => [row.follows, row.glass === null, Object.keys(row.cells)])]);
+    const signature = JSON.stringify([columns, lens.rows.length, this.showsX(lens), lens.configurations, lens.rows.map((row) => [row.follows, row.glass === null, Object.keys(row.cells)])]);
     if (signature !== this.signature) {
       this.signature = signature;
       this.buildTable(lens, columns);
       this.buildConditions(lens);
     }
-    this.title.textContent = lens.name || "Lens";
+    this.title.textContent = this.title.title = lens.name || "Lens";
     this.undo.disabled = !lens.undo;
     this.redo.disabled = !lens.redo;
     this.compare.checked = lens.compare;
@@ -474,7 +493,7 @@ class Viewer {
     const surface = row.surface;
     if (name === "glass") {
       if (row.glass === null) return make("td", {});
-      const input = make("input", { type: "text", className: "glass", spellcheck: false, "aria-label": `glass behind surface ${surface}`, "data-cell": `glass:${surface}` });
+      const input = make("input", { type: "text", className: "glass", placeholder: "air", spellcheck: false, "aria-label": `glass behind surface ${surface}`, "data-cell": `glass:${surface}` });
       input.addEventListener("change", () => this.edit(surface, "glass", input.value, input));
       this.controls.push((lens, refused) => this.show(input, lens.rows[surface].glass || "", refused));
       return make("td", {}, input);
@@ -549,11 +568,21 @@ class Viewer {
   }
 
   buildConditions(lens) {
-    const field = (label, name, send, show, ...more) => {
+    const field = (label, name, event, show) => {
       const input = make("input", { type: "text", "data-condition": name, spellcheck: false });
-      input.addEventListener("change", () => { input.dataset.sent = 1; this.event({ ...send, [send.type === "fields" || send.type === "wavelengths" ? "values" : "value"]: input.value }); });
+      input.addEventListener("change", () => { input.dataset.sent = 1; this.event(event(input.value)); });
       this.controls.push((now, refused) => this.show(input, show(now), refused));
-      return make("label", { className: name }, make("span", { textContent: label }), input, ...more);
+      return make("label", { className: name }, make("span", { textContent: label }), input);
+    };
+    const select = (label, event, options, chosen) => {
+      const input = make("select", { "aria-label": label, onchange: () => this.event(event(input.value)) });
+      this.controls.push((now) => {
+        const pairs = options(now);
+        if (JSON.stringify(pairs) !== input.dataset.pairs) input.replaceChildren(...pairs.map(([value, textContent]) => make("option", { value, textContent })));
+        input.dataset.pairs = JSON.stringify(pairs);
+        input.value = chosen(now);
+      });
+      return input;
     };
     const slide = (name, send, at) => {
       const slider = make("input", { type: "range", min: 0, max: 1000, step: 1, "aria-label": `${name}, slider`, "data-slider": name });
@@ -563,32 +592,31 @@ class Viewer {
       slider.addEventListener("change", () => { delete slider.dataset.held; moved(false); });
       this.controls.push((now) => {
         const value = at(now);
-        slider.hidden = value === null;
-        if (value === null || slider.dataset.held) return;
+        if (slider.dataset.held) return;
         if (low === undefined || value <= low * 1.02 || value >= high * 0.98) [low, high] = [0.4 * value, 1.6 * value];
         slider.value = Math.round((1000 * (value - low)) / (high - low));
         slider.setAttribute("aria-valuetext", words(value, 5));
       });
       return slider;
     };
-    const kind = make("select", { "aria-label": "kind of aperture", onchange: () => this.event({ type: "aperture", kind: kind.value }) }, ...lens.aperture.kinds.map((one) => make("option", { value: one, textContent: KINDS[one] || one })));
-    const primary = make("select", { "aria-label": "primary wavelength", onchange: () => this.event({ type: "primary", number: Number(primary.value) }) });
-    this.controls.push((now) => {
-      kind.value = now.aperture.kind;
-      primary.replaceChildren(...now.wavelengths.map((one, k) => make("option", { value: k + 1, textContent: words(one, 5), selected: k + 1 === now.primary })));
-    });
-    const parts = [
-      field(`fields, ${lens.fields.unit.replace("degrees", "°")}`, "fields", { type: "fields" }, (now) => now.fields.y.map(typed).join(", ")),
-      field("wavelengths, µm", "wavelengths", { type: "wavelengths" }, (now) => now.wavelengths.map(typed).join(", ")),
-      make("div", { className: "pair" }, kind, field("aperture", "aperture", { type: "aperture" }, (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)),
+    const unit = unitOf(lens), listed = (numbers) => numbers.map(typed).join(", "), numbered = (count) => Array.from({ length: count }, (_, k) => [k + 1, k + 1]);
+    const fields = (axis) => field(this.showsX(lens) ? `fields ${axis}, ${unit}` : `fields, ${unit}`, axis === "y" ? "fields" : "fields-x", (values) => ({ type: "fields", axis, values }), (now) => listed(now.fields[axis]));
+    const rows = [
+      this.showsX(lens) ? [fields("x"), fields("y")] : [fields("y")],
+      [field("wavelengths, µm", "wavelengths", (values) => ({ type: "wavelengths", values }), (now) => listed(now.wavelengths)),
+        make("label", {}, make("span", { textContent: "primary" }), select("primary wavelength", (value) => ({ type: "primary", number: Number(value) }), (now) => now.wavelengths.map((one, k) => [k + 1, words(one, 5)]), (now) => now.primary))],
+      [select("kind of aperture", (kind) => ({ type: "aperture", kind }), (now) => now.aperture.kinds.map((one) => [one, KINDS[one] || one]), (now) => now.aperture.kind),
+        field("", "aperture", (value) => ({ type: "aperture", value }), (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)],
+      [make("label", { className: "more" }, this.more, " all numbers (conic, asphere, tilt, …)")],
     ];
-    parts.push(make("label", {}, make("span", { textContent: "primary, µm" }), primary), make("label", { className: "more" }, this.more, " all numbers (conic, asphere, tilt, …)"));
-    if (lens.configurations > 1) {
-      const chosen = make("select", { "aria-label": "configuration", onchange: () => this.event({ type: "configuration", number: Number(chosen.value) }) }, ...Array.from({ length: lens.configurations }, (_, k) => make("option", { value: k + 1, textContent: k + 1 })));
-      this.controls.push((now) => (chosen.value = now.configuration));
-      parts.push(make("label", {}, make("span", { textContent: "configuration" }), chosen));
-    }
-    this.conditions.replaceChildren(...parts);
+    if (lens.configurations > 1) rows[3].push(make("label", {}, make("span", { textContent: "configuration" }), select("configuration", (value) => ({ type: "configuration", number: Number(value) }), (now) => numbered(now.configurations), (now) => now.configuration)));
+    this.conditions.replaceChildren(...rows.map((parts) => make("div", { className: "row" }, ...parts)));
+    this.conditions.querySelector("[data-condition=aperture]").ariaLabel = "size of the aperture";
+  }
+
+  // Whether the x of the fields has a text field of its own.
+  showsX(lens) {
+    return this.moreNumbers || lens.fields.x.some((one) => one !== 0);
   }
 
   // -- optimising and saving
@@ -599,13 +627,18 @@ class Viewer {
 
   optimised(found) {
     this.running = Boolean(found && found.running);
+    clearTimeout(this.polling);
     this.optimise.textContent = this.running ? "Stop" : "Optimise";
     this.root.classList.toggle("running", this.running);
+    if (this.running && this.left.contains(document.activeElement)) this.optimise.focus();
+    this.left.inert = this.running;
+    for (const one of [this.restore, this.merit]) one.disabled = this.running;
+    if (this.running) this.undo.disabled = this.redo.disabled = true;
     if (!found) return;
     drawMerit(this.meritCurve, found.merits);
-    this.say(found.failure || `${this.running ? "optimising: " : "optimised: "}${found.cycles} cycles, ${found.words || "starting"}`, Boolean(found.failure));
+    if (!this.message.classList.contains("wrong")) this.say(`${this.running ? "optimising: " : "optimised: "}${found.words}`, false);
     this.root.dataset.cycles = found.cycles;
-    if (this.running) setTimeout(() => this.event({ type: "progress" }), 150);
+    if (this.running) this.polling = setTimeout(() => this.event({ type: "progress", cycles: found.cycles }), 60);
   }
 
   save() {
@@ -615,12 +648,22 @@ class Viewer {
 
 // -- where it runs ----------------------------------------------------------------------------------------------------
 
-// A page of the local server. A tab keeps its session through a reload.
-export function page(root, token) {
+// A page of the local server. A tab keeps its session through a reload; a duplicate of the tab, which begins with a copy
+// of its storage, has another one: the lock of a name is held by one tab.
+function sessionName() {
   const name = sessionStorage.getItem("raytrace") || crypto.randomUUID();
   sessionStorage.setItem("raytrace", name);
+  return new Promise((answer) => navigator.locks.request(name, { ifAvailable: true }, (lock) => {
+    if (lock) return answer(name), new Promise(() => {});
+    sessionStorage.removeItem("raytrace");
+    answer(sessionName());
+  }));
+}
+
+export function page(root, token) {
+  const session = sessionName();
   return new Viewer(root, async (event) => {
-    const reply = await fetch(`event?token=${token}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ session: name, event }) });
+    const reply = await fetch(`event?token=${token}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ session: await session, event }) });
     if (!reply.ok) throw new Error(await reply.text());
     return reply.json();
   });

@@ -1,0 +1,9 @@
+"""Tolerances: errors of manufacture as values, and lenses with such errors.
+
+tolerances      `Tolerances`: rows, compensators and the wavelength of the test
+elements        elements and cemented groups of a lens, found from its media and mirrors
+perturbation    `perturbed`: the lens with an error for each row, one lens or many
+sampling        `draw_errors`: random errors, the same for a trial in any batch
+
+A kind of error is a row of `KINDS` in `system/tolerance_data.py`.
+"""

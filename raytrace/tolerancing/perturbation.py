@@ -1,0 +1,432 @@
+"""Perturbation: a lens with errors of manufacture, an error for each row of its tolerances.
+
+Errors of one surface and of nested elements combine. They are applied in this order: operands of configurations; radii,
+thicknesses and other numbers, with the pickups and position solves that follow them; sag terms; motions.
+
+    before′ = M_group ∘ M_element ∘ before ∘ M_surface            M: decentre, then tilts about x, y and z
+    after′  = M_surface⁻¹ ∘ after ∘ E_element ∘ E_group           E = T⁻¹ M⁻¹ T,  T: the way through the element
+
+An element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what follows
+keeps its place: as with a coordinate break before it and one behind it. All motions are poses of surfaces, so that
+surfaces keep their numbers and the compiled trace carries the lens.
+"""
+
+import dataclasses
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.materials.glass import is_air
+from raytrace.system import configurations
+from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import Solve
+from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, parameter_paths, with_number
+from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
+from raytrace.system.sag_terms import with_powers
+from raytrace.system.surface import Surface
+from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
+from raytrace.tracing.geometry import semi_diameters
+from raytrace.words import did_you_mean
+
+#: Parameters of an Irregular surface by the names of a lens.
+_IRREGULAR = {"x": 1, "y": 2, "tilt_x": 3, "tilt_y": 4, "spherical": 5}
+
+
+def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: Tensor | Sequence[float]) -> Lens:
+    """The lens with an error for each tolerance.
+
+    tolerances: `Tolerances`, or rows; errors: (N,) in the rows' units, or (L, N) for L lenses at once, whose numbers
+    that differ from lens to lens then are (L, 1, 1, 1) and broadcast against rays (lens, field, wavelength, pupil).
+    Differentiable in the errors and in the lens. Numbers that no error touches stay the same tensors.
+    A lens of several configurations is perturbed in all of them, and loses the others where an element moves whose
+    thicknesses or poses differ between them: perturb each `lens.configuration(k)` then. Pickups and position solves
+    follow; other solves keep the nominal number.
+    Raises BadTolerance for a tolerance that the lens does not have, and for errors that are not one for each row.
+    """
+    rows = rows_of(tolerances)
+    wavelength = 1e-3 * (tolerances if isinstance(tolerances, Tolerances) else Tolerances(rows)).test_wavelength
+    check_tolerances(lens, rows)
+    errors = torch.as_tensor(errors, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
+        shape, count = tuple(errors.shape), len(rows)
+        raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")
+    values = [_per_lens(error) for error in errors.unbind(-1)]
+    pairs = list(zip(rows, values, strict=True))
+    gauges = _gauges(lens, pairs, wavelength)
+    start = _with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
+    surfaces = list(start.surfaces)
+    for row, value in pairs:
+        _change(lens, surfaces, row, value, gauges)
+    _follow(start, surfaces)
+    numbers = tuple(surfaces)
+    spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
+    _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
+    moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
+    operands = _operands(start, numbers, moved)
+    return dataclasses.replace(start, surfaces=tuple(surfaces), operands=operands)
+
+
+def _per_lens(number: Tensor) -> Tensor:
+    """A number of one lens (), or of L lenses (L,) as (L, 1, 1, 1)."""
+    return number.reshape(-1, 1, 1, 1) if number.dim() else number
+
+
+# -- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def _gauges(lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]], wavelength: float) -> dict[int, Gauge]:
+    """What the errors of each surface are measured by."""
+    angles: dict[int, Tensor] = {}
+    for row, value in pairs:
+        if row.kind == "irregularity_angle":
+            k = row.surfaces[0]
+            angles[k] = angles[k] + value if k in angles else value
+    used = {row.surfaces[0] for row, _ in pairs if KINDS[row.kind].sag or KINDS[row.kind].needs_semi_diameter}
+    radii = semi_diameters(lens) if any(KINDS[row.kind].needs_semi_diameter for row, _ in pairs) else None
+    gauges = {}
+    for k in used:
+        radius = radii[k] if radii else lens.surfaces[k].semi_diameter or 0.0
+        gauges[k] = Gauge(radius if radius > 0 else None, wavelength, angles.get(k))
+    for row, _ in pairs:
+        if KINDS[row.kind].needs_semi_diameter and gauges[row.surfaces[0]].semi_diameter is None:
+            message = "the surface has no semi-diameter, and no ray reaches it; give it `semi_diameter`"
+            raise BadTolerance(f"{_named(row)}: {message}")
+    return gauges
+
+
+def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, gauges: dict[int, Gauge]) -> None:
+    """Change the number of a row; of a thickness, the adjusting one with it."""
+    change = KINDS[row.kind].change
+    if change is None:
+        return
+    k = row.surfaces[0]
+    gauge = gauges.get(k, Gauge(None, 0.0))
+    if row.kind == "parameter":
+        gauge = gauge._replace(path=_path(lens.surfaces[k], row.parameter))
+        surfaces[k] = modelled(surfaces[k], row.parameter)
+    surfaces[k] = change(surfaces[k], value, row, gauge)
+    if row.kind == "thickness" and row.adjust not in (None, k):
+        surfaces[row.adjust] = change(surfaces[row.adjust], -value, row, gauge)
+
+
+def _path(nominal: Surface, quantity: str) -> ParameterPath | None:
+    """Where a surface holds a quantity; None: nowhere."""
+    if quantity == "thickness":
+        return ParameterPath((quantity,))
+    return parameter_paths(modelled(nominal, quantity)).get(quantity)
+
+
+def _follow(lens: Lens, surfaces: list[Surface]) -> None:
+    """The numbers that follow others by pickups and position solves; those whose sources are the same stay."""
+    solves = _solves(lens)
+    known: dict[tuple[int, str], Tensor | None] = {}
+
+    def step(place: tuple[int, str]) -> Tensor | None:
+        """How much a number has changed; None: not at all."""
+        if place not in known:
+            known[place] = None  # a number that follows itself stays
+            known[place] = _solved(solves[place]) if place in solves else _difference(lens, surfaces, *place)
+        return known[place]
+
+    def _solved(solve: Solve) -> Tensor | None:
+        if solve.kind == "pickup":
+            change = step((solve.source, solve.quantity_of_source or solve.quantity))
+            return None if change is None else solve.scale * change
+        k, source = solve.surface, solve.source
+        others = range(source, k) if source <= k else range(k + 1, source)
+        changes = [change for j in others if (change := step((j, "thickness"))) is not None]
+        return -sum(changes) if changes else None
+
+    changes = {place: step(place) for place in solves if solves[place].quantity != "glass"}
+    for (k, quantity), change in changes.items():
+        if change is not None:
+            surface, path = modelled(surfaces[k], quantity), _path(lens.surfaces[k], quantity)
+            surfaces[k] = with_number(surface, path, number_at(surface, path) + change)
+    for (k, quantity), solve in solves.items():
+        source = solve.source
+        while (source, quantity) in solves and source != k:
+            source = solves[source, quantity].source
+        if quantity == "glass" and surfaces[source].glass is not lens.surfaces[source].glass:
+            surfaces[k] = dataclasses.replace(surfaces[k], glass=surfaces[source].glass)
+
+
+def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
+    """The pickups and position solves of the lens, by surface and quantity."""
+    data = lens.optimization_data
+    solves = () if data is None else data.solves
+    return {(s.surface, s.quantity): s for s in solves if s.kind in ("pickup", "position") and s.operand is None}
+
+
+def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
+    """How much a number differs from that of the lens; None where it is the same tensor, or none."""
+    old, new, path = lens.surfaces[k], surfaces[k], _path(lens.surfaces[k], quantity)
+    if old is new or path is None:
+        return None
+    old, new = (_part(surface, path) for surface in (old, new))
+    if new is None or new is old:
+        return None
+    return (new if old is None else new - old)[() if path.entry is None else path.entry]
+
+
+def _part(surface: Surface, path: ParameterPath) -> Tensor | None:
+    """The tensor at a path, of all its entries; None where it is not modelled."""
+    part = surface
+    for name in path.path:
+        part = getattr(part, name, None)
+    return part
+
+
+def _carriers(lens: Lens, row: Tolerance) -> list[tuple[int, float]]:
+    """The surfaces that have the error of a surface, and its factor: with those that pick it up as irregular ones."""
+    kind = KINDS[row.kind]
+    if kind.elements or not (kind.sag or kind.motion):
+        return []
+    source, found = row.surfaces[0], [(row.surfaces[0], 1.0)]
+    data = lens.optimization_data
+    for solve in () if data is None or not kind.parameter else data.kept:
+        picked = solve.kind == "PPAR" and solve.quantity == f"PARM {kind.parameter}" and len(solve.numbers) > 1
+        if picked and int(solve.numbers[0]) == source:
+            found.append((solve.surface, solve.numbers[1]))
+    for solve in () if data is None or not kind.parameter else data.solves:
+        picked = solve.kind == "pickup" and _IRREGULAR.get(solve.quantity) == kind.parameter
+        if picked and solve.source == source and not lens.surfaces[solve.surface].is_break:
+            found.append((solve.surface, solve.scale))
+    return found
+
+
+# -- sag terms --------------------------------------------------------------------------------------------------------
+
+
+def _add_sags(surfaces: list[Surface], parts: Sequence[tuple[Tolerance, int, Tensor]], gauges: dict) -> None:
+    """Add the powers of all errors of a surface to its sag."""
+    sums: dict[tuple[int, float], list[Tensor]] = {}
+    for row, k, value in parts:
+        gauge = gauges[row.surfaces[0]]
+        terms = KINDS[row.kind].sag(value, row, gauge)
+        old = sums.get((k, gauge.radius), [])
+        pairs = itertools.zip_longest(old, terms)
+        sums[k, gauge.radius] = [b if a is None else a if b is None else a + b for a, b in pairs]
+    for (k, radius), terms in sums.items():
+        coefficients = torch.stack(torch.broadcast_tensors(*terms))
+        added = with_powers(surfaces[k].sag_terms, coefficients, coefficients.new_tensor(radius))
+        surfaces[k] = dataclasses.replace(surfaces[k], sag_terms=added)
+
+
+# -- motions ----------------------------------------------------------------------------------------------------------
+
+
+def _move(
+    surfaces: list[Surface],
+    pairs: Sequence[tuple[Tolerance, Tensor]],
+    parts: Sequence[tuple[Tolerance, int, Tensor]],
+) -> list[tuple[int, int]]:
+    """Move surfaces and elements rigidly; returns the first and last surface of each that moves."""
+    of_surfaces: dict[int, dict[str, Tensor]] = {}
+    for row, k, value in parts:
+        _add_to(of_surfaces.setdefault(k, {}), KINDS[row.kind].motion, value)
+    of_elements: dict[tuple[int, int, float], dict[str, Tensor]] = {}
+    for row, value in pairs:
+        kind = KINDS[row.kind]
+        if kind.elements:
+            _add_to(of_elements.setdefault((*_range(row), row.pivot), {}), kind.motion, value)
+    # From the outermost to the innermost: a longer range holds a shorter one.
+    ranges = sorted(of_elements, key=lambda place: place[0] - place[1])
+    still, before, behind = tuple(surfaces), defaultdict(list), defaultdict(list)
+    for first, last, pivot in ranges:
+        motion, z = Pose(**of_elements[first, last, pivot]), still[first].thickness.new_tensor(pivot)
+        motions = [Pose(z=z), motion, Pose(z=-z)] if pivot else [motion]
+        back, way = rows_back(rows_along(motions)), rows_along(_way(still[first : last + 1]))
+        before[first] += motions
+        behind[last].insert(0, rows_of_both(rows_of_both(rows_back(way), back), way))
+    for k in {*before, *behind, *of_surfaces}:
+        surface, own = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
+        front = [pose for pose in (*before[k], surface.before, *own) if pose is not None]
+        rear = [pose for pose in (*map(undone, own), surface.after) if pose is not None]
+        rows = rows_along(rear)
+        for element in behind[k]:
+            rows = rows_of_both(rows, element)
+        surfaces[k] = dataclasses.replace(
+            surfaces[k],
+            before=_single(front) or _pose(rows_along(front), k),
+            after=(None if behind[k] else _single(rear)) or _pose(rows, k),
+        )
+    return [(first, last) for first, last, _ in ranges] + [(k, k) for k in of_surfaces]
+
+
+def _add_to(motion: dict[str, Tensor], field: str, value: Tensor) -> None:
+    motion[field] = motion[field] + value if field in motion else value
+
+
+def _range(row: Tolerance) -> tuple[int, int]:
+    return row.surfaces[0], row.surfaces[-1]
+
+
+def _way(surfaces: Sequence[Surface]) -> list[Pose | Tensor | None]:
+    """The poses and thicknesses from the axes in front of the first surface to those behind the last."""
+    steps: list[Pose | Tensor | None] = []
+    for surface in surfaces:
+        steps += [surface.before, surface.after, surface.thickness]
+    return steps[:-1]
+
+
+def _single(poses: Sequence[Pose]) -> Pose | None:
+    """The pose of one alone, without the rounding of its angles."""
+    return poses[0] if len(poses) == 1 else None
+
+
+def _pose(rows: Rows, k: int) -> Pose:
+    """The pose of a passage. Raises BadTolerance where its tilt about y is a right angle."""
+    sine, hidden = rows[2][0], torch._C._are_functorch_transforms_active()
+    if isinstance(sine, Tensor) and not hidden and bool((sine.detach().abs() > 1 - 1e-12).any()):
+        message = "its axes turn by 90° about y, where a further tilt has no angles about x and z"
+        raise BadTolerance(f"surface {k}: {message}; put the turn on a coordinate break of its own")
+    return pose_of(rows)
+
+
+# -- configurations ---------------------------------------------------------------------------------------------------
+
+
+def _with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]]) -> Lens:
+    """The lens with errors of operands of configurations."""
+    for row, value in pairs:
+        operand = lens.operands[row.operand]
+        if value.dim() and any(isinstance(scaled.path[-1], tuple) for scaled in operand.paths):
+            raise BadTolerance(f"{_named(row)}: a coefficient that differs between configurations; expected one lens")
+        lens = dataclasses.replace(
+            lens, operands=tuple(_raised(one, row, value) if one is operand else one for one in lens.operands)
+        )
+        if row.configuration == lens.current_configuration:
+            for path, factor, _ in operand.paths:
+                lens = configurations.with_part(lens, path, configurations.part(lens, path) + factor * value)
+    return lens
+
+
+def _raised(operand: configurations.Operand, row: Tolerance, value: Tensor) -> configurations.Operand:
+    one = torch.zeros_like(operand.numbers)
+    one[row.configuration - 1] = 1.0
+    return dataclasses.replace(operand, numbers=_spread(operand.numbers, value) + _spread(one, value) * value)
+
+
+def _spread(numbers: Tensor, value: Tensor) -> Tensor:
+    """Numbers (C, ...) with trailing axes for those of a value."""
+    return numbers.reshape(*numbers.shape, *(1,) * (value.dim() + 1 - numbers.dim()))
+
+
+def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[int, int]]) -> tuple:
+    """The operands of configurations with the errors of the numbers that they hold; none where a motion needs them.
+
+    numbers: the surfaces with errors of their numbers; moved: first and last surfaces of what moves.
+    """
+
+    def differs(path: configurations.Path) -> bool:
+        if path[0] != "surfaces":
+            return False
+        posed = path[2] in ("before", "after")
+        return any(a <= path[1] <= b if posed else path[2] == "thickness" and a <= path[1] < b for a, b in moved)
+
+    if any(differs(scaled.path) for operand in lens.operands for scaled in operand.paths):
+        return ()
+    changed, found = dataclasses.replace(lens, surfaces=numbers), []
+    for operand in lens.operands:
+        path = operand.paths[0].path if operand.paths and operand.numbers is not None else None
+        old, new = (None, None) if path is None else (configurations.part(one, path) for one in (lens, changed))
+        if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old and not isinstance(path[-1], tuple):
+            step = (new - old) / operand.paths[0].factor
+            operand = dataclasses.replace(operand, numbers=_spread(operand.numbers, step) + step)
+        found.append(operand)
+    return tuple(found)
+
+
+# -- what a lens does not have ----------------------------------------------------------------------------------------
+
+
+def _named(row: Tolerance) -> str:
+    return f"{row.name} of {row.where}" + (f" ({row.source})" if row.source else "")
+
+
+def check_tolerances(lens: Lens, rows: Iterable[Tolerance]) -> None:
+    """Refuse tolerances that a lens does not have. Raises BadTolerance naming what was found and expected."""
+    last, ranges = len(lens.surfaces) - 1, {}
+    solves = _solves(lens)
+    for row in rows:
+        if row.kind not in KINDS:
+            meant = did_you_mean(row.kind, KINDS)
+            raise BadTolerance(f"kind {row.kind!r}{meant}: expected one of {', '.join(KINDS)}")
+        check_limits(row)
+        kind = KINDS[row.kind]
+        if row.kind == "operand":
+            _check_operand(lens, row)
+            continue
+        if len(row.surfaces) not in ((1, 2) if kind.elements else (1,)):
+            wanted = "its first and last surface, as (1, 2)" if kind.elements else "one surface, as (3,)"
+            raise BadTolerance(f"{row.kind} of surfaces {row.surfaces}: expected {wanted}")
+        least = 0 if row.kind == "thickness" else 1
+        most = last if kind.motion or kind.sag else last - 1
+        if not all(least <= k <= most for k in row.surfaces):
+            raise BadTolerance(f"{_named(row)}: this lens has surfaces {least} to {most} with such an error")
+        if kind.elements:
+            first, end = _range(row)
+            if first > end:
+                raise BadTolerance(f"{_named(row)}: the first surface lies behind the last; expected ({end}, {first})")
+            _check_nested(row, ranges)
+            ranges.setdefault((first, end), row)
+        else:
+            _check_surface(lens, row, solves)
+
+
+def _check_operand(lens: Lens, row: Tolerance) -> None:
+    count = configurations.count(lens.operands)
+    if row.operand is None or not 0 <= row.operand < len(lens.operands):
+        raise BadTolerance(f"{_named(row)}: this lens has {len(lens.operands)} operands of configurations")
+    if not 1 <= row.configuration <= count:
+        raise BadTolerance(f"{_named(row)}: this lens has configurations 1 to {count}")
+    if lens.operands[row.operand].numbers is None:
+        raise BadTolerance(f"{_named(row)}: {lens.operands[row.operand]} is no number; expected one that has a value")
+
+
+def _check_nested(row: Tolerance, ranges: dict[tuple[int, int], Tolerance]) -> None:
+    """Refuse an element that holds a part of another."""
+    first, end = _range(row)
+    for (a, b), other in ranges.items():
+        if a < first <= b < end or first < a <= end < b:
+            message = f"it shares a part of surfaces {a}-{b} ({other.kind}); expected one inside the other, or apart"
+            raise BadTolerance(f"{_named(row)}: {message}")
+
+
+def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Solve]) -> None:
+    k = row.surfaces[0]
+    surface, message = lens.surfaces[k], ""
+    if row.adjust is not None and not 0 <= row.adjust < len(lens.surfaces) - 1:
+        message = f"the adjusting surface {row.adjust}; this lens has surfaces 0 to {len(lens.surfaces) - 2}"
+    elif row.kind == "parameter":
+        if row.parameter not in parameter_paths(modelled(surface, row.parameter)):
+            known = ", ".join(parameter_paths(surface))
+            message = f"the surface has no {row.parameter!r}; it has {known}"
+    elif surface.is_break and row.kind != "thickness":
+        message = 'the surface is a coordinate break; expected "parameter" with its tilt_x, x, …, or an optical surface'
+    elif row.kind == "zernike" and not 2 <= row.term <= 231:
+        message = f"term {row.term}; expected one of Noll's from 2 to 231"
+    quantity = {"radius": "curvature", "power": "curvature", "index": "glass", "abbe": "glass"}.get(row.kind, row.kind)
+    quantity = row.parameter if row.kind == "parameter" else quantity
+    if (k, quantity) in solves and not message:
+        source = solves[k, quantity].source
+        message = f"its {quantity} follows that of surface {source}; put the tolerance there"
+    if not message and not torch._C._are_functorch_transforms_active():
+        message = _objection(lens, row, surface)
+    if message:
+        raise BadTolerance(f"{_named(row)}: {message}")
+
+
+def _objection(lens: Lens, row: Tolerance, surface: Surface) -> str:
+    """What the values of a lens forbid, in words, else ""."""
+    if row.kind == "radius" and (surface.curvature is None or not bool((surface.curvature != 0).any())):
+        return "the surface is a plane, whose radius has no error; expected power (fringes) or curvature"
+    if row.kind in ("index", "abbe") and (surface.is_mirror or is_air(surface.glass)):
+        return f"the surface is {'a mirror' if surface.is_mirror else 'followed by air'}; expected one before glass"
+    if row.kind == "thickness" and not bool(torch.isfinite(surface.thickness).all()):
+        return "the thickness is infinite"
+    return ""

@@ -1,0 +1,78 @@
+"""CONTRIBUTING.md: its changes apply to a copy of the package, and the tests that it shows pass there."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+#: A file in backticks, and the block of its change or of its text.
+BLOCK = re.compile(r"^`([\w/.]+)`[^\n]*:\n\n(`{3,})(diff|python)\n(.*?)^\2$", re.M | re.S)
+BLOCKS = [(path, kind, text) for path, _, kind, text in BLOCK.findall((ROOT / "CONTRIBUTING.md").read_text("utf-8"))]
+TESTS = [path for path, kind, _ in BLOCKS if kind == "python" and path.startswith("tests/")]
+
+
+def changed(text: str, change: str) -> str:
+    """A text after the changes of a block; each place occurs once."""
+    for place in change.split("…\n"):
+        lines = place.splitlines(keepends=True)
+        before, after = ("".join(line[1:] for line in lines if line[0] in signs) for signs in (" -", " +"))
+        assert text.count(before) == 1, f"once expected, found {text.count(before)} times:\n{before}"
+        text = text.replace(before, after)
+    return text
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A copy of the repository with all changes of the page."""
+    root = tmp_path_factory.mktemp("contribution")
+    for folder in ("raytrace", "tests", "docs"):
+        shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__", "_build", "*.png"))
+    for name in ("glass_catalogs", "lenses", "pyproject.toml", "README.md"):
+        (root / name).symlink_to(ROOT / name)
+    for path, kind, text in BLOCKS:
+        file = root / path
+        assert file.exists() == (kind == "diff"), path
+        file.write_text(changed(file.read_text("utf-8"), text) if kind == "diff" else text, "utf-8")
+    run(root, "tests/test_stub.py")
+    return root
+
+
+def run(root: Path, *words: str) -> str:
+    """The output of Python in a copy. Torch traces: to compile the trace for a copy would take a minute."""
+    environment = {**os.environ, "PYTHONPATH": str(root), "MPLBACKEND": "Agg", "CXX": "no-compiler"}
+    process = subprocess.run(
+        [sys.executable, *words], cwd=root, env=environment, capture_output=True, text=True, timeout=1800
+    )
+    assert process.returncode == 0, process.stdout[-4000:] + process.stderr[-2000:]
+    return process.stdout
+
+
+def test_every_addition_has_a_test_that_the_page_runs():
+    page = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    assert len(TESTS) == 4
+    for path in TESTS:
+        assert f"\npytest {path}\n" in page
+
+
+def test_the_shown_tests_pass(copy):
+    summary = run(copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", *TESTS).splitlines()[-1]
+    assert int(re.match(r"(\d+) passed", summary)[1]) >= 7, summary
+
+
+def test_the_code_is_formatted_and_its_command_runs(copy):
+    files = [path for path, _, _ in BLOCKS if path.endswith(".py")]
+    run(copy, "-m", "ruff", "check", "-q", *files)
+    run(copy, "-m", "ruff", "format", "--check", "-q", *files)
+    assert "fraction" in run(copy, "-m", "raytrace", "vignetting", "cooke_triplet", "--samples", "3")
+
+
+@pytest.mark.slow
+def test_the_changed_package_keeps_its_structure(copy):
+    """The tests of the repository that a commit runs, but for counts of files: those are of the compiled trace."""
+    (line,) = re.findall(r"^pytest (tests/test_layers.*)$", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.M)
+    run(copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "not runs_through_few_files", *line.split())

@@ -1,0 +1,495 @@
+"""Tolerances: errors of manufacture against explicit coordinate breaks, closed forms and finite differences."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from problems import number
+
+import raytrace as rt
+from raytrace.materials.environment import Environment, index_in
+from raytrace.materials.glass import LINES, InvalidIndex, abbe_number, index, model_glass, with_index_errors
+from raytrace.system.poses import undone
+from raytrace.system.sag_terms import FringeSag, GridSag, PolynomialSag, TiltSag, ZernikeSag, spline
+from raytrace.system.surface import sag_at
+from raytrace.system.tolerance_data import KINDS
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import trace_lens
+
+T = rt.Tolerance
+HEAD = """VERS 130000
+MODE SEQ
+UNIT MM X W X CM MR CPMM
+ENPD 8
+FTYP 0 0 2 1 0 0 0
+RAIM 0 0 1 1 0 0 0 0 0
+XFLN 0 0
+YFLN 0 5
+WAVM 1 0.55 1
+PWAV 1"""
+#: Curvature, thickness and index of the surfaces of a lens with a cemented doublet; then its sensor.
+SURFACES = [
+    (0.02, 3.0, 1.6, 8.0),
+    (-0.015, 1.5, 1.7, 8.0),
+    (-0.004, 5.0, 0.0, 8.0),
+    (0.03, 2.5, 1.5, 7.0),
+    (0.01, 40.0, 0.0, 7.0),
+]
+
+
+def standard(curvature, thickness, index, semi_diameter, *, stop=False) -> str:
+    glass = f"\n  GLAS ___BLANK 1 0 {index} 0 0 0 0 0 0 0" if index else ""
+    size = f"DIAM {semi_diameter} 1 0 0 1"
+    return (
+        f"  {'STOP' if stop else 'TYPE STANDARD'}\n  CURV {curvature!r} 0 0 0 0\n  DISZ {thickness!r}{glass}\n  {size}"
+    )
+
+
+def coordinate_break(x=0.0, y=0.0, tilt_x=0.0, tilt_y=0.0, tilt_z=0.0, *, order=0, thickness=0.0) -> str:
+    numbers = (x, y, tilt_x, tilt_y, tilt_z, order)
+    parameters = "\n".join(f"  PARM {j} {number!r}" for j, number in enumerate(numbers, 1))
+    return f"  TYPE COORDBRK\n{parameters}\n  DISZ {thickness!r}"
+
+
+def back(*numbers: float, thickness=0.0) -> str:
+    """The coordinate break that undoes one."""
+    return coordinate_break(*(-number for number in numbers), order=1, thickness=thickness)
+
+
+def read(tmp_path, *blocks: str) -> rt.Lens:
+    blocks = ["  TYPE STANDARD\n  DISZ INFINITY", *blocks, "  TYPE STANDARD\n  DISZ 0"]
+    text = "\n".join([HEAD, *(f"SURF {k}\n{block}" for k, block in enumerate(blocks))])
+    path = tmp_path / "lens.zmx"
+    path.write_text(text + "\n", encoding="utf-8")
+    return rt.read_lens(path)
+
+
+def blocks(**changed) -> list[str]:
+    return [standard(*numbers, stop=k == 0) for k, numbers in enumerate(SURFACES)]
+
+
+@pytest.fixture
+def nominal(tmp_path):
+    return read(tmp_path, *blocks())
+
+
+def hits(lens, start=None):
+    """Position and direction (6, ...) on the sensor of rays that start as those of another lens."""
+    start = lens if start is None else start
+    points = torch.tensor([[0.0, 0.3, -0.8], [0.0, 0.7, -0.4]], dtype=torch.float64)
+    fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
+    rays = launch(start, points, fields=fields, wavelengths=start.wavelengths)
+    end = trace_lens(lens, rays, start.wavelengths[:, None])
+    assert end.valid.all()
+    return torch.cat([end.position, end.direction])
+
+
+def close(one, other, atol=1e-12):
+    torch.testing.assert_close(one, other, rtol=0, atol=atol)
+
+
+MOVE = (0.2, -0.1, 0.7, -0.4, 1.3)
+NAMES = ("element_decenter_x", "element_decenter_y", "element_tilt_x", "element_tilt_y", "element_roll")
+
+
+def element(first, last, **known):
+    return [T(name, (first, last), -2, 2, **known) for name in NAMES]
+
+
+def test_an_element_is_moved_as_between_two_coordinate_breaks(nominal, tmp_path):
+    found = rt.perturbed(nominal, element(1, 3), MOVE)
+    s = blocks()
+    s[2] = standard(-0.004, -4.5, 0.0, 8.0)
+    dummy = standard(0.0, 5.0, 0.0, 8.0)
+    explicit = read(tmp_path, coordinate_break(*MOVE), *s[:3], back(*MOVE, thickness=4.5), dummy, *s[3:])
+    close(hits(found, nominal), hits(explicit, nominal))
+    assert (hits(found, nominal) - hits(nominal))[:2].abs().max() > 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_sign_of_each_motion_is_that_of_a_coordinate_break(name, nominal, tmp_path):
+    move = [0.3 if other == name else 0.0 for other in NAMES]
+    found = rt.perturbed(nominal.replace(4, conic=-3.0), [T(name, (4, 5), -1, 1)], [0.3])
+    s = blocks()
+    s[3] += "\n  CONI -3"
+    s[4] = standard(0.01, -2.5, 0.0, 7.0)
+    dummy = standard(0.0, 40.0, 0.0, 7.0)
+    explicit = read(tmp_path, *s[:3], coordinate_break(*move), *s[3:], back(*move, thickness=2.5), dummy)
+    close(hits(found, nominal), hits(explicit, nominal))
+
+
+def test_a_pivot_lies_behind_the_first_vertex(nominal, tmp_path):
+    found = rt.perturbed(nominal, [T("element_tilt_x", (4, 5), -2, 2, pivot=6.0)], [0.7])
+    s = blocks()
+    s[2] = standard(-0.004, 11.0, 0.0, 8.0)  # to the pivot
+    s[4] = standard(0.01, 3.5, 0.0, 7.0)
+    turn = coordinate_break(tilt_x=0.7, thickness=-6.0)
+    rest = standard(0.0, 36.5, 0.0, 7.0)
+    explicit = read(tmp_path, *s[:3], turn, *s[3:], back(0, 0, 0.7, 0, 0), rest)
+    close(hits(found, nominal), hits(explicit, nominal))
+
+
+def test_elements_move_inside_groups_and_surfaces_inside_elements(nominal, tmp_path):
+    rows = [*element(4, 5), T("surface_decenter_x", (4,), -1, 1), *element(1, 5), T("surface_decenter_y", (1,), -1, 1)]
+    group = (-0.3, 0.2, -0.5, 0.9, -2.0)
+    found = rt.perturbed(nominal, rows, [*MOVE, 0.15, *group, -0.25])
+    s = blocks()
+    s[0] = standard(0.02, 0.0, 1.6, 8.0)
+    s[3] = standard(0.03, 0.0, 1.5, 7.0)
+    s[4] = standard(0.01, -2.5, 0.0, 7.0)
+    explicit = read(
+        tmp_path,
+        *(coordinate_break(*group), coordinate_break(0, -0.25), s[0].replace("STOP", "TYPE STANDARD")),
+        *(back(0, -0.25, thickness=3.0), "  STOP\n" + s[1], s[2]),
+        *(coordinate_break(*MOVE), coordinate_break(0.15), s[3], back(0.15, thickness=2.5), s[4]),
+        *(back(*MOVE, thickness=2.5), standard(0.0, -12.0, 0.0, 8.0), back(*group, thickness=12.0)),
+        standard(0.0, 40.0, 0.0, 7.0),
+    )
+    close(hits(found, nominal), hits(explicit, nominal))
+
+
+def test_errors_of_mirrors_between_coordinate_breaks(tmp_path):
+    mirror = "  TYPE STANDARD\n  CURV -0.004 0 0 0 0\n  DISZ {}\n  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0\n  DIAM 9 1 0 0 1"
+    front = "  STOP\n  TYPE STANDARD\n  DISZ 20"
+    fold = coordinate_break(tilt_x=-40.0)
+    nominal = read(tmp_path, front, fold, mirror.format("0"), coordinate_break(tilt_x=-40.0, thickness=-30.0))
+    assert rt.lens_elements(nominal) == [(3, 3)]
+    found = rt.perturbed(nominal, element(3, 3), MOVE)
+    moved = [coordinate_break(*MOVE), mirror.format("0"), back(*MOVE)]
+    explicit = read(tmp_path, front, fold, *moved, coordinate_break(tilt_x=-40.0, thickness=-30.0))
+    close(hits(found, nominal), hits(explicit, nominal))
+    # a group that contains the breaks
+    found = rt.perturbed(nominal, element(2, 4), MOVE)
+    inner = [fold, mirror.format("0"), coordinate_break(tilt_x=-40.0)]
+    undo = [coordinate_break(tilt_x=40.0), coordinate_break(tilt_x=40.0), back(*MOVE)]
+    again = [fold, coordinate_break(tilt_x=-40.0, thickness=-30.0)]
+    explicit = read(tmp_path, front, coordinate_break(*MOVE), *inner, *undo, *again)
+    close(hits(found, nominal), hits(explicit, nominal))
+
+
+def test_a_surface_with_a_pose_of_its_own_keeps_it(nominal):
+    inner, behind = rt.Pose(y=0.4, tilt_x=3.0, tilt_z=20.0), rt.Pose(tilt_x=-1.0)
+    posed = nominal.replace(4, before=inner, after=behind)
+    found = rt.perturbed(posed, [*element(4, 4), T("surface_decenter_x", (4,), -1, 1)], [*MOVE, 0.3])
+    shift, outer = (rt.Pose(x=number(0.3)), rt.Pose(*map(number, MOVE[:2]), None, *map(number, MOVE[2:])))
+    surface, zero = posed.surfaces[4], number(0.0)
+
+    def axes(pose, thickness=zero):
+        return rt.Surface(thickness, before=pose, is_break=True)
+
+    bare = dataclasses.replace(surface, before=shift, after=undone(shift), thickness=zero)
+    inner, behind = surface.before, surface.after
+    chain = [axes(outer), axes(inner), bare, axes(behind)]
+    chain += [axes(undone(behind)), axes(undone(inner)), axes(undone(outer)), axes(inner)]  # back, and forward again
+    chain.append(axes(behind, surface.thickness))
+    surfaces = (*posed.surfaces[:4], *chain, *posed.surfaces[5:])
+    close(hits(found, nominal), hits(dataclasses.replace(posed, surfaces=surfaces), nominal))
+
+
+# -- numbers ----------------------------------------------------------------------------------------------------------
+
+#: A row of every kind, with an error.
+ROWS = [
+    (T("radius", (1,), -1, 1), 0.4),
+    (T("radius", (4,), -1, 1, unit="%"), -0.6),
+    (T("power", (2,), -9, 9), 5.0),
+    (T("curvature", (3,), -1, 1), 1e-4),
+    (T("conic", (4,), -1, 1), 0.2),
+    (T("thickness", (1,), -1, 1, adjust=3), 0.1),
+    (T("thickness", (4,), -1, 1), -0.07),
+    (T("index", (1,), -1, 1), 1e-3),
+    (T("index", (6,), -1, 1), -2e-3),
+    (T("abbe", (6,), -9, 9), 3.0),
+    (T("abbe", (6,), -9, 9, unit="%"), 0.8),
+    (T("parameter", (5,), -1, 1, parameter="a4"), 1e-6),
+    (T("parameter", (4,), -1, 1, parameter="tilt_x"), 0.1),
+    (T("surface_decenter_x", (3,), -1, 1), 0.1),
+    (T("surface_decenter_y", (4,), -1, 1), -0.1),
+    (T("surface_tilt_x", (2,), -1, 1), 0.2),
+    (T("surface_tilt_y", (4,), -1, 1), 0.1),
+    (T("surface_runout_x", (5,), -1, 1), 0.02),
+    (T("surface_runout_y", (2,), -1, 1), 0.01),
+    (T("irregularity", (3,), -9, 9), 2.0),
+    (T("irregularity_angle", (3,), -90, 90), 35.0),
+    (T("zernike", (3,), -1, 1, term=7), 1e-4),
+    (T("element_decenter_x", (4, 5), -1, 1), 0.1),
+    (T("element_decenter_y", (1, 3), -1, 1), -0.1),
+    (T("element_decenter_z", (4, 5), -1, 1), 0.2),
+    (T("element_tilt_x", (1, 3), -1, 1), 0.3),
+    (T("element_tilt_y", (1, 5), -1, 1, pivot=2.0), 0.2),
+    (T("element_roll", (1, 5), -9, 9), 4.0),
+]
+
+
+@pytest.fixture
+def asphere(nominal):
+    """The lens with terms of an asphere on surface 5, and a dispersive plate in front of its sensor."""
+    lens = nominal.replace(5, coefficients=[0.0, 2e-6], thickness=20.0)
+    plate = dataclasses.replace(lens.surfaces[5], curvature=None, coefficients=None)
+    pair = [dataclasses.replace(plate, glass=model_glass(1.5, 60.0), thickness=number(3.0)), plate]
+    lens = dataclasses.replace(lens, surfaces=(*lens.surfaces[:6], *pair, lens.surfaces[6]))
+    return lens.at(wavelengths=[0.55, 0.48, 0.65])
+
+
+def test_every_kind_of_error_has_a_row_here():
+    assert {row.kind for row, _ in ROWS} == set(KINDS) - {"operand"}
+
+
+def errors(factor=1.0):
+    return factor * torch.tensor([value for _, value in ROWS], dtype=torch.float64)
+
+
+def test_no_error_is_the_nominal_lens(asphere):
+    rows = [row for row, _ in ROWS]
+    close(hits(rt.perturbed(asphere, rows, errors(0.0)), asphere), hits(asphere), 1e-13)
+    for row, value in ROWS:
+        moved = hits(rt.perturbed(asphere, [row], [value]), asphere) - hits(asphere)
+        alone = ("irregularity_angle", "element_roll")  # nothing turns but what is round
+        assert (moved.abs().max() > 1e-7) == (row.kind not in alone), row
+
+
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
+def test_a_batch_of_lenses_is_each_of_them(engine, asphere, compiler):
+    rows = [row for row, _ in ROWS]
+    batch = torch.stack([errors(factor) for factor in (1.0, -0.5, 0.0)])
+    with rt.trace_engine(engine):
+        together = hits(rt.perturbed(asphere, rows, batch), asphere)
+        for k, one in enumerate(batch):
+            close(together[:, k], hits(rt.perturbed(asphere, rows, one), asphere), 1e-13)
+
+
+@pytest.mark.parametrize("place", range(len(ROWS)))
+def test_the_derivative_by_an_error_is_that_of_the_rays(place, asphere):
+    rows, step = [row for row, _ in ROWS], 1e-4 * abs(ROWS[place][1])
+    weights = torch.linspace(-1, 1, 6, dtype=torch.float64)[:, None, None, None]
+
+    def total(values):
+        return (weights * hits(rt.perturbed(asphere, rows, values), asphere)).sum()
+
+    values = errors().requires_grad_()
+    (slope,) = torch.autograd.grad(total(values), values)
+    one = torch.zeros(len(rows), dtype=torch.float64)
+    one[place] = step
+    with torch.no_grad():
+        stencil = [total(errors() + k * one) for k in (-2, -1, 1, 2)]
+    expected = (stencil[0] - 8 * stencil[1] + 8 * stencil[2] - stencil[3]) / (12 * step)
+    assert float(slope[place]) == pytest.approx(float(expected), rel=1e-5, abs=1e-9 / step * 1e-3)
+
+
+def test_the_derivative_by_a_number_of_the_lens(nominal):
+    curvature = number(0.02).requires_grad_()
+    found = rt.perturbed(nominal.replace(1, curvature=curvature), [T("radius", (1,), -1, 1)], [0.5])
+    (slope,) = torch.autograd.grad(found.surfaces[1].curvature, curvature)
+    assert float(slope) == pytest.approx(1 / (1 + 0.02 * 0.5) ** 2, rel=1e-14)
+
+
+def test_what_no_error_touches_stays_the_same(nominal):
+    found = rt.perturbed(nominal, [T("thickness", (2,), -1, 1)], [0.1])
+    for k, (old, new) in enumerate(zip(nominal.surfaces, found.surfaces, strict=True)):
+        assert (old is new) == (k != 2)
+    assert found.surfaces[2].curvature is nominal.surfaces[2].curvature
+    assert found.fields is nominal.fields
+
+
+def test_a_fringe_of_power_is_half_a_wave_of_sag_at_the_semi_diameter(nominal):
+    lens = nominal.replace(1, conic=-0.7)
+    found = rt.perturbed(lens, rt.Tolerances((T("power", (1,), -9, 9),), test_wavelength=0.5), [3.0])
+    h = number(8.0)
+    old, new = (sag_at(one.surfaces[1], 0 * h, h) for one in (lens, found))
+    assert float(new - old) == pytest.approx(3 * 0.25e-3, rel=1e-9)
+    plane = rt.perturbed(nominal.replace(1, curvature=None), [T("power", (1,), -9, 9)], [2.0])
+    assert float(sag_at(plane.surfaces[1], h, 0 * h)) == pytest.approx(0.6328e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0])
+def test_irregularity_is_half_spherical_half_astigmatism(angle, nominal):
+    rows = [T("irregularity", (2,), -9, 9), T("irregularity_angle", (2,), -90, 90)]
+    found = rt.perturbed(nominal, rows, [2.0, angle])
+    x, y = torch.meshgrid(*[torch.linspace(-8, 8, 9, dtype=torch.float64)] * 2, indexing="ij")
+    added = sag_at(found.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
+    turn = math.radians(angle)
+    v, rho2 = (y * math.cos(turn) - x * math.sin(turn)) / 8, (x * x + y * y) / 64
+    close(added, 2 * 0.6328e-3 / 4 * (rho2**2 + v * v), 1e-16)
+    # by Zernike's fringe terms Z_9, Z_4, Z_5 and Z_6
+    z5, z6 = (x * x - y * y) / 64, 2 * x * y / 64
+    z4, z9 = 2 * rho2 - 1, 6 * rho2**2 - 6 * rho2 + 1
+    bent = (z5 * math.cos(2 * turn) + z6 * math.sin(2 * turn)) / 2
+    close(added, 2 * 0.6328e-3 / 4 * (z9 / 6 + 3 * z4 / 4 - bent + 7 / 12), 1e-16)
+
+
+def test_the_limit_of_a_zernike_term_is_its_rms(nominal):
+    found = rt.perturbed(nominal, [T("zernike", (2,), -1, 1, term=11)], [1e-3])
+    x, y = 8 * torch.randn(2, 40_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64).clamp(-1, 1)
+    rho2 = (x * x + y * y) / 64
+    added = sag_at(found.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
+    close(added, 1e-3 * math.sqrt(5) * (6 * rho2**2 - 6 * rho2), 1e-14)  # without its constant, which is a thickness
+
+
+SAGS = {
+    "polynomial": PolynomialSag(torch.tensor([1e-3, -2e-3, 3e-3]).double(), torch.tensor(6.0).double()),
+    "fringe": FringeSag(*(torch.tensor(v).double() for v in ([1e-3, 2e-3, -1e-3, 4e-4, 5e-4], 7.0, 0.5, -0.8))),
+    "zernike": ZernikeSag(torch.tensor([1e-4, 2e-4, -3e-4, 1e-4]).double(), torch.tensor(9.0).double()),
+    "tilt": TiltSag(torch.tensor(0.01).double(), torch.tensor(-0.02).double()),
+}
+
+
+@pytest.mark.parametrize("name", SAGS)
+def test_sag_terms_stay_under_an_error(name, nominal):
+    lens = nominal.replace(2, sag_terms=SAGS[name])
+    rows = [T("irregularity", (2,), -9, 9), T("surface_tilt_x", (2,), -1, 1)]
+    found = rt.perturbed(lens, rows, [3.0, 0.1])
+    x, y = torch.tensor([[0.0, 3.0, -5.0], [1.0, -2.0, 4.0]], dtype=torch.float64)
+    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + y * math.tan(math.radians(0.1))
+    close(sag_at(found.surfaces[2], x, y), sag_at(lens.surfaces[2], x, y) + added, 1e-15)
+
+
+def test_heights_of_a_grid_stay_under_an_error(nominal):
+    heights = 1e-4 * torch.sin(torch.arange(33.0 * 33).reshape(33, 33)).double()
+    lens = nominal.replace(2, sag_terms=GridSag(heights, number(0.5)))
+    x, y = torch.tensor([[0.0, 3.1, -5.2], [1.3, -2.0, 4.0]], dtype=torch.float64)
+    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64)
+    spline_lens = nominal.replace(2, sag_terms=spline(lens.surfaces[2].sag_terms))
+    for one in (lens, spline_lens):
+        found = rt.perturbed(one, [T("irregularity", (2,), -9, 9)], [3.0])
+        close(sag_at(found.surfaces[2], x, y), sag_at(one.surfaces[2], x, y) + added, 1e-9)
+
+
+# -- media ------------------------------------------------------------------------------------------------------------
+
+
+def test_an_index_error_moves_the_index_at_all_wavelengths_and_an_abbe_error_turns_it_about_d():
+    glass = rt.find_glass("N-BK7")
+    wavelengths = torch.tensor([LINES["d"], LINES["F"], LINES["C"], 1.0], dtype=torch.float64)
+    found = with_index_errors(glass, index=number(2e-3))
+    close(index(found, wavelengths), index(glass, wavelengths) + 2e-3, 1e-15)
+    found = with_index_errors(found, abbe=number(1.5))
+    n = index(found, wavelengths)
+    assert float(n[0] - index(glass, wavelengths)[0]) == pytest.approx(2e-3, abs=1e-7)  # the model's d line is 0.5876
+    expected = abbe_number(glass) + 1.5
+    nominal_nd = index(glass, wavelengths)[0]
+    assert float((nominal_nd - 1) / (n[1] - n[2])) == pytest.approx(float(expected), rel=1e-5)
+    percent = with_index_errors(glass, abbe=number(1.0), percent=True)
+    n = index(percent, wavelengths)
+    assert float((n[0] - 1) / (n[1] - n[2])) == pytest.approx(1.01 * float(abbe_number(glass)), rel=1e-5)
+
+
+def test_a_glass_with_errors_keeps_its_thermal_coefficients():
+    glass = rt.find_glass("N-BK7")
+    hot = Environment(number(60.0), number(1.0))
+    at = torch.tensor([0.5, 0.6], dtype=torch.float64)
+    found = index_in(with_index_errors(glass, index=number(1e-4)), at, hot)
+    close(found, index_in(glass, at, hot) + 1e-4, 1e-7)
+
+
+def test_a_glass_without_dispersion_has_no_abbe_error(nominal):
+    with pytest.raises(InvalidIndex, match="no Abbe number"):
+        rt.perturbed(nominal, [T("abbe", (1,), -1, 1)], [0.5])
+
+
+# -- elements ---------------------------------------------------------------------------------------------------------
+
+
+def test_elements_are_found_from_the_media(nominal):
+    assert rt.lens_elements(nominal) == [(1, 2), (2, 3), (4, 5)]
+    assert rt.cemented_groups(nominal) == [(1, 3)]
+    assert rt.lens_elements(rt.read_lens("double_gauss")) == [(1, 2), (3, 4), (4, 5), (7, 8), (8, 9), (10, 11)]
+    assert rt.cemented_groups(rt.read_lens("double_gauss")) == [(3, 5), (7, 9)]
+
+
+def test_a_plane_inside_glass_belongs_to_the_element_and_a_mirror_inside_glass_too(nominal):
+    glass, zero = nominal.surfaces[1].glass, number(1.0)
+    inside = rt.Surface(zero, glass=glass)
+    surfaces = (*nominal.surfaces[:2], inside, *nominal.surfaces[2:])
+    assert rt.lens_elements(dataclasses.replace(nominal, surfaces=surfaces))[0] == (1, 3)
+    mirror = rt.Surface(-zero, glass=rt.MIRROR)
+    surfaces = (*nominal.surfaces[:2], mirror, rt.Surface(zero), nominal.surfaces[-1])
+    assert rt.lens_elements(dataclasses.replace(nominal, surfaces=surfaces)) == [(1, 3)]
+
+
+def test_the_page_of_kinds_is_that_of_the_table():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "tolerances.md").read_text("utf-8")
+    for name, kind in KINDS.items():
+        assert f"| `{name}` | {kind.unit} | {kind.operand} | {kind.words} |" in page
+
+
+# -- random errors ----------------------------------------------------------------------------------------------------
+
+
+def test_a_trial_is_the_same_in_any_batch():
+    rows = [row for row, _ in ROWS]
+    every = rt.draw_errors(rows, 20, seed=7)
+    assert torch.equal(every[5:9], rt.draw_errors(rows, 4, seed=7, first=5))
+    assert not torch.equal(every, rt.draw_errors(rows, 20, seed=8))
+    fewer = rt.draw_errors(rows[:3], 20, seed=7)
+    assert torch.equal(every[:, :3], fewer)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "variance"),
+    [("normal", None), ("uniform", 1 / 3), ("parabolic", 3 / 5), ("end_points", 1.0)],
+)
+def test_errors_have_their_distribution(distribution, variance):
+    row = T("thickness", (1,), 1.0, 3.0, distribution=distribution, sigmas=1.5)
+    errors = rt.draw_errors([row], 40_000, seed=3)[:, 0] - 2.0
+    assert errors.abs().max() <= 1
+    if variance is None:  # of the normal distribution truncated at 1.5 standard deviations
+        a = 1.5
+        density, inside = math.exp(-a * a / 2) / math.sqrt(2 * math.pi), math.erf(a / math.sqrt(2))
+        variance = (1 - 2 * a * density / inside) / a**2
+    assert float(errors.mean()) == pytest.approx(0, abs=4 * math.sqrt(variance / 40_000))
+    assert float((errors**2).mean()) == pytest.approx(variance, rel=0.03)
+
+
+def test_rows_of_a_group_share_an_rms():
+    rows = [T("zernike", (1,), -2e-4, 2e-4, term=j, group="a", distribution="uniform") for j in (4, 5, 6, 7)]
+    errors = rt.draw_errors([*rows, T("thickness", (1,), -1, 1)], 50)
+    torch.testing.assert_close((errors[:, :4] ** 2).sum(1).sqrt(), torch.full((50,), 4e-4, dtype=torch.float64))
+
+
+# -- what a lens does not have ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (T("radius", (9,), -1, 1), "surfaces 1 to 5"),
+        (T("raduis", (1,), -1, 1), "radius"),
+        (T("radius", (1,), 1, -1), "minimum not above the maximum"),
+        (T("radius", (1,), -1, math.inf), "finite limits"),
+        (T("radius", (1,), -1, 1, distribution="gauss"), "expected one of normal"),
+        (T("radius", (1,), -1, 1, sigmas=0.0), "more than 0"),
+        (T("radius", (1, 2), -1, 1), "expected one surface"),
+        (T("element_tilt_x", (3, 1), -1, 1), r"expected \(1, 3\)"),
+        (T("thickness", (0,), -1, 1), "infinite"),
+        (T("thickness", (1,), -1, 1, adjust=12), "adjusting surface 12"),
+        (T("index", (3,), -1, 1), "followed by air"),
+        (T("parameter", (1,), -1, 1, parameter="a3"), "no 'a3'"),
+        (T("zernike", (1,), -1, 1, term=1), "from 2 to 231"),
+        (T("operand", (), -1, 1, configuration=1, operand=0), "0 operands"),
+    ],
+)
+def test_a_tolerance_that_the_lens_does_not_have_is_refused(row, message, nominal):
+    with pytest.raises(rt.BadTolerance, match=message):
+        rt.perturbed(nominal, [row], [0.0])
+
+
+def test_elements_that_share_a_part_are_refused(nominal):
+    with pytest.raises(rt.BadTolerance, match="shares a part of surfaces 1-3"):
+        rt.perturbed(nominal, [*element(1, 3), *element(2, 5)], torch.zeros(10))
+
+
+def test_a_radius_of_a_plane_and_a_wrong_number_of_errors_are_refused(nominal):
+    with pytest.raises(rt.BadTolerance, match="plane"):
+        rt.perturbed(nominal.replace(1, curvature=None), [T("radius", (1,), -1, 1)], [0.1])
+    with pytest.raises(rt.BadTolerance, match=r"expected \(1,\)"):
+        rt.perturbed(nominal, [T("radius", (1,), -1, 1)], [0.1, 0.2])
+
+
+def test_a_surface_that_no_ray_reaches_has_no_fringes(nominal):
+    bare = nominal.replace(1, semi_diameter=None).replace(3, thickness=-1e9)
+    lens = dataclasses.replace(bare, optimization_data=None)
+    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, 1e-9), centre=(500.0, 0.0)),))
+    with pytest.raises(rt.BadTolerance, match="no semi-diameter"):
+        rt.perturbed(lens, [T("power", (1,), -1, 1)], [1.0])
