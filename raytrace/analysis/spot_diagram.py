@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.panels import first_order_text
+from raytrace.analysis.setting import scene_of
 from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.sampling import gauss_rings, hexapolar, sampled, sobol, with_rim
+from raytrace.maths.sampling import SAMPLINGS, gauss_rings, hexapolar, sampled, sobol, with_rim
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -24,13 +25,16 @@ from raytrace.system.lens import (
     name_of_field,
     with_wavelengths,
 )
+from raytrace.tracing.clear_pupil import arms_of, is_clipped
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
 from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
+from raytrace.tracing.scene import trace_apertures
 from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, image_rays, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
+_KERNELS = 64  # whose clear pupils are found at once
 _TRIED = 4096  # rays from which the cause is found where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
@@ -136,7 +140,9 @@ class Spots(Result):
         lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
-        whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
+        radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
+        centre = self.whole.centroid.detach() if about is None else about  # what panels are centred on
+        whole = dataclasses.replace(whole, centroid=centre, **radii)
         fields, wavelengths = style.array(points), style.array(lens.wavelengths)
         airy = float(airy_radius(lens))
         half = panel_size(style.array(whole.geometric_radius), airy)
@@ -200,6 +206,11 @@ def spot(
     `sampling` hexapolar, `rings` 6, `weights` equal, `reference` chief. ray_aiming: a key of RAY_AIMING. Warns LostRays
     for fields that lose all their rays, UnfilledStop. Raises ValueError for unknown options. progress: called with
     (work, unit), returns the iterable, or a progress bar to update.
+
+    Where apertures clip the beam, `gauss` by area integrates it up to its edge (`tracing.clear_pupil`): centroid and
+    radii, and their derivatives, converge to those of the light, whose edge moves with the lens and its apertures.
+    Other samplings and weights return sums over the rays that arrive, with the derivatives of these sums, which lack
+    the motion of the edge. `rays` counts those launched in either case.
     """
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
         if word not in known:
@@ -228,7 +239,43 @@ def spot(
     hits, valid = found.rays.position[:2].flatten(-2), found.rays.valid.flatten(-2)
     about = None if about is None else about[..., 0]
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
+    if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):
+        aimed, size = with_ray_aiming(lens, ray_aiming), SAMPLINGS["gauss"][2] if rings is None else rings
+        spots, whole = _of_clear_pupils(aimed, fields, at[:, shares > 0], size, about, spots, whole)
     return Spots(lens, fields, spots, whole, found, reference, weights)
+
+
+def _of_clear_pupils(
+    lens: Lens, fields: Tensor, launched: Tensor, rings: int, about: Tensor | None, each: Spot, whole: Spot
+) -> tuple[Spot, Spot]:
+    """The spots (F, W) and (F,) of launched rays, with the statistics of the clear pupils of fields (2, F) if clipped.
+
+    about: (2, F) mm, or None. The points, and which of them are valid, stay those of the rays that were launched.
+    """
+    size = max(1, _KERNELS // len(lens.wavelengths))
+    scenes = [scene_of(lens, some) for some in fields.split(size, 1)]
+    if not any(is_clipped(scene, launched) for scene in scenes):
+        return each, whole
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    found: tuple[list[Spot], list[Spot]] = [], []
+    for part, scene in enumerate(scenes):
+        arms = arms_of(scene, 4 * rings)
+        points, weights = arms.rule(rings)
+        ends, exist = arms.ends()
+        hits, _, met = trace_apertures(scene, torch.cat([points, ends], -1))
+        weights = torch.cat([weights, torch.zeros_like(ends[0])], -1)[0]  # ends count for the geometric radius alone
+        hits, valid = hits[:, 0], (met & torch.cat([weights[None, ..., : -exist.shape[-1]] > 0, exist], -1))[0]
+        centre = None if about is None else about[:, part * size : (part + 1) * size]
+        found[0].append(spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None]))
+        together = hits.flatten(2), valid.flatten(1), (weights * shares[:, None]).flatten(1)
+        found[1].append(spot_of_points(*together, about=centre))
+    names = "centroid", "mean_square_radius", "rms_radius", "geometric_radius"
+    return tuple(
+        dataclasses.replace(
+            launched, **{name: torch.cat([getattr(s, name) for s in several], int(name == names[0])) for name in names}
+        )
+        for launched, several in zip((each, whole), found, strict=True)
+    )
 
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:

@@ -16,12 +16,12 @@ from torch.utils import _pytree as pytree
 
 from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, value, varies
-from raytrace.system.apertures import SHAPES
+from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import Crossing, lens_steps, sequence_of, steps, trace_lens, trace_surfaces
+from raytrace.tracing.trace import Crossing, lens_steps, points_at, sequence_of, steps, trace_lens, trace_surfaces
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: accepted error of interpolated rays
@@ -311,6 +311,33 @@ def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
 def cross_scene(scene: Scene, pupil: Tensor) -> list[Crossing]:
     """The crossings of the same rays with every surface after the object; axes D, F and W of equal rays may be 1."""
     return cross_bundle(_bundle(scene, pupil), scene.memo)
+
+
+def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
+    """Image points (2, D, F, W, P) on the sensor, crossings of every aperture, and which rays meet every surface.
+
+    No ray is vignetted. disc: pupil points (2, P), or (2, D, F, W, P) with axes of length 1 to broadcast.
+    """
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        rays = trace_scene(scene, disc)
+        return rays.position[:2], [], rays.valid
+    shape = (*scene.shape, disc.shape[-1])
+    if scene.memo is None or torch._C._are_functorch_transforms_active():
+        lens, _, wavelength, _ = bundle = _bundle(scene, disc)
+        numbers = [k for k, surface in enumerate(lens.surfaces) if k and surface.apertures]
+        hits, met = points_at(lens, _launched(bundle), wavelength, (*numbers, len(lens.surfaces) - 1))
+        *crossed, hit = (at.expand(2, *shape) for at in hits)
+        pairs = zip(numbers, crossed, strict=True)
+        return hit, [(a, at) for k, at in pairs for a in lens.surfaces[k].apertures], met.expand(shape)
+    crossings = cross_scene(scene, disc)
+    # Rays that fail at launch are invalid before the first surface.
+    met = crossings[0].rays.valid | crossings[0].clipped
+    crossed = []
+    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
+        met = met & ~crossing.missed & ~crossing.totally_reflected
+        hit = crossing.rays.position[:2]
+        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
+    return hit.expand(2, *shape), crossed, met.expand(shape)
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
