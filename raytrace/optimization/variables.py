@@ -229,6 +229,8 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     if kind not in known:
         raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
     if kind == "aperture":
+        if configurations:
+            raise BadVariables(f"{word!r}: the system aperture is that of all configurations; leave @ out")
         if any(place.path[0] == "aperture" for operand in lens.operands for place in operand.paths):
             raise BadVariables(f"{word!r}: the system aperture differs between the configurations, and is not varied")
         return (Vary(*APERTURE),)
