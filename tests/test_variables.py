@@ -447,9 +447,7 @@ def beam(kind, size, distance, aiming):
 def test_rays_and_pupils_have_derivatives_by_the_system_aperture(case):
     """Also by the place of the stop: the thicknesses before and behind it."""
     lens = beam(*case)
-    rows = [
-        Row("REAY", (lens_last, 1), (0.0, hy, px, py), weight=1.0) for lens_last in (5, 11) for hy, px, py in POINTS
-    ]
+    rows = [Row("REAY", (surface, 1), (0.0, *point), weight=1.0) for surface in (5, 11) for point in POINTS]
     rows += [Row("EPDI", weight=1.0), Row("WFNO", weight=1.0)]
     model = Model(lens, tuple(Vary(*at) for at in ((0, "aperture"), (4, "thickness"), (5, "thickness"))))
     assert [name_of(one) for one in model.variables] == ["aperture", "thickness_4", "thickness_5"]
