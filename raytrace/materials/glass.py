@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.words import calling_level
@@ -277,6 +278,9 @@ class Glass:
     comment: str = ""
     records: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<Glass: {', '.join(_description(self))}>"
+
 
 # -- the index --------------------------------------------------------------------------------------------------------
 
@@ -475,6 +479,18 @@ def label(glass: Glass) -> str:
     if glass.formula == "model":
         return f"{numbers[0]:.6g}/{numbers[1]:.4g}"
     return f"n {numbers[0]:.6g}" if glass.formula == "constant" and numbers[0] != 1 else ""
+
+
+def _description(glass: Glass) -> list[str]:
+    """Name and catalog, n_d and V_d as its coefficients give them; of a batch the smallest and the largest."""
+    name = label(glass) or ("air" if glass.formula == "constant" and glass.coefficients.dim() == 1 else "no name")
+    words = [f"{name} ({glass.catalog})" if glass.catalog else name]
+    if glass.formula in ("mirror", "constant") or is_functorch_wrapped_tensor(glass.coefficients):
+        return words
+    for symbol, number in (("n_d", nd(glass).detach()), ("V_d", abbe_number(glass).detach())):
+        low, high = (f"{float(extreme):.6g}" for extreme in (number.min(), number.max()))
+        words.append(f"{symbol} {low}" if low == high else f"{symbol} {low} to {high}")
+    return words
 
 
 def mil_glass(code: str) -> Glass:
