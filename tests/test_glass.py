@@ -353,7 +353,8 @@ def test_an_index_at_a_plain_number_is_that_of_a_tensor():
 
 def test_a_glass_is_shown_in_a_line():
     assert repr(BK7) == "<Glass: N-BK7 (SCHOTT), n_d 1.5168, V_d 64.1673>"
-    assert repr(constant(1.0)) == "<Glass: air>" and repr(constant(1.5)) == "<Glass: n 1.5>"
+    assert repr(constant(1.0)) == "<Glass: air>"
+    assert repr(constant(1.5)) == "<Glass: n 1.5>"
     two = replace(BK7, coefficients=torch.stack([BK7.coefficients, 1.1 * BK7.coefficients], 1))
     indices = nd(two).tolist()
     assert f"n_d {indices[0]:.6g} to {indices[1]:.6g}, V_d " in repr(two)
