@@ -111,7 +111,7 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     for start in (1, 2):
         evaluations = [evaluation for number, evaluation, _ in watched if number == start]
         assert evaluations == [*range(1, len(evaluations) + 1)]
-    assert min(error for *_, error in watched) == pytest.approx(float(after.detach()), rel=1e-9)
+    assert min(error for *_, error in watched) == pytest.approx(float(after.detach()), rel=1e-6)  # of another sampling
 
 
 @pytest.mark.parametrize(
