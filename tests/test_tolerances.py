@@ -680,8 +680,30 @@ def test_a_grade_has_rows_for_every_face_element_and_gap_with_their_source(nomin
     assert all(row.source for row in found)
     assert [one.surface for one in found.compensators] == [5]
     assert "Manufacturing Tolerance Chart" in str(found)
-    # 3 fringes of the weakest surface are more than 0.1 % of its radius
-    assert places["power"] == [(3,)]
+
+
+def test_a_radius_may_differ_by_the_larger_of_its_part_and_of_fringes(nominal):
+    """One fringe is N λ |R|/h² of a radius: 0.0494 % of surface 1, 0.066 % of surface 2."""
+    found = rt.tolerances(nominal, grade="high")
+    assert [row.surfaces for row in found if row.kind == "radius"] == [(1,), (4,)]
+    assert [row.surfaces for row in found if row.kind == "power"] == [(2,), (3,), (5,)]
+    plane = rt.tolerances(nominal.replace(1, curvature=None), grade="high")
+    assert (1,) in [row.surfaces for row in plane if row.kind == "power"]
+    made = rt.perturbed(nominal, [T("power", (1,), -1, 1)], [1.0]).surfaces[1]
+    assert abs(0.02 / float(made.curvature) - 1) == pytest.approx(0.6328e-3 / (0.02 * 64), rel=0.02)
+
+
+def test_the_page_has_the_figures_of_the_grades():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "tolerances.md").read_text("utf-8")
+    table = page.partition("| limit ± |")[2]
+    for word in GRADES["precision"]:
+        figures = [GRADES[name][word] for name in ("commercial", "precision", "high")]
+        parts = [
+            f"{one.limit:g}{one.unit}" + (f" or {one.fringes:g} fringes" if one.fringes else "") for one in figures
+        ]
+        line = next(line for line in table.splitlines() if line.startswith(f"| `{word}`"))
+        assert [cell.strip() for cell in line.split("|")[2:5]] == parts
+        assert all(part in line for one in figures for part in one.source.split("; "))
 
 
 def test_the_grades_get_tighter():

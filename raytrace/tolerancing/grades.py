@@ -24,7 +24,7 @@ from raytrace.tracing.geometry import semi_diameters
 from raytrace.words import did_you_mean
 
 _CHART = "Optimax Systems, Manufacturing Tolerance Chart"
-_GLASS = "ISO 12123, Specification of raw optical glass"
+_GLASS = "ISO 12123"
 _MOUNT = "assumed of a bored barrel, of no published grade"
 
 
@@ -44,8 +44,8 @@ GRADES = {
         "irregularity": Figure(2.0, _CHART),
         "thickness": Figure(0.15, _CHART),
         "wedge": Figure(0.05, _CHART),
-        "index": Figure(0.001, f"{_CHART}; {_GLASS}, NP010"),
-        "abbe": Figure(0.8, f"{_CHART}; {_GLASS}, AN8", "%"),
+        "index": Figure(0.001, f"{_CHART}; {_GLASS} NP010"),
+        "abbe": Figure(0.8, f"{_CHART}; {_GLASS} AN8", "%"),
         "air": Figure(0.15, _MOUNT),
         "element_decenter": Figure(0.1, _MOUNT),
         "element_tilt": Figure(0.1, _MOUNT),
@@ -55,8 +55,8 @@ GRADES = {
         "irregularity": Figure(0.5, _CHART),
         "thickness": Figure(0.05, _CHART),
         "wedge": Figure(0.01, _CHART),
-        "index": Figure(0.0005, f"{_CHART}; {_GLASS}, NP005"),
-        "abbe": Figure(0.5, f"{_CHART}; {_GLASS}, AN5", "%"),
+        "index": Figure(0.0005, f"{_CHART}; {_GLASS} NP005"),
+        "abbe": Figure(0.5, f"{_CHART}; {_GLASS} AN5", "%"),
         "air": Figure(0.05, _MOUNT),
         "element_decenter": Figure(0.05, _MOUNT),
         "element_tilt": Figure(0.05, _MOUNT),
@@ -66,8 +66,8 @@ GRADES = {
         "irregularity": Figure(0.1, _CHART),
         "thickness": Figure(0.025, _CHART),
         "wedge": Figure(0.005, _CHART),
-        "index": Figure(0.0002, f"{_GLASS}, NP002; the chart has melt data"),
-        "abbe": Figure(0.2, f"{_GLASS}, AN2; the chart has melt data", "%"),
+        "index": Figure(0.0002, f"{_GLASS} NP002; the chart has melt data"),
+        "abbe": Figure(0.2, f"{_GLASS} AN2; the chart has melt data", "%"),
         "air": Figure(0.02, _MOUNT),
         "element_decenter": Figure(0.02, _MOUNT),
         "element_tilt": Figure(0.02, _MOUNT),
