@@ -59,6 +59,7 @@ PUBLIC = {
     "Spot": "tracing.spot",
     "UnfilledStop": "tracing.launch",
     "base_ray": "tracing.base_ray",
+    "batch": "system.lens",
     "first_order": "tracing.paraxial",
     "focus": "analysis.focus_report",
     "gauss_rings": "maths.sampling",

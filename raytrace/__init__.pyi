@@ -89,6 +89,7 @@ from raytrace.system.apertures import Aperture as Aperture
 from raytrace.system.lens import Fields as Fields
 from raytrace.system.lens import Lens as Lens
 from raytrace.system.lens import SystemAperture as SystemAperture
+from raytrace.system.lens import batch as batch
 from raytrace.system.lens import with_object_distance as with_object_distance
 from raytrace.system.lens import with_sensor_distance as with_sensor_distance
 from raytrace.system.optimization_data import Row as Row

@@ -18,10 +18,10 @@ from raytrace.maths.numerics import to
 from raytrace.maths.sampling import grid
 from raytrace.psf_models import NotConverged, drt, fourier, psf, wave
 from raytrace.psf_models.gaussian import gaussian_pixels
-from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.result import Kernels, polychromatic
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
+from raytrace.tracing.clear_pupil import arms_of
 from raytrace.tracing.launch import stop_radius
 from raytrace.tracing.scene import Scene, beam_share, scene, trace_scene
 
@@ -144,9 +144,7 @@ def reference(model: str, lens: Lens, options: dict):
 
 def dense_gaussian(batch: Scene, window) -> Kernels:
     """Moments of 48 Gauss nodes on the clear part of each of 720 arms."""
-    angle = (torch.arange(720, dtype=torch.float64) + 0.5) * (2 * math.pi / 720)
-    unit = torch.stack([torch.cos(angle), torch.sin(angle)])
-    points, weights = between(*clear_arms(batch, unit), unit, rings=48)
+    points, weights = arms_of(batch, 720).rule(48)
     rays = trace_scene(batch, points)
     energy = torch.where(rays.valid, weights, 0.0)
     total = energy.sum(-1)

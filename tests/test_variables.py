@@ -5,8 +5,10 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from differences import slopes_by_differences
 from problems import scalar
 from torch.utils import _pytree as pytree
 
@@ -24,8 +26,10 @@ from raytrace.imaging.variables import (
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
-from raytrace.optimization.variables import freedom, name_of
-from raytrace.system.lens import with_sensor_distance
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.system.lens import SystemAperture, with_sensor_distance
+from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import BadLimits, BadVariables, parameter_paths, parse_bounds, parse_range
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag
@@ -421,3 +425,78 @@ def test_variables_and_words_may_be_given_together():
     assert [(one.surface, one.quantity) for one in free.variables] == [(1, "curvature"), (3, "conic"), (2, "thickness")]
     assert free.variables[0].bounds == (0.01, 0.05)
     assert float(free.lens.surfaces[3].conic) == 0
+
+
+BEAMS = [
+    ("entrance_pupil_diameter", 30.0, math.inf, "off"),
+    ("image_f_number", 3.2, math.inf, "real"),
+    ("paraxial_working_f_number", 4.0, 1500.0, "off"),
+    ("float_by_stop", 9.0, math.inf, "paraxial"),
+    ("float_by_stop", 9.0, math.inf, "real"),
+    ("object_na", 0.01, 1500.0, "off"),
+    ("object_cone_angle", 0.6, 1500.0, "off"),
+]
+
+
+def beam(kind, size, distance, aiming):
+    found = read_lens("double_gauss").at(ray_aiming=aiming, object_distance=distance)
+    return dataclasses.replace(found, aperture=SystemAperture(kind, scalar(size)))
+
+
+@pytest.mark.parametrize("case", BEAMS)
+def test_rays_and_pupils_have_derivatives_by_the_system_aperture(case):
+    """Also by the place of the stop: the thicknesses before and behind it."""
+    lens = beam(*case)
+    rows = [Row("REAY", (surface, 1), (0.0, *point), weight=1.0) for surface in (5, 11) for point in POINTS]
+    rows += [Row("EPDI", weight=1.0), Row("WFNO", weight=1.0)]
+    model = Model(lens, tuple(Vary(*at) for at in ((0, "aperture"), (4, "thickness"), (5, "thickness"))))
+    assert [name_of(one) for one in model.variables] == ["aperture", "thickness_4", "thickness_5"]
+    evaluation = Evaluation(model, rows)
+    found = evaluation(model.start, derivatives=True)
+    assert not found.lost.any()
+    assert (found.jacobian[:, 0] != 0).all()
+    expected = slopes_by_differences(evaluation, model.start, 1e-4)
+    factors = np.array([evaluation.factors[k] for k in found.of_row])[:, None]
+    np.testing.assert_allclose(found.jacobian, factors * expected[found.of_row], rtol=1e-7, atol=1e-9)
+
+
+POINTS = [(0.0, 0.0, 0.9), (0.7, 0.0, 0.8), (1.0, 0.5, -0.6)]
+
+
+def test_the_radius_of_the_stop_is_a_variable_of_optimize():
+    """F/4 is held: of EFL 99.5 mm the pupil is 24.875 mm wide, and the paraxial image of the stop's radius is half."""
+    lens = beam("float_by_stop", 9.0, math.inf, "real")
+    done = rt.optimize(
+        lens, merit="spot", vary="thickness:4,5 sensor aperture", hold="efl=99.5 f_number=4", cycles=4
+    ).lens
+    pupil = rt.first_order(done).entrance_pupil_diameter
+    assert float(pupil) == pytest.approx(99.5 / 4, rel=1e-9)
+    assert float(done.aperture.value) != 9.0
+    assert all(one.quantity != "aperture" for one in done.optimization_data.variables)
+
+
+def test_the_system_aperture_is_a_parameter():
+    lens = beam("float_by_stop", 9.0, math.inf, "real")
+    variables = Variables(lens, "sensor aperture", bounds="aperture:5..9.5")
+    assert variables.names == ("sensor", "aperture")
+    rt.spot(variables(), fields=[0.0]).mean_square_radius.sum().backward()
+
+    def square(radius):
+        moved = dataclasses.replace(lens, aperture=SystemAperture("float_by_stop", scalar(radius)))
+        return float(rt.spot(moved, fields=[0.0]).mean_square_radius.sum())
+
+    by_radius = (square(9.0 + 1e-4) - square(9.0 - 1e-4)) / 2e-4
+    assert float(variables.aperture.grad) == pytest.approx(0.9 * by_radius, rel=1e-6)
+    with torch.no_grad():
+        variables.aperture.add_(1.0)
+    variables.project()
+    assert variables.numbers()["aperture"] == pytest.approx(9.5, rel=1e-15)
+    other = Variables(lens, "sensor aperture")
+    other.load_state_dict(variables.state_dict())
+    assert float(other().aperture.value.detach()) == pytest.approx(9.5, rel=1e-15)
+
+
+@pytest.mark.parametrize("word", ["aperture:3", "aperture@2"])
+def test_the_system_aperture_has_no_surface_and_no_configuration(word):
+    with pytest.raises(BadVariables, match="aperture"):
+        freedom(read_lens("double_gauss"), word)

@@ -14,9 +14,11 @@ from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, field_colour, styled
 from raytrace.system.lens import Lens
+from raytrace.tracing.clear_pupil import arms_of, is_clipped
 from raytrace.tracing.wavefront import wavefront_of
 
 _RINGS = 24, 96
+_CLEAR = 12, 96  # rings and arms of a clipped pupil
 _WORST_CONDITION = 1e8  # of the fit of that map
 _TERMS = 45  # Zernike terms (to degree 8) of the map from the pupil to directions
 
@@ -73,7 +75,8 @@ def relative_illumination(
 
     (L, M) the directions from the reference sphere at the exit pupil to the chief ray's point (Born & Wolf §4.8.3): the
     pupil as the sensor sees it, whatever the aberrations. fields: y or (x, y); by default `samples` from the axis to
-    the lens's largest; wavelengths: µm. Vignetting by a hard edge is resolved to about 1e-3.
+    the lens's largest; wavelengths: µm. A clipped beam is integrated up to its edge (`tracing.clear_pupil`), whose
+    motion the derivatives include; where an obscuration or a polygon clips, to about 1e-3.
     """
     asked = fields is not None
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
@@ -84,14 +87,22 @@ def relative_illumination(
 
 def _illumination(lens: Lens, fields: Tensor, *, marked: bool = False) -> RelativeIllumination:
     points, weights = gauss_rings(*_RINGS, **like(lens))
-    front = wavefront_of(scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1)), points, weights)
+    scene = scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1))
+    front = wavefront_of(scene, points, weights)
     orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
     basis, light = zernike.polynomials(orders, *points), torch.where(front.usable, weights, 0.0)
     # Where light comes through a small part of the pupil alone, the slopes of the map are not known from it.
     fitted, known = zernike.fit_known(front.direction[:2], basis, light, worst=_WORST_CONDITION)
-    (L_x, M_x), (L_y, M_y) = (fitted @ slope for slope in zernike.gradients(orders, *points))
+    lit = front.valid
+    if not bool(front.valid.all()) and is_clipped(scene, points):
+        points, weights = arms_of(scene, _CLEAR[1]).rule(_CLEAR[0])
+        lit = torch.ones_like(weights, dtype=torch.bool)
+        slopes = (slope.movedim(0, -2) for slope in zernike.gradients(orders, *points))
+        (L_x, M_x), (L_y, M_y) = ((fitted[..., None, :] @ slope)[..., 0, :] for slope in slopes)
+    else:
+        (L_x, M_x), (L_y, M_y) = (fitted @ slope for slope in zernike.gradients(orders, *points))
     jacobian = (L_x * M_y - L_y * M_x).abs()
-    angle = math.pi * torch.where(front.valid & known[..., None], weights * jacobian, 0.0).sum(-1)[0]
+    angle = math.pi * torch.where(lit & known[..., None], weights * jacobian, 0.0).sum(-1)[0]
     angle = torch.where(known[0] | ~front.valid[0].any(-1), angle, torch.nan)
     solid = (angle * wavelength_shares(lens)).sum(-1)
     return RelativeIllumination(lens, fields, safe_divide(solid[1:], solid[:1].expand_as(solid[1:])), solid[1:], marked)

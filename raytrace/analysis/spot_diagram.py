@@ -11,25 +11,30 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.panels import first_order_text
+from raytrace.analysis.setting import scene_of
 from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.sampling import gauss_rings, hexapolar, sampled, sobol, with_rim
+from raytrace.maths.sampling import SAMPLINGS, gauss_rings, hexapolar, sampled, sobol, with_rim
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
+    aligned,
     field_label,
     field_points,
     field_title,
     name_of_field,
     with_wavelengths,
 )
+from raytrace.tracing.clear_pupil import arms_of, is_clipped
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
 from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
+from raytrace.tracing.scene import trace_apertures
 from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, image_rays, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
+_KERNELS = 64  # whose clear pupils are found at once
 _TRIED = 4096  # rays from which the cause is found where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
@@ -44,7 +49,7 @@ def _of_each(name: str) -> property:
 
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, mm, with the properties of `Spot`.
+    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with what a `Spot` has.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
@@ -78,32 +83,38 @@ class Spots(Result):
 
     def columns(self) -> dict[str, Tensor]:
         x, y = (axis(component, 0, 2) for component in self.fields)
-        return {"field_x": x, "field_y": y, "wavelength": self.lens.wavelengths, **_figures(self.each)}
+        of_lens = {} if self.lens.count is None else {"lens": axis(torch.arange(self.lens.count), 0, 3)}
+        return {**of_lens, "field_x": x, "field_y": y, "wavelength": self.lens.wavelengths, **_figures(self.each)}
 
     def document(self) -> dict:
-        places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
+        places = [*np.ndindex(*self.rays.shape)]
         unit = {"field_type": self.lens.fields.kind, "field_unit": self.lens.fields.unit}
         about = {} if self.arrivals is None else {"reference": self.reference, "weights": self.weights}
         return {**unit, "results": [self._entry(*place) for place in places], **about}
 
-    def _entry(self, f: int, w: int) -> dict:
-        """What JSON says of a spot: null where no ray arrives."""
-        found = {
+    def _entry(self, *place: int) -> dict:
+        """What JSON says of the spot of a field and a wavelength, of a lens of a batch: null where no ray arrives."""
+        *of_lens, f, w = place
+        found = {"lens": of_lens[0]} if of_lens else {}
+        found |= {
             "field": numbers(self.fields[:, f]),
             "wavelength": number(self.lens.wavelengths[w]),
-            "centroid": numbers(self.centroid[:, f, w]),
-            "rms_radius_um": number(1e3 * self.rms_radius[f, w]),
-            "geometric_radius_um": number(1e3 * self.geometric_radius[f, w]),
-            "rays": int(self.rays[f, w]),
+            "centroid": numbers(self.centroid[:, *place]),
+            "rms_radius_um": number(1e3 * self.rms_radius[place]),
+            "geometric_radius_um": number(1e3 * self.geometric_radius[place]),
+            "rays": int(self.rays[place]),
         }
         if self.arrivals is None:
-            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[f, w])
+            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[place])
         else:
-            found["vignetted"] = int((self.arrivals.status[f, w] == STATUS.index("vignetted")).sum())
+            found["vignetted"] = int((self.arrivals.status[place] == STATUS.index("vignetted")).sum())
         return {**found, "launched": self.launched}
 
     def tables(self) -> list[Table]:
-        """A row for each spot, and one for each field of several wavelengths together."""
+        """A row for each spot, and one for each field of several wavelengths together; of a batch one for each spot."""
+        if self.lens.count is not None:
+            columns = self.columns()
+            return [Table({**columns, "lost": self.launched - columns.pop("rays")})]
         waves = [f"{wavelength:g}" for wavelength in self.lens.wavelengths.tolist()]
         several = len(waves) > 1
         together = [""] * several
@@ -121,12 +132,17 @@ class Spots(Result):
         """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
         All panels have the same scale, are centred on the centroid over all wavelengths or on the chief ray of
-        the primary one (`reference`), and print the RMS and the geometric radius about it.
+        the primary one (`reference`), and print the RMS and the geometric radius about it. Raises ValueError for a
+        batch of lenses.
         """
+        if self.lens.count is not None:
+            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
         lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
-        whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
+        radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
+        centre = self.whole.centroid.detach() if about is None else about  # what panels are centred on
+        whole = dataclasses.replace(whole, centroid=centre, **radii)
         fields, wavelengths = style.array(points), style.array(lens.wavelengths)
         airy = float(airy_radius(lens))
         half = panel_size(style.array(whole.geometric_radius), airy)
@@ -190,11 +206,16 @@ def spot(
     `sampling` hexapolar, `rings` 6, `weights` equal, `reference` chief. ray_aiming: a key of RAY_AIMING. Warns LostRays
     for fields that lose all their rays, UnfilledStop. Raises ValueError for unknown options. progress: called with
     (work, unit), returns the iterable, or a progress bar to update.
+
+    Where apertures clip the beam, `gauss` by area integrates it up to its edge (`tracing.clear_pupil`): centroid and
+    radii, and their derivatives, converge to those of the light, whose edge moves with the lens and its apertures.
+    Other samplings and weights return sums over the rays that arrive, with the derivatives of these sums, which lack
+    the motion of the edge. `rays` counts those launched in either case.
     """
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
         if word not in known:
             raise ValueError(f"{name} {word!r}: expected one of {', '.join(known)}")
-    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    lens = aligned(lens if wavelengths is None else with_wavelengths(lens, wavelengths), 3)
     fields = field_points(fields, like=lens)
     warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     if rays is not None:
@@ -215,10 +236,46 @@ def spot(
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
     warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
-    hits, valid = found.rays.position[:2].flatten(2), found.rays.valid.flatten(1)
+    hits, valid = found.rays.position[:2].flatten(-2), found.rays.valid.flatten(-2)
     about = None if about is None else about[..., 0]
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
+    if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):
+        aimed, size = with_ray_aiming(lens, ray_aiming), SAMPLINGS["gauss"][2] if rings is None else rings
+        spots, whole = _of_clear_pupils(aimed, fields, at[:, shares > 0], size, about, spots, whole)
     return Spots(lens, fields, spots, whole, found, reference, weights)
+
+
+def _of_clear_pupils(
+    lens: Lens, fields: Tensor, launched: Tensor, rings: int, about: Tensor | None, each: Spot, whole: Spot
+) -> tuple[Spot, Spot]:
+    """The spots (F, W) and (F,) of launched rays, with the statistics of the clear pupils of fields (2, F) if clipped.
+
+    about: (2, F) mm, or None. The points, and which of them are valid, stay those of the rays that were launched.
+    """
+    size = max(1, _KERNELS // len(lens.wavelengths))
+    scenes = [scene_of(lens, some) for some in fields.split(size, 1)]
+    if not any(is_clipped(scene, launched) for scene in scenes):
+        return each, whole
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    found: tuple[list[Spot], list[Spot]] = [], []
+    for part, scene in enumerate(scenes):
+        arms = arms_of(scene, 4 * rings)
+        points, weights = arms.rule(rings)
+        ends, exist = arms.ends()
+        hits, _, met = trace_apertures(scene, torch.cat([points, ends], -1))
+        weights = torch.cat([weights, torch.zeros_like(ends[0])], -1)[0]  # ends count for the geometric radius alone
+        hits, valid = hits[:, 0], (met & torch.cat([weights[None, ..., : -exist.shape[-1]] > 0, exist], -1))[0]
+        centre = None if about is None else about[:, part * size : (part + 1) * size]
+        found[0].append(spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None]))
+        together = hits.flatten(2), valid.flatten(1), (weights * shares[:, None]).flatten(1)
+        found[1].append(spot_of_points(*together, about=centre))
+    names = "centroid", "mean_square_radius", "rms_radius", "geometric_radius"
+    return tuple(
+        dataclasses.replace(
+            launched, **{name: torch.cat([getattr(s, name) for s in several], int(name == names[0])) for name in names}
+        )
+        for launched, several in zip((each, whole), found, strict=True)
+    )
 
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:

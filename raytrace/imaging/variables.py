@@ -32,6 +32,7 @@ from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import to
 from raytrace.optimization.variables import (
+    APERTURE,
     GLASS,
     BadHold,
     bounds_of,
@@ -41,6 +42,7 @@ from raytrace.optimization.variables import (
     split_constraint,
     split_words,
     varied,
+    with_aperture,
     with_modelled,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
@@ -209,6 +211,7 @@ def _floating(values: tuple) -> Tensor:
 # -- variables of a lens -----------------------------------------------------------------------------------------------
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
+_APERTURE = 0.1  # of the number of the system aperture: its unit
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
 
@@ -218,7 +221,8 @@ class Variable:
 
     kind: its quantity, or "sensor" for the last thickness; start: its value in the lens; unit: of the parameter, in
     that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the change that moves the
-    surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them.
+    surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them. The system aperture, of
+    surface 0, is in tenths of its number at the start.
     """
 
     kind: str
@@ -229,7 +233,7 @@ class Variable:
 
     @property
     def name(self) -> str:
-        return "sensor" if self.kind == "sensor" else f"{self.kind}_{self.surface}"
+        return self.kind if self.kind in ("sensor", "aperture") else f"{self.kind}_{self.surface}"
 
 
 @dataclass(frozen=True)
@@ -416,6 +420,8 @@ class Variables(Owned):
 
 def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:
     """The lens with another number of a variable."""
+    if (variable.surface, variable.kind) == APERTURE:
+        return with_aperture(lens, value)
     surfaces = list(lens.surfaces)
     surfaces[variable.surface] = with_number(surfaces[variable.surface], variable.path, value)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
@@ -428,7 +434,8 @@ def _named(lens: Lens, vary: str) -> tuple[tuple[Vary, ...], tuple[str, ...]]:
         if "=" in word:
             raise BadVariables(f"{word!r}: solves and pickups are for optimize; name variables alone")
         for one in varied(lens, word):
-            if one.quantity == "glass" or one.operand is not None or not one.surface:
+            is_alone = one.surface or (one.surface, one.quantity) == APERTURE
+            if one.quantity == "glass" or one.operand is not None or not is_alone:
                 raise BadVariables(f"{word!r}: {name_of(one)} is a variable of optimize alone")
             kinds[one] = "sensor" if word == "sensor" else one.quantity
     if not kinds:
@@ -442,6 +449,9 @@ def _variable(lens: Lens, number: int, kind: str, quantity: str) -> Variable:
     Units of numbers of the shape follow from the first term of the series z ≈ c r²/2 + (1 + k) c³ r⁴/8 + … at the
     semi-diameter, or at the radius of the entrance pupil where the surface has none.
     """
+    if (number, quantity) == APERTURE:
+        start = float(lens.aperture.value)
+        return Variable(kind, number, start, _APERTURE * start, ParameterPath(("aperture", "value")))
     surface = lens.surfaces[number]
     path = path_of(surface, quantity)
     start = number_at(surface, path).detach()

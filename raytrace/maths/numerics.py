@@ -370,18 +370,23 @@ def value(cls: type) -> type:
     """Make a class a frozen, slotted dataclass and register it as a pytree.
 
     Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
-    that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. There is no generated `==` (it would raise on
-    tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
+    that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
+    `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would raise
+    on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
     A class with a `__repr__` keeps it. `torch.load` accepts it: restoring its fields executes nothing.
     """
     shown = cls.__repr__ is object.__repr__
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
     fields = dataclasses.fields(cls)
     numeric = {field.name for field in fields if _holds_numbers(field.type)}
+    mixed = [field.name for field in fields if _may_hold_tensors(field.type)]
 
     def flatten(instance):
         items = [(field.name, getattr(instance, field.name)) for field in fields]
         children = {name: item for name, item in items if name in numeric and item is not None}
+        for name in mixed:
+            if any(isinstance(number, torch.Tensor) for number in getattr(instance, name)):
+                children[name] = getattr(instance, name)
         structure = tuple((name, item) for name, item in items if name not in children)
         return list(children.values()), (tuple(children), structure)
 
@@ -402,6 +407,12 @@ def _holds_numbers(annotation: object) -> bool:
     if isinstance(annotation, types.UnionType):
         return any(_holds_numbers(member) for member in typing.get_args(annotation))
     return annotation is torch.Tensor or annotation in _VALUE_TYPES
+
+
+def _may_hold_tensors(annotation: object) -> bool:
+    """Whether a field of this type is a tuple of numbers, each of which may be a tensor."""
+    members = typing.get_args(annotation) if typing.get_origin(annotation) is tuple else ()
+    return any(isinstance(one, types.UnionType) and torch.Tensor in typing.get_args(one) for one in members)
 
 
 def check_precision(dtype: torch.dtype) -> None:

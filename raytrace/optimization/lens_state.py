@@ -299,14 +299,14 @@ class LensState:
     @cached_property
     def entrance_pupil_diameter(self):
         """mm, of the aperture of the lens at the primary wavelength."""
-        aperture, data = self.lens.aperture, self.gaussian(self.primary)
-        number, distance = float(aperture.value), self.thickness[0]
-        return data.entrance_pupil_diameter(aperture.kind, number, distance, self.vergence, self.tan_cone)
+        kind, data = self.lens.aperture.kind, self.gaussian(self.primary)
+        number, distance = self.number(0, "aperture"), self.thickness[0]
+        return data.entrance_pupil_diameter(kind, number, distance, self.vergence, self.tan_cone)
 
     @property
     def tan_cone(self) -> float | None:
         """Tangent of the half angle of the cone at the object, of an aperture that is specified as one."""
-        kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
+        kind, number = self.lens.aperture.kind, self.number(0, "aperture")
         if kind not in CONES:
             return None
         return np.tan(np.arcsin(number / self.index(self.primary)[0]) if kind == "object_na" else np.deg2rad(number))
@@ -857,7 +857,7 @@ class Bundle:
         lens = self.view.lens
         paraxial = 0.5 * state.entrance_pupil_diameter * state.gaussian(state.primary).front[0]
         if lens.aperture.kind == "float_by_stop":
-            return float(lens.aperture.value) * np.sign(value_of(paraxial))
+            return state.number(0, "aperture") * np.sign(value_of(paraxial))
         if lens.ray_aiming == "paraxial":
             return paraxial
         marginal = self._marginal

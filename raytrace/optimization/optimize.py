@@ -60,7 +60,7 @@ from raytrace.optimization.problem import (
     optimization_data_of,
     typical_of,
 )
-from raytrace.optimization.variables import Model, bounds_of, freedom, name_of, without_glass
+from raytrace.optimization.variables import APERTURE, Model, bounds_of, freedom, name_of, without_glass
 from raytrace.plotting import style
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_label, field_points
@@ -1013,7 +1013,11 @@ def _lens_at(
     lens = model.lens_at(x)
     data = lens.optimization_data or optimization_data_of(model, rows, unit)
     bounds = bounded or {}
-    variables = tuple(dataclasses.replace(one, bounds=bounds.get(name_of(one), one.bounds)) for one in data.variables)
+    variables = tuple(
+        dataclasses.replace(one, bounds=bounds.get(name_of(one), one.bounds))
+        for one in data.variables
+        if (one.surface, one.quantity) != APERTURE  # which no file holds
+    )
     return dataclasses.replace(lens, optimization_data=dataclasses.replace(data, variables=variables))
 
 

@@ -4,6 +4,7 @@ curvature thickness           all refracting and reflecting surfaces; all gaps f
 curvature:1-4,7 conic:3 a4:3  of some surfaces
 tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose; of the image, too
 sensor                        the last gap
+aperture                      the number of the system aperture: F/#, entrance pupil, NA, or the radius of the stop
 index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
 thickness:6@2                 in configuration 2, of a number that differs between configurations
 curvature:4=-curvature:3      pickup: a factor times another number plus an offset, as thickness:8=2*thickness:2+1
@@ -62,6 +63,9 @@ from raytrace.words import calling_level, did_you_mean
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
 
+#: The number of the system aperture, a number of the lens that no surface has.
+APERTURE: Address = (0, "aperture")
+
 #: Numbers of the medium behind a surface, where it is a model glass or a constant index.
 GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
 
@@ -75,6 +79,9 @@ SOLVED_BY = {
     "marginal_height": ("thickness", 1, 2),
     "edge_thickness": ("thickness", 1, 2),
 }
+
+#: Words that take no surfaces.
+_ALONE = ("sensor", "aperture")
 
 #: Numbers that belong to a medium.
 MEDIA = (*GLASS, "glass")
@@ -109,12 +116,29 @@ def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
 def with_numbers_of(
     lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
 ) -> Lens:
-    """The lens with other numbers of its surfaces; known: their places, where they have been looked up before."""
+    """The lens with other numbers, by address; known: their places, where they have been looked up before."""
     surfaces = list(lens.surfaces)
+    if APERTURE in numbers:
+        lens = with_aperture(lens, numbers[APERTURE])
     for (surface, quantity), number in numbers.items():
+        if (surface, quantity) == APERTURE:
+            continue
         place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
         surfaces[surface] = with_number(surfaces[surface], place, number)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def with_aperture(lens: Lens, number: Tensor) -> Lens:
+    """The lens with another number of its system aperture."""
+    return dataclasses.replace(lens, aperture=dataclasses.replace(lens.aperture, value=number))
+
+
+def stored_number(lens: Lens, at: Address) -> Tensor | None:
+    """The number at an address; None where a surface does not model it. Raises UnknownNumber."""
+    if at == APERTURE:
+        return lens.aperture.value
+    surface = lens.surfaces[at[0]]
+    return number_at(surface, path_of(surface, at[1], f"surface {at[0]}: "))
 
 
 def names_at(surface: Surface, path: tuple) -> list[str]:
@@ -198,12 +222,18 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     named, _, configurations = word.partition("@")
     kind, colon, numbers = named.partition(":")
     of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
-    known = dict.fromkeys(["thickness", "sensor", *MEDIA, *GROUPS, *of_surfaces])
-    if (kind == "sensor" and colon) or (kind in _INSTEAD and kind not in known):
+    known = dict.fromkeys(["thickness", "sensor", "aperture", *MEDIA, *GROUPS, *of_surfaces])
+    if (kind in _ALONE and colon) or (kind in _INSTEAD and kind not in known):
         meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
-        raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
+        raise BadVariables(f"{word!r}: expected {kind if kind in _ALONE else 'a number of a lens'}{meant}")
     if kind not in known:
         raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
+    if kind == "aperture":
+        if configurations:
+            raise BadVariables(f"{word!r}: the system aperture is that of all configurations; leave @ out")
+        if any(place.path[0] == "aperture" for operand in lens.operands for place in operand.paths):
+            raise BadVariables(f"{word!r}: the system aperture differs between the configurations, and is not varied")
+        return (Vary(*APERTURE),)
     if kind == "sensor":
         kind, surfaces = "thickness", [sensor(lens)]
     elif numbers or colon:
@@ -227,7 +257,9 @@ def split_words(vary: str | Sequence[str]) -> list[str]:
 
 
 def name_of(one: Vary) -> str:
-    """A variable as bounds and tables call it: thickness_6, in configuration 2 thickness_6@2."""
+    """A variable as bounds and tables call it: thickness_6, in configuration 2 thickness_6@2, aperture."""
+    if (one.surface, one.quantity) == APERTURE:
+        return "aperture"
     return f"{one.quantity}_{one.surface}" + (f"@{one.configuration}" if one.configuration else "")
 
 
@@ -523,8 +555,7 @@ class Model:
             if one.operand is not None:
                 numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
                 continue
-            surface = self.lens.surfaces[one.surface]
-            stored = number_at(surface, path_of(surface, one.quantity, f"surface {one.surface}: "))
+            stored = stored_number(self.lens, (one.surface, one.quantity))
             numbers.append(0.0 if stored is None else float(stored))
         return np.array(numbers)
 
@@ -572,7 +603,7 @@ class View:
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
-        self._held = {(k, quantity): path_of(surfaces[k], quantity) for k, quantity in self.moved}
+        self._held = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at != APERTURE}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
@@ -609,8 +640,7 @@ class View:
 
     def number(self, at: Address) -> float:
         """A number of the lens as it is stored."""
-        surface, quantity = at
-        held = number_at(self.lens.surfaces[surface], path_of(self.lens.surfaces[surface], quantity))
+        held = stored_number(self.lens, at)
         return 0.0 if held is None else float(held)
 
     @cached_property

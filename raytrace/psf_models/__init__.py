@@ -14,7 +14,6 @@
 | radial          | rotationally symmetric light along one radius                                                |
 | dft             | sums of waves: matrix DFT, Bessel functions, Huygens                                         |
 | direct_sum      | the direct Huygens sum: converged kernels of waves, reference of the wave model              |
-| pupil_clearance | clear parts of a vignetted pupil                                                             |
 | figures         | figures of PSFs, the finely sampled light in them                                            |
 
 To add a model: a module with `kernels(scene, grid, *, order) -> Kernels`, a class of its numbers and a row of `_ROWS`

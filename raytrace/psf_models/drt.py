@@ -33,7 +33,7 @@ from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import Aperture, clearance
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
-from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, trace_scene
+from raytrace.tracing.scene import Scene, beam_share, symmetry, trace_apertures, trace_scene
 
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
@@ -281,26 +281,6 @@ def trace_clearances(scene: Scene, disc: Tensor) -> tuple[Tensor, list[Tensor]]:
         clearances.append(torch.where(met, 1.0, -1.0).to(hits.dtype))
         hits = torch.where(met, hits, 0.0)
     return hits, clearances
-
-
-def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
-    """Image points (2, D, F, W, P) on the sensor, crossings of every aperture, and which rays meet every surface.
-
-    No ray is vignetted. disc: pupil points (2, P), or (2, D, F, W, P) with axes of length 1 to broadcast.
-    """
-    if not any(surface.apertures for surface in scene.lens.surfaces):
-        rays = trace_scene(scene, disc)
-        return rays.position[:2], [], rays.valid
-    shape = (*scene.shape, disc.shape[-1])
-    crossings = cross_scene(scene, disc)
-    # Rays that fail at launch are invalid before the first surface.
-    met = crossings[0].rays.valid | crossings[0].clipped
-    crossed = []
-    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
-        met = met & ~crossing.missed & ~crossing.totally_reflected
-        hit = crossing.rays.position[:2]
-        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
-    return hit.expand(2, *shape), crossed, met.expand(shape)
 
 
 def cell_width(order: int) -> float:

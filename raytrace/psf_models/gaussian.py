@@ -15,9 +15,9 @@ from torch.utils import _pytree as pytree
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import Grid, centres, edges, gauss_rings, sobol
 from raytrace.psf_models.drt import histogram
-from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search
 from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import stands_inside
+from raytrace.tracing.clear_pupil import Arms, arms_of
 from raytrace.tracing.scene import Scene, beam_share, symmetry, trace_scene
 
 #: Standard deviations beyond which a normal distribution is 0 in float64.
@@ -349,16 +349,15 @@ class Light:
     """Traced rays of a scene, or of the part of the pupil that its symmetry needs.
 
     hits: (2, D, F, W, P) mm on the sensor; valid: (D, F, W, P), those that arrive; weights: (P,) or (D, F, W, P),
-    shares of the pupil, 1 in all; rays: how many were traced for each kernel. inner, outer: (D, F, W, B) radii of the
-    parts of arms that the rays fill if anything is clipped, else None.
+    shares of the pupil, 1 in all; rays: how many were traced for each kernel. arms: those that the rays fill where the
+    beam is clipped, else None.
     """
 
     hits: Tensor
     valid: Tensor
     weights: Tensor
     rays: int
-    inner: Tensor | None = None
-    outer: Tensor | None = None
+    arms: Arms | None = None
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
@@ -395,28 +394,28 @@ def trace_light(scene: Scene, order: int, fold: str) -> Light:
     """The rays of an order, of the part of the pupil that symmetry needs.
 
     If any ray fails, of these or of those at the rim of a lens with apertures, or an obstruction lies in the pupil,
-    2·order rings on 32·(order - 1) arms fill the clear parts of the arms (`clear_arms`): energy and σ then err by 2e-4
-    at order 4 where the clear pupil has corners, by less than 1e-8 where it is round.
+    2·order rings fill the clear parts of 8·order arms (`clear_pupil.arms_of`), 32·(order - 1) with an obstruction or a
+    polygon, whose corners then leave an error of 2e-4 at order 4.
     """
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
-    count = 0
-    if not any(stands_inside(aperture) for aperture in apertures):
+    count, is_hollow = 0, any(map(stands_inside, apertures))
+    if not is_hollow:
         points, weights = fold_pupil(order, fold, scene.wavelengths)
-        rim = _RIM * directions(2 * arms_of(order), fold, scene.wavelengths, start=0.0) if apertures else points[:, :0]
+        rim = (
+            _RIM * directions(2 * round_arms(order), fold, scene.wavelengths, start=0.0) if apertures else points[:, :0]
+        )
         rays = trace_scene(scene, torch.cat([points, rim], 1))
         hits, valid = rays.position[:2], rays.valid
         inside, count = points.shape[1], points.shape[1] + rim.shape[1]
         if scene.everywhere(valid.all()):
             return Light(hits[..., :inside], valid[..., :inside], weights, count)
-    unit = directions(32 * max(order - 1, 1), fold, scene.wavelengths)
-    inner, outer = clear_arms(scene, unit)
-    points, weights = between(inner, outer, unit, rings=2 * order)
+    arms = arms_of(scene, 32 * max(order - 1, 1) if is_hollow else 8 * order, fold)
+    points, weights = arms.rule(2 * order)
     rays = trace_scene(scene, points)
-    count += rays_of_search(unit.shape[1], inner.shape[-1]) + points.shape[-1]
-    return Light(rays.position[:2], rays.valid, weights, count, inner, outer)
+    return Light(rays.position[:2], rays.valid, weights, count + arms.rays + points.shape[-1], arms)
 
 
-def arms_of(order: int) -> int:
+def round_arms(order: int) -> int:
     """Arms of a rule of `order` rings: as many as leave the error to the rings, a multiple of 4 for its symmetry."""
     return 4 * max(order - 1, 2)
 
@@ -427,7 +426,7 @@ def fold_pupil(order: int, fold: str, like: Tensor) -> tuple[Tensor, Tensor]:
         points, weights = gauss_rings(order, 1, dtype=like.dtype, device=like.device)
         radius = torch.linalg.vector_norm(points, dim=0)
         return torch.stack([torch.zeros_like(radius), radius]), weights
-    points, weights = gauss_rings(order, arms_of(order), dtype=like.dtype, device=like.device)
+    points, weights = gauss_rings(order, round_arms(order), dtype=like.dtype, device=like.device)
     if fold == "none":
         return points, weights
     right = points[0] > 0
@@ -451,7 +450,7 @@ def residual(light: Light, grid: Grid, shape: Tensor, order: int, fold: str) -> 
     0.01. 2 is the largest distance of two distributions of equal energy.
     """
     with torch.no_grad():
-        if light.inner is None:  # of Sobol points of the pupil, by a fit through the rings
+        if light.arms is None:  # of Sobol points of the pupil, by a fit through the rings
             matrix = torch.as_tensor(_ray_map(order), device=light.hits.device)
             points = _unfold(light.hits, order, fold) @ matrix.to(light.hits.dtype).mT
             weights = torch.ones_like(points[0])
@@ -463,13 +462,14 @@ def residual(light: Light, grid: Grid, shape: Tensor, order: int, fold: str) -> 
 
 def _points_of_arms(light: Light, fold: str) -> tuple[Tensor, Tensor]:
     """Hits (2, ..., P) of many nodes in every clear part of an arm, and weights, by interpolation along it."""
-    parts = light.inner.shape[-1]
+    arms = light.arms
+    parts = arms.inner.shape[-1]
     rings = light.hits.shape[-1] // parts
     fine = (np.arange(_MAP_NODES) + 0.5) / _MAP_NODES
     nodes, fitted = (legendre.legvander(x, rings - 1) for x in (2 * fine - 1, legendre.leggauss(rings)[0]))
     points = light.hits.new_tensor(nodes @ np.linalg.inv(fitted)) @ light.hits.unflatten(-1, (rings, parts))
-    inner, length = light.inner[..., None, :], (light.outer - light.inner)[..., None, :]
-    weights = (inner + length * light.hits.new_tensor(fine)[:, None]) * length
+    inner, length = arms.inner[..., None, :], (arms.outer - arms.inner)[..., None, :]
+    weights = (inner + length * light.hits.new_tensor(fine)[:, None]) * length * arms.share[..., None, :]
     if fold == "round":
         angle = torch.arange(_MAP_ARMS, dtype=points.dtype, device=points.device) * (2 * math.pi / _MAP_ARMS)
         points = torch.stack([points[1, ..., None] * torch.cos(angle), points[1, ..., None] * torch.sin(angle)])
@@ -484,7 +484,7 @@ def _unfold(position: Tensor, order: int, fold: str) -> Tensor:
     """Hits (2, ..., P) of the whole of the rule, from those of the part that was traced."""
     if fold == "none":
         return position
-    arms = arms_of(order)
+    arms = round_arms(order)
     points, _ = gauss_rings(order, arms, dtype=position.dtype, device=position.device)
     number = torch.arange(order * arms, device=points.device)
     ring, arm = number // arms, number % arms
@@ -503,7 +503,7 @@ def _unfold(position: Tensor, order: int, fold: str) -> Tensor:
 @functools.cache
 def _ray_map(order: int) -> np.ndarray:
     """Matrix (4096, P) from values on the rings to Sobol points: a fit of r^n cos mθ, r^n sin mθ, m ≤ n < 2·order."""
-    arms = arms_of(order)
+    arms = round_arms(order)
     points, weights = (t.numpy() for t in gauss_rings(order, arms))
     fine = sobol(_MAP_POINTS)[0].numpy()
 

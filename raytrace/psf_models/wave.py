@@ -21,9 +21,9 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide, safe_sqrt, to, value
 from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import dft
-from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves
 from raytrace.psf_models.result import Kernels, combined, moments_of_rays
+from raytrace.tracing.clear_pupil import arms_of
 from raytrace.tracing.scene import Scene, symmetry, trace_scene
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
@@ -263,7 +263,8 @@ def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -> tuple[Tensor, Tensor]:
     """Pupil points (2, P) and weights (P,), or (2, D, F, W, P) and (D, F, W, P) over the clear part of every arm."""
     like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
-    rings, arms = dft.rings_and_arms(phase, order)
+    rings, whole = dft.rings_and_arms(phase, order)
+    arms = whole
     if fold == "round":
         dft.afford_rings("the wave PSF", scene, rings, phase)
         arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
@@ -276,7 +277,11 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
     with torch.no_grad():
         if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
-    return between(*clear_arms(scene, unit), unit, rings=rings)
+    # Gaussian nodes between kinks are less dense in the middle than equal steps, by up to π/2; and an arm from a point
+    # beside the centre may be longer than 1, and the phase along it larger.
+    clear = arms_of(scene, math.ceil(1.25 * whole), fold)
+    longest = scene.largest((clear.outer - clear.inner).detach().max().clamp_min(1.0))
+    return clear.rule(math.ceil(rings * float(longest)))
 
 
 def one_field(scene: Scene, f: int) -> Scene:

@@ -20,15 +20,15 @@ class Aperture:
 
     shape: a key of SHAPES, "circular" (extent: inner and outer radius), "rectangular" or "elliptic" (half-widths in x
         and y), "polygon" (x, y of its corners; several, each closed by its first corner, are one shape).
-    extent: the numbers of the shape, mm.
+    extent: the numbers of the shape, mm: floats, or scalar tensors, which derivatives may be taken by (`clear_pupil`).
     obscures: True if the shape blocks what lies inside it (an obscuration) instead of passing it.
     centre: (x, y) mm of the shape in the surface's frame.
     """
 
     shape: str
-    extent: tuple[float, ...]
+    extent: tuple[float | Tensor, ...]
     obscures: bool = False
-    centre: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float | Tensor, ...] = (0.0, 0.0)
 
 
 class Edge(NamedTuple):
@@ -59,7 +59,7 @@ class Edge(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A shape of apertures; its numbers are sizes in mm, without derivatives: an edge is hard.
+    """A shape of apertures; its numbers are sizes in mm.
 
     edges: x, y (...) mm from its centre, and sizes -> its edges; reach: sizes -> range of |y| in the cross section;
     symmetry: "round", "mirror" (in x and y) or "none"; zemax: keywords of a .zmx file as aperture and obscuration;
@@ -155,9 +155,16 @@ def inside(apertures: Sequence[Aperture], hit: Tensor | Sequence[Tensor]) -> Ten
 
 def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
     """How far points (2, ...) lie on the clear side of an aperture's edge: smooth there, above 0 where light passes."""
+    first, *second = clearances_of(aperture, hit)
+    return torch.minimum(first, *second) if second else first
+
+
+def clearances_of(aperture: Aperture, hit: Tensor) -> list[Tensor]:
+    """The same of every edge by itself, where light must pass all of them; of an obscuration one for all."""
     sides = [edge.distance() for edge in edges(aperture, hit)]
-    within = sides[0] if len(sides) == 1 else torch.minimum(*sides)
-    return -within if aperture.obscures else within
+    if not aperture.obscures:
+        return sides
+    return [-(sides[0] if len(sides) == 1 else torch.minimum(*sides))]
 
 
 def reach(aperture: Aperture) -> tuple[float, float]:

@@ -14,7 +14,8 @@ class Vary:
     """A number that an optimisation may change.
 
     surface: of the file; quantity: "thickness", "curvature", or another name of `parameter_paths`, as "conic", "a4",
-    "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass.
+    "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass; of surface 0 "aperture", the number of the
+    system aperture.
     configuration, operand: of a number that differs between configurations, the configuration (from 1) and its place in
     `lens.operands` (from 0); surface and quantity are those of the operand. 0 and None: of the lens itself.
     bounds: smallest and largest value, in mm; () if there are none.

@@ -10,6 +10,7 @@
 | aiming        | rays through given points of the stop, and to given image points                               |
 | launch        | rays of field and pupil points before surface 1; vignetting factors; filling of the stop       |
 | scene         | object distances × fields × wavelengths; rays reused between calls (Memo)                      |
+| clear_pupil   | points and weights over the pupil that passes all apertures; its edge moves with the lens      |
 | spot          | centroid, RMS and geometric radius; rays on the sensor                                         |
 | focus         | sensor distance of least RMS spot, paraxial image distances                                    |
 | wavefront     | OPD on the reference sphere, RMS, Zernike coefficients                                         |

@@ -148,7 +148,8 @@ class _Row(NamedTuple):
 class Structure:
     """Surfaces without their numbers.
 
-    layout: (S, 18) int32, a `_Row` each; constants: (C,) float64, rims and apertures, which have no derivatives.
+    layout: (S, 18) int32, a `_Row` each; constants: (C,) float64, rims and apertures: whether a ray passes has no
+    derivative.
     """
 
     layout: np.ndarray
@@ -204,7 +205,8 @@ class _Table:
         self.constants.append(float("inf") if surface.semi_diameter is None else surface.semi_diameter)
         for aperture in surface.apertures:
             code, sizes = SHAPES[aperture.shape].code, aperture.extent
-            self.constants += [code, float(aperture.obscures), *aperture.centre, len(sizes), *sizes]
+            numbers = [code, aperture.obscures, *aperture.centre, len(sizes), *sizes]
+            self.constants += [float(n.detach() if isinstance(n, Tensor) else n) for n in numbers]
         return position
 
 

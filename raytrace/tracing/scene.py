@@ -16,12 +16,12 @@ from torch.utils import _pytree as pytree
 
 from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, value, varies
-from raytrace.system.apertures import SHAPES
-from raytrace.system.lens import Lens, is_round_about_axis, media, with_object_distance
+from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import Crossing, lens_steps, sequence_of, steps, trace_lens, trace_surfaces
+from raytrace.tracing.trace import Crossing, lens_steps, points_at, sequence_of, steps, trace_lens, trace_surfaces
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: accepted error of interpolated rays
@@ -260,8 +260,8 @@ def _combined(rays: Rays, weights: Tensor) -> Rays:
 class Scene:
     """Object distance × field × wavelength: batch shape (D, F, W) of everything a model computes.
 
-    lens: its object distance is (D, 1, 1), all finite or all inf; fields: (2, F) in the lens's kind of field;
-    wavelengths: (W,) µm; memo: stored rays of earlier scenes, if any.
+    lens: its object distance is (D, 1, 1), all finite or all inf, and of a batch so are other numbers; fields: (2, F)
+    in the lens's kind of field; wavelengths: (W,) µm; memo: stored rays of earlier scenes, if any.
     largest: maximum of numbers () or (K,) over the whole scene that this one is a chunk of, by which decisions common
     to all its kernels are made. By default the scene is the whole.
     """
@@ -283,8 +283,12 @@ class Scene:
 
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
-    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm."""
-    return Scene(with_object_distance(lens, object_distances[:, None, None]), fields, wavelengths, memo)
+    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm.
+
+    Of a batch of lenses (L,) there is an object distance for each, and D is L.
+    """
+    lens = aligned(with_object_distance(lens, object_distances), 2)
+    return Scene(lens, fields, wavelengths, memo)
 
 
 def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
@@ -309,9 +313,35 @@ def cross_scene(scene: Scene, pupil: Tensor) -> list[Crossing]:
     return cross_bundle(_bundle(scene, pupil), scene.memo)
 
 
+def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
+    """Image points (2, D, F, W, P) on the sensor, crossings of every aperture, and which rays meet every surface.
+
+    No ray is vignetted. disc: pupil points (2, P), or (2, D, F, W, P) with axes of length 1 to broadcast.
+    """
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        rays = trace_scene(scene, disc)
+        return rays.position[:2], [], rays.valid
+    shape = (*scene.shape, disc.shape[-1])
+    if scene.memo is None or torch._C._are_functorch_transforms_active():
+        lens, _, wavelength, _ = bundle = _bundle(scene, disc)
+        numbers = [k for k, surface in enumerate(lens.surfaces) if k and surface.apertures]
+        hits, met = points_at(lens, _launched(bundle), wavelength, (*numbers, len(lens.surfaces) - 1))
+        *crossed, hit = (at.expand(2, *shape) for at in hits)
+        pairs = zip(numbers, crossed, strict=True)
+        return hit, [(a, at) for k, at in pairs for a in lens.surfaces[k].apertures], met.expand(shape)
+    crossings = cross_scene(scene, disc)
+    # Rays that fail at launch are invalid before the first surface.
+    met = crossings[0].rays.valid | crossings[0].clipped
+    crossed = []
+    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
+        met = met & ~crossing.missed & ~crossing.totally_reflected
+        hit = crossing.rays.position[:2]
+        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
+    return hit.expand(2, *shape), crossed, met.expand(shape)
+
+
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    return lens, scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
+    return aligned(scene.lens, 3), scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
 
 
 def chief_landing(scene: Scene) -> Tensor:

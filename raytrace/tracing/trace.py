@@ -282,7 +282,7 @@ def without_apertures(lens: Lens) -> Lens:
 def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
     """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
     indices = media(lens, wavelength)
-    unclipped = without_apertures(lens).surfaces
+    unclipped = (lens.surfaces[0], *sequence_of(without_apertures(lens)))
     rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
     for last in numbers:
         rays = trace_surfaces(

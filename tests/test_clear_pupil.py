@@ -7,17 +7,13 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
 from raytrace.psf_models.drt import trace_clearances
-from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search
 from raytrace.system.surface import Aperture
+from raytrace.tracing import clear_pupil as clear_pupil_module
+from raytrace.tracing.clear_pupil import Arms, arms_of
 from raytrace.tracing.scene import Scene, scene
 
 RADIUS = 5.0  # of the entrance pupil, mm
 EDGE = 1e-10  # two Newton steps from an edge enclosed in 1/2048, the slope good to 1/2048 of the radius
-
-
-def arms(count: int) -> torch.Tensor:
-    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (2 * math.pi / count)
-    return torch.stack([torch.cos(angle), torch.sin(angle)])
 
 
 def window(*apertures: Aperture, diameter=2 * RADIUS) -> Scene:
@@ -30,8 +26,7 @@ def window(*apertures: Aperture, diameter=2 * RADIUS) -> Scene:
 
 
 def area(result: Scene, count: int = 256) -> torch.Tensor:
-    unit = arms(count)
-    return between(*clear_arms(result, unit), unit, rings=3)[1].sum()
+    return arms_of(result, count).rule(3)[1].sum()
 
 
 @pytest.mark.parametrize(
@@ -57,12 +52,12 @@ def test_area_of_the_clear_pupil(apertures, expected, allowed):
 
 
 def test_a_clear_pupil_is_whole_and_a_blocked_one_dark():
-    unit = arms(8)
-    inner, outer = clear_arms(window(), unit)
-    assert inner.shape == outer.shape == (1, 1, 1, 8)
-    assert bool((inner == 0).all() and (outer == 1).all())
-    for edges in clear_arms(window(Aperture("circular", (0.0, 9.0), True)), unit):
-        assert bool((edges == 0).all())
+    whole = arms_of(window(), 8)
+    assert whole.inner.shape == whole.outer.shape == (1, 1, 1, 8)
+    assert bool((whole.inner == 0).all())
+    assert float((whole.outer - 1).abs().max()) < 1e-15
+    dark = arms_of(window(Aperture("circular", (0.0, 9.0), True)), 8)
+    assert bool((dark.inner == 0).all() and (dark.outer == 0).all())
 
 
 def test_edge_is_where_the_ray_grazes_the_aperture():
@@ -73,10 +68,10 @@ def test_edge_is_where_the_ray_grazes_the_aperture():
         vector(1e4),
         vector(0.53),
     )
-    unit = arms(12)
-    _, outer = clear_arms(result, unit)
-    _, (clearance, *_) = trace_clearances(result, outer.flatten() * unit)
-    assert float(outer.max()) < 1
+    arms = arms_of(result, 12)
+    ends = arms.origin[..., None] + arms.outer * arms.unit
+    _, (clearance, *_) = trace_clearances(result, ends)
+    assert float((ends * ends).sum(0).max()) < 1
     assert float(clearance.abs().max()) < 1e-10
 
 
@@ -107,24 +102,32 @@ def test_edges_of_any_shape_move():
 
 
 def test_rings_integrate_odd_powers_between_arms_of_unlike_length():
-    """∫ r³ over a disc about (c, 0) that touches the middle: powers of r in opposite arms do not cancel there."""
-    unit = arms(64)
+    """∫ r³ over a disc that touches the middle: powers of r in opposite arms do not cancel there."""
+    angle = (torch.arange(64, dtype=torch.float64) + 0.5) * (2 * math.pi / 64)
+    unit = torch.stack([torch.cos(angle), torch.sin(angle)])[:, None, None, None]
     outer = (2 * 0.4 * unit[0]).clamp_min(0.0)
-    points, weights = between(torch.zeros_like(outer), outer, unit, rings=4)
+    share = torch.full_like(outer, 1 / 64)
+    arms = Arms(torch.zeros(2, 1, 1, 1, dtype=torch.float64), unit, share, torch.zeros_like(outer), outer, 0)
+    points, weights = arms.rule(4)
     # (1/π) ∫ (2 a cos θ)⁵/5 dθ over the right half, ∫ cos⁵ = 16/15.
     expected = 0.8**5 / 5 * (16 / 15) / math.pi
     assert float((weights * points.square().sum(0) ** 1.5).sum()) == pytest.approx(expected, rel=1e-5)
 
 
-def test_rays_of_the_search_are_counted(monkeypatch):
+@pytest.mark.parametrize("apertures", [[], [Aperture("circular", (0.0, 1.0), True, (0.0, 2.0))]])
+def test_rays_are_counted(monkeypatch, apertures):
     traced = []
-    plain = trace_clearances.__globals__["trace_apertures"]
 
-    def counting(result, disc):
-        traced.append(disc.shape[-1])
-        return plain(result, disc)
+    def counting(trace):
+        def count(result, pupil):
+            traced.append(pupil.shape[-1])
+            return trace(result, pupil)
 
-    monkeypatch.setattr("raytrace.psf_models.pupil_clearance.trace_apertures", counting)
-    inner, _ = clear_arms(window(Aperture("circular", (0.0, 1.0), True, (0.0, 2.0))), arms(16))
-    assert inner.shape[-1] == 32
-    assert sum(traced) == rays_of_search(16, 32)
+        return count
+
+    for name in ("trace_apertures", "trace_scene"):
+        plain = getattr(clear_pupil_module, name)
+        monkeypatch.setattr(f"raytrace.tracing.clear_pupil.{name}", counting(plain))
+    arms = arms_of(window(Aperture("circular", (0.0, 3.0), False, (2.0, 2.0)), *apertures), 16)
+    assert sum(traced) == arms.rays
+    assert arms.outer.shape[-1] == (32 if apertures else arms.unit.shape[-1])

@@ -1,0 +1,308 @@
+"""Clear pupil: a rule of points and weights whose edge is the rim that clips the beam, and how it moves with the lens.
+
+The light of a field fills the part Ω of its pupil that passes every aperture. An integral over Ω changes with a number
+q of the lens by a term of its edge, which the derivatives of a fixed set of rays lack (Reynolds' transport theorem; Teh
+et al., "Aperture-aware lens design", SIGGRAPH 2024):
+
+    d/dq ∫_Ω f dA = ∫_Ω ∂f/∂q dA + ∮_∂Ω f v_n ds,   v_n the speed of the edge along its outward normal
+
+Here the pupil is a bundle of arms from a point inside it, and the rule fills each arm from edge to edge, so that both
+terms are the derivative of one sum. An edge ρ of the clear part of an arm is a zero of a clearance c of
+`apertures.clearances`. It is found with traced rays without derivatives. Two Newton steps with a constant slope s,
+ρ - c(ρ)/s, then carry its derivatives.
+
+Where the images of two rims cross in the pupil, ρ has a kink as a function of the angle of the arm, at which the
+angles of a rule of equal steps err by the step squared, and their derivatives by the step. The angles are therefore
+Gaussian nodes between kinks.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.sampling import gauss_legendre, gauss_rings
+from raytrace.system.apertures import clearances_of, stands_inside
+from raytrace.system.lens import Lens, field_points
+from raytrace.tracing.launch import with_ray_aiming
+from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
+
+_SCAN = 32  # steps along an arm in which edges are looked for
+_SECTIONS, _ZOOMS = 8, 2  # an edge is enclosed in 8⁻² of a step: slopes are good to 5e-4
+_MOST_PARTS = 3  # clear parts of one arm
+_COARSE = 64  # arms round the pupil between which kinks are looked for
+_NEWTON = 4  # steps to a kink
+_RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
+_INNER = 6, 24  # rings and arms of the rays whose mean is a point inside the clear pupil
+_NODES, _DENSER = 8, 1.25  # of a span between kinks; more of them than arms of equal steps
+
+
+@value
+class Arms:
+    """Arms of the pupil of every object distance, field and wavelength, and the parts of them that are clear.
+
+    origin: (2, D, F, W) pupil point from which they start, unit: (2, D, F, W, B) their directions, share: (D, F, W, B)
+    of the full angle that each represents, 1 in all. inner, outer: (D, F, W, B) radii between which light passes, with
+    derivatives. rays: how many were traced for each kernel.
+    """
+
+    origin: Tensor
+    unit: Tensor
+    share: Tensor
+    inner: Tensor
+    outer: Tensor
+    rays: int
+
+    def rule(self, rings: int) -> tuple[Tensor, Tensor]:
+        """Pupil points (2, D, F, W, P) and weights (D, F, W, P): `rings` nodes on each part, those of a ring together.
+
+            ∫ f r dr ≈ (o - i) Σ_n w_n f(r_n) r_n,   r_n = i + (o - i) t_n,   with Gauss-Legendre nodes t_n
+
+        Rings of equal steps in r² (`sampling.gauss_rings`) need opposite arms of the same length: else odd powers of
+        r, roots of r², do not cancel. The weights of a clear pupil sum to 1.
+        """
+        nodes, weights = (self.inner.new_tensor(t)[:, None] for t in gauss_legendre(rings))
+        inner, length = self.inner[..., None, :], (self.outer - self.inner)[..., None, :]
+        radius = inner + length * 0.5 * (nodes + 1)
+        points = self.origin[..., None, None] + radius * self.unit[..., None, :]
+        return points.flatten(-2), (weights * radius * length * self.share[..., None, :]).flatten(-2)
+
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Pupil points (2, D, F, W, 2 B) at both ends of every part, on the edge; and which parts there are."""
+        exists = self.outer > self.inner
+        points = [self.origin[..., None] + radius * self.unit for radius in (self.inner, self.outer)]
+        return torch.cat(points, -1), torch.cat([exists, exists], -1)
+
+
+def clear_pupil(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    ray_aiming: str | None = None,
+    rings: int = 12,
+    arms: int = 48,
+) -> tuple[Tensor, Tensor]:
+    """Pupil points (2, F, W, P) and weights (F, W, P) over the clear pupil of every field and wavelength.
+
+        Σ_p w_p f(x_p) → (1/π) ∬ f dx dy   over the part of the unit disc whose rays pass every aperture
+
+    Value and derivatives by all numbers of the lens, fields and extents of apertures converge as those of a smooth
+    integrand, also where rims cross. Without a clipped ray the rule is `gauss_rings(rings, arms)`. fields, wavelengths,
+    ray_aiming: as for `launch`. An edge where rays miss a surface or are totally reflected has no derivative. See
+    `arms_of` for obscurations and polygons.
+    """
+    lens = with_ray_aiming(lens, ray_aiming)
+    fields = field_points(fields, like=lens)
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    pupil = scene(lens, fields, lens.surfaces[0].thickness.reshape(1), wavelengths)
+    points, weights = gauss_rings(rings, arms, dtype=lens.surfaces[-2].thickness.dtype, device=wavelengths.device)
+    if is_clipped(pupil, points):
+        points, weights = arms_of(pupil, arms).rule(rings)
+        return points[:, 0], weights[0]
+    shape = fields.shape[1], len(wavelengths), points.shape[1]
+    return points[:, None, None].expand(2, *shape), weights.expand(shape)
+
+
+@torch.no_grad()
+def is_clipped(scene: Scene, points: Tensor) -> bool:
+    """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails."""
+    if any(surface.apertures for surface in scene.lens.surfaces):
+        angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
+        points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
+    return not scene.everywhere(trace_scene(scene, points).valid.all())
+
+
+def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
+    """About `count` arms round the pupil, at angles that integrate over it, and their clear parts.
+
+    fold: the symmetry of the light, as of `scene.symmetry`: "mirror": arms in x > 0 alone; "round": a single one.
+    They start inside the clear pupil. Where an aperture can stop light in the midst of the beam (an obscuration, a
+    polygon) they start at the centre of the pupil; if it stands beside the centre, the angles are of equal steps, and a
+    second or third clear part of all arms follows the first ones.
+    """
+    like = scene.wavelengths
+    around = 2 * math.pi if fold == "none" else math.pi
+    apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+    if fold == "round":
+        unit, origin = like.new_tensor([[0.0], [1.0]]).reshape(2, 1, 1, 1, 1), like.new_zeros(2, *scene.shape)
+        inner, outer, traced = _clear_parts(scene, unit.expand(2, *scene.shape, 1), origin)
+        return Arms(origin, unit.expand(2, *scene.shape, outer.shape[-1]), torch.ones_like(outer), inner, outer, traced)
+    is_hollow = any(map(stands_inside, apertures))
+    with torch.no_grad():
+        origin, traced = like.new_zeros(2, *scene.shape), 0
+        if not is_hollow:
+            points, weights = gauss_rings(*_INNER, dtype=like.dtype, device=like.device)
+            passes = torch.where(trace_scene(scene, points).valid, weights, 0.0)
+            origin = torch.stack([safe_divide((passes * at).sum(-1), passes.sum(-1)) for at in points])
+            origin = torch.stack([torch.zeros_like(origin[0]), origin[1]]) if fold == "mirror" else origin
+            traced = points.shape[1]
+        kinks, searched = _kinks(scene, origin, fold, around, is_hollow)
+    angle, share = _angles(kinks, count, around)
+    unit = torch.stack([torch.sin(angle), torch.cos(angle)])
+    inner, outer, found = _clear_parts(scene, unit, origin)
+    parts = outer.shape[-1] // unit.shape[-1]
+    return Arms(origin, unit.repeat(1, 1, 1, 1, parts), share.repeat(1, 1, 1, parts), inner, outer,
+                traced + searched + found)  # fmt: skip
+
+
+def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
+    """Angles (D, F, W, A) from the y axis, and the share of each in `around`, as many as the kernel with most needs.
+
+    kinks: (D, F, W, K), inf where a kernel has fewer. One without kinks has angles of equal steps; another has Gaussian
+    nodes in spans between its kinks and a few fixed angles, so that its rule does not depend on other kernels.
+    """
+    count = count if around > 4 else (count + 1) // 2
+    step = (torch.arange(count, dtype=kinks.dtype, device=kinks.device) + 0.5) * (around / count)
+    fixed = math.ceil(_DENSER * count / _NODES)
+    nodes, weights = (kinks.new_tensor(t) for t in gauss_legendre(_NODES))
+    kinks, known = torch.remainder(kinks, around).nan_to_num(torch.inf).sort(-1).values, torch.isfinite(kinks).sum(-1)
+    most = int(known.max()) if kinks.shape[-1] else 0
+    size = max(count, (fixed + most) * _NODES if most else 0)
+    angles, shares = kinks.new_zeros(*known.shape, size), kinks.new_zeros(*known.shape, size)
+    for number in range(most + 1):
+        if number:
+            bounds = torch.arange(fixed, dtype=kinks.dtype, device=kinks.device) * (around / fixed)
+            bounds = torch.cat([bounds.expand(*known.shape, -1), kinks[..., :number]], -1).sort(-1).values
+            span = torch.cat([bounds[..., 1:], torch.full_like(bounds[..., :1], around)], -1) - bounds
+            angle = (bounds[..., None] + span[..., None] * 0.5 * (nodes + 1)).flatten(-2)
+            share = (span[..., None] * weights / (2 * around)).flatten(-2)
+        else:
+            angle, share = (t.expand(*known.shape, -1) for t in (step, torch.full_like(step, 1 / count)))
+        rest = (*known.shape, size - angle.shape[-1])
+        here = (known == number)[..., None]
+        angles = torch.where(here, torch.cat([angle, angle[..., -1:].expand(rest)], -1), angles)
+        shares = torch.where(here, torch.cat([share, share.new_zeros(rest)], -1), shares)
+    return angles, shares
+
+
+def _kinks(scene: Scene, origin: Tensor, fold: str, around: float, is_hollow: bool) -> tuple[Tensor, int]:
+    """Angles (D, F, W, K) at which another edge begins to bound the clear pupil, inf where there are fewer than K.
+
+    K is 0 if an arm has several clear parts. And the number of rays traced for each kernel.
+    """
+    is_whole = fold == "none"
+    count = _COARSE if is_whole else _COARSE // 2
+    step = around / count
+    angle = (torch.arange(count, dtype=origin.dtype, device=origin.device) + 0.5) * step
+    unit = torch.stack([torch.sin(angle), torch.cos(angle)])[:, None, None, None].expand(2, *scene.shape, -1)
+    (inner, outer), (number_in, number_out), *_, traced = _enclosed(scene, unit, origin)
+    if outer.shape[-1] > count:
+        return origin.new_zeros(*scene.shape, 0), traced
+    found = [origin.new_zeros(*scene.shape, 0)]
+    for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
+        after = number.roll(-1, -1)
+        change = number != after
+        if not is_whole:
+            change = torch.cat([change[..., :-1], torch.zeros_like(change[..., :1])], -1)
+        most = int(change.sum(-1).max())
+        if not most:
+            continue
+        order = change.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., :most]
+        pair = torch.stack([number.gather(-1, order), after.gather(-1, order)])
+        start = (0.5 * (radius + radius.roll(-1, -1))).gather(-1, order), angle[order] + 0.5 * step
+        kink, rays = _crossing(scene, origin, start, pair, step)
+        traced += rays
+        found.append(torch.where(change.gather(-1, order), kink, torch.inf))
+    return torch.cat(found, -1), traced
+
+
+def _crossing(scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float):
+    """Angle (D, F, W, K) where two clearances (2, D, F, W, K) vanish together, near a radius and an angle; and rays."""
+    radius, angle = start
+    here = origin[..., None] + radius * torch.stack([torch.sin(angle), torch.cos(angle)])
+    small = torch.finfo(here.dtype).eps ** (1 / 3)
+    shifts = small * here.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).reshape(2, 1, 1, 1, 1, 3)
+    for _ in range(_NEWTON):
+        shifted = here[..., None] + shifts
+        values = _clearances_at(scene, shifted.flatten(-2)).unflatten(-1, (-1, 3))
+        c = values.gather(0, pair[..., None].expand(*pair.shape, 3))  # (2, D, F, W, K, 3)
+        (a, b), (p, q) = ((c[i, ..., 1:] - c[i, ..., :1]).unbind(-1) for i in range(2))
+        u, v = c[..., 0]
+        determinant = a * q - b * p
+        change = small * torch.stack([safe_divide(q * u - b * v, determinant), safe_divide(a * v - p * u, determinant)])
+        here = here - change.clamp(-step, step)
+    x, y = here - origin[..., None]
+    turned = torch.remainder(torch.atan2(x, y) - angle + math.pi, 2 * math.pi) - math.pi
+    return angle + torch.where(turned.abs() <= 0.51 * step, turned, 0.0), 3 * _NEWTON * radius.shape[-1]
+
+
+def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Radii (D, F, W, B) between which light passes on arms in the directions (2, D, F, W, A); and the number of rays.
+
+    B is A, or a multiple of it if an obstruction lies in an arm: then the second clear parts of all arms follow the
+    first ones. A part that an arm does not have lies between 0 and 0. First derivatives are exact to 1e-6, second ones
+    to 1e-3, where an aperture of any shape sets the edge; where rays miss a surface or are totally reflected the edge
+    has none. Parts and gaps shorter than 1/32 of an arm may be missed; gaps behind the third part are filled.
+    """
+    radius, number, slope, exists, traced = _enclosed(scene, unit, origin)
+    unit = unit.repeat(1, 1, 1, 1, radius.shape[-1] // unit.shape[-1])
+    # A step with a constant slope has the error (1 - c'/s)(ρ - ρ₀) to first order, in value and derivatives. Arms that
+    # end at the edge of the pupil, which is fixed, have the slope 0.
+    for _ in range(2 if bool((slope != 0).any()) else 0):
+        clearances = _clearances(scene, radius, unit, origin)
+        here = clearances.gather(0, number.clamp(0, len(clearances) - 1)[None])[0]
+        radius = radius - safe_divide(here, slope)
+        traced += 2 * unit.shape[-1]
+    inner, outer = torch.where(exists, radius, 0.0)
+    return inner, outer, traced
+
+
+def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
+    """Edges (2, D, F, W, B), inner and outer, just inside the clear side, and which aperture sets them; no derivatives.
+
+    Their numbers are those of `_clearances_at`, -1 for the origin. Then the slope of the clearance, 0 where there is
+    none; whether the part exists (D, F, W, B); and the number of rays traced for each kernel.
+    """
+    arms = unit.shape[-1]
+    with torch.no_grad():
+        along = (origin[..., None] * unit).sum(0)
+        reach = torch.sqrt(along * along + 1 - (origin * origin).sum(0)[..., None]) - along
+        step = torch.linspace(0, 1, _SCAN + 1, dtype=unit.dtype, device=unit.device)
+        radii = step[:, None, None, None, None] * reach
+        passed = (_clearances(scene, radii, unit, origin) >= 0).all(0)
+        part = (passed & ~torch.cat([torch.zeros_like(passed[:1]), passed[:-1]])).cumsum(0).clamp_max(_MOST_PARTS)
+        count = max(1, int(part.max()))
+        here = torch.cat([passed & (part == number + 1) for number in range(count)], -1)
+        unit, reach = unit.repeat(1, 1, 1, 1, count), reach.repeat(1, 1, 1, count)
+        first, last = (t.to(torch.int8).argmax(0) for t in (here, here.flip(0)))
+        at = torch.stack([first, _SCAN - last]), torch.stack([first - 1, _SCAN - last + 1])
+        passes, blocked = (step[place.clamp(0, _SCAN)] * reach for place in at)
+        ends = torch.stack([at[1][0] < 0, at[1][1] > _SCAN])  # at the origin, at the edge of the pupil
+        share = torch.linspace(0, 1, _SECTIONS + 1, dtype=passes.dtype, device=passes.device)
+        for _ in range(_ZOOMS):
+            radii = passes + share[:, None, None, None, None, None] * (blocked - passes)
+            clearances = _clearances(scene, radii.flatten(0, 1), unit, origin).unflatten(1, radii.shape[:2])
+            index = (clearances >= 0).all(0)[1:].to(torch.int64).cumprod(0).sum(0)[None]
+            pair = index, (index + 1).clamp_max(_SECTIONS)
+            passes, blocked = (radii.gather(0, at)[0] for at in pair)
+        inside, outside = (clearances.gather(1, at.expand(len(clearances), *at.shape))[:, 0] for at in pair)
+        # The aperture that stops the ray; a missed surface, last in the list, has no slope.
+        lowest, number = outside.min(0)
+        apertures = len(clearances) - 1
+        slope = safe_divide((outside - inside).gather(0, number[None])[0], blocked - passes)
+        slope = torch.where((lowest < 0) & (number < apertures) & ~ends, slope, 0.0)
+        number = torch.where(number >= apertures, apertures + 1, number)
+        number = torch.where(ends, number.new_tensor([-1, apertures]).reshape(2, 1, 1, 1, 1), number)
+        traced = arms * (_SCAN + 1) + arms * count * 2 * _ZOOMS * (_SECTIONS + 1)
+    return passes, number, slope, here.any(0), traced
+
+
+def _clearances(scene: Scene, radii: Tensor, unit: Tensor, origin: Tensor) -> Tensor:
+    """Clearances (C + 1, K, D, F, W, B) at radii (K, D, F, W, B) of the arms; the last: ±1, whether the ray arrives."""
+    points = origin[:, None, ..., None] + radii * unit[:, None]
+    flat = points.movedim(1, -2).flatten(-2)
+    return _traced(scene, flat).unflatten(-1, (len(radii), unit.shape[-1])).movedim(-2, 1)
+
+
+def _clearances_at(scene: Scene, points: Tensor) -> Tensor:
+    """Clearances (C + 2, D, F, W, P) at pupil points (2, D, F, W, P); the last but one that of the pupil's edge."""
+    *apertures, arrives = _traced(scene, points)
+    return torch.stack([*apertures, 1 - (points * points).sum(0), arrives])
+
+
+def _traced(scene: Scene, points: Tensor) -> Tensor:
+    _, crossed, met = trace_apertures(scene, points)
+    arrives = torch.where(met, 1.0, -1.0).to(points.dtype)
+    return torch.stack([*(c for aperture, hit in crossed for c in clearances_of(aperture, hit)), arrives])
