@@ -102,6 +102,8 @@ PUBLIC = {
     "draw_errors": "tolerancing.sampling",
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
+    "read_tolerances": "tolerancing.files",
+    "tolerances": "tolerancing.grades",
     # images and analyses
     "Memo": "tracing.scene",
     "DRT": "psf_models",
