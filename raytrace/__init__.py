@@ -103,6 +103,8 @@ PUBLIC = {
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
     "read_tolerances": "tolerancing.files",
+    "Toleranced": "tolerancing.study",
+    "tolerance": "tolerancing.study",
     "tolerances": "tolerancing.grades",
     # images and analyses
     "Memo": "tracing.scene",

@@ -768,6 +768,20 @@ COMMANDS = (
         double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
         lens, conditions, plot("the curves"), table,
     ),
+    _command(
+        "tolerance",
+        "the lens as built: sensitivities, expectation and Monte Carlo",
+        "Change of the RMS spot radius or wavefront by every tolerance at its limits, the mean of the lens as built by "
+        "second derivatives, and its distribution over perturbed and compensated lenses. The tolerances are those of "
+        "the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the sensor distance unless the "
+        "file has others.",
+        """
+        cooke_triplet --grade precision --plot as_built.png
+        lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
+        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
+        lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
+        rings={"help": "rings of the pupil (default 4)"}, checkpoint={"metavar": "FILE", "type": output_file},
+    ),
     _of_module("codesign", codesign, _codesign),
     Command(
         "wave",
