@@ -132,7 +132,9 @@ class Study:
         """Derivatives (L, C) of q by the compensators."""
         with torch.enable_grad():
             changes = changes.detach().requires_grad_()
-            return torch.autograd.grad(self.square(errors, changes).sum(), changes)[0]
+            q = self.square(errors, changes)
+            found = torch.autograd.grad(q.sum(), changes, allow_unused=True)[0] if q.requires_grad else None
+            return torch.zeros_like(changes) if found is None else found
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
         """q (L,) with the compensators that minimise it, and their changes (L, C)."""
@@ -250,12 +252,16 @@ class Toleranced(Result):
     changes: Tensor
     seed: int = 0
 
-    COLUMNS = (
-        Column("tolerance", form="<"), Column("change_minimum", "of the criterion", ".5f", "change\nat minimum"),
-        Column("change_maximum", "of the criterion", ".5f", "change\nat maximum"),
-        Column("slope", "of the criterion", ".5f", "slope ×\nhalf width"), Column("minimum", form=".5g"),
-        Column("maximum", form=".5g"),
-    )  # fmt: skip
+    COLUMNS = property(
+        lambda self: (
+            Column("tolerance", form="<"),
+            Column("minimum", form=".5g"),
+            Column("maximum", form=".5g"),
+            Column("change_minimum", self.unit, ".5f", "change\nat min."),
+            Column("change_maximum", self.unit, ".5f", "change\nat max."),
+            Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
+        )
+    )
 
     @property
     def worst(self) -> Tensor:
@@ -324,7 +330,7 @@ class Toleranced(Result):
         return [Table(self.columns(), about)]
 
     def document(self) -> dict:
-        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **super().document()}
+        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
 
     @styled
     def draw(self):
@@ -494,7 +500,7 @@ def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Sha
             rows = torch.cat([study.criterion.of_square(q)[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
-        found[part.start : part.stop] = torch.as_tensor(rows).to(found)
+        found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
         if bar is not None:
             bar.update(len(part))
     if bar is not None:
