@@ -59,6 +59,7 @@ PUBLIC = {
     "Spot": "tracing.spot",
     "UnfilledStop": "tracing.launch",
     "base_ray": "tracing.base_ray",
+    "batch": "system.lens",
     "first_order": "tracing.paraxial",
     "focus": "analysis.focus_report",
     "gauss_rings": "maths.sampling",
@@ -101,6 +102,8 @@ PUBLIC = {
     "draw_errors": "tolerancing.sampling",
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
+    "read_tolerances": "tolerancing.files",
+    "tolerances": "tolerancing.grades",
     # images and analyses
     "Memo": "tracing.scene",
     "DRT": "psf_models",

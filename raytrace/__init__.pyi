@@ -89,6 +89,7 @@ from raytrace.system.apertures import Aperture as Aperture
 from raytrace.system.lens import Fields as Fields
 from raytrace.system.lens import Lens as Lens
 from raytrace.system.lens import SystemAperture as SystemAperture
+from raytrace.system.lens import batch as batch
 from raytrace.system.lens import with_object_distance as with_object_distance
 from raytrace.system.lens import with_sensor_distance as with_sensor_distance
 from raytrace.system.optimization_data import Row as Row
@@ -109,6 +110,8 @@ from raytrace.system.tolerance_data import Compensator as Compensator
 from raytrace.system.tolerance_data import Tolerance as Tolerance
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements
+from raytrace.tolerancing.files import read_tolerances as read_tolerances
+from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
 from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance

@@ -29,7 +29,7 @@ from raytrace.maths.result import Table, axis
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
-from raytrace.system.lens import Lens, vector, with_sensor_distance
+from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Memo, Scene
@@ -170,7 +170,7 @@ def mtf(
     through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
     ValueError where too few rays arrive or the blur is too large.
     """
-    lens, fields = setting(lens, fields, wavelengths, every=True)
+    lens, fields = setting(aligned(lens, 3), fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
     choice = None if geometric is None else torch.full_like(fields[0], geometric, dtype=torch.bool)
     if through_focus is not None:

@@ -41,7 +41,8 @@ def setting(
     """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
-    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func this is not checked.
+    of those listed, or from `every` one, see `check_reach`; of batches of lenses and inside transforms of torch.func
+    this is not checked.
     Warns UnfilledStop.
     """
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
@@ -50,7 +51,8 @@ def setting(
     warn_of_filling(lens, found)
     if curve:
         return lens, found
-    if not any(isinstance(leaf, Tensor) and is_functorch_wrapped_tensor(leaf) for leaf in pytree.tree_leaves(lens)):
+    hidden = any(isinstance(leaf, Tensor) and is_functorch_wrapped_tensor(leaf) for leaf in pytree.tree_leaves(lens))
+    if not hidden and lens.count is None:
         check_reach(lens, None if fields is None else found, every=every)
     return lens, found
 
@@ -61,8 +63,8 @@ def primary_wavelength(lens: Lens) -> Tensor:
 
 
 def scene_of(lens: Lens, fields: Tensor) -> Scene:
-    """The scene (1, F, W) of the lens at its own object distance and wavelengths; fields: (2, F)."""
-    return make_scene(lens, fields, lens.surfaces[0].thickness[None], lens.wavelengths)
+    """The scene (1, F, W), (L, F, W) of a batch, of the lens at its own object distance; fields: (2, F)."""
+    return make_scene(lens, fields, lens.surfaces[0].thickness.reshape(-1).expand(lens.count or 1), lens.wavelengths)
 
 
 def wavelength_shares(lens: Lens) -> Tensor:

@@ -18,6 +18,7 @@ from raytrace.maths.sampling import SAMPLINGS, gauss_rings, hexapolar, sampled, 
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
+    aligned,
     field_label,
     field_points,
     field_title,
@@ -48,7 +49,7 @@ def _of_each(name: str) -> property:
 
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, mm, with the properties of `Spot`.
+    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with what a `Spot` has.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
@@ -82,32 +83,38 @@ class Spots(Result):
 
     def columns(self) -> dict[str, Tensor]:
         x, y = (axis(component, 0, 2) for component in self.fields)
-        return {"field_x": x, "field_y": y, "wavelength": self.lens.wavelengths, **_figures(self.each)}
+        of_lens = {} if self.lens.count is None else {"lens": axis(torch.arange(self.lens.count), 0, 3)}
+        return {**of_lens, "field_x": x, "field_y": y, "wavelength": self.lens.wavelengths, **_figures(self.each)}
 
     def document(self) -> dict:
-        places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
+        places = [*np.ndindex(*self.rays.shape)]
         unit = {"field_type": self.lens.fields.kind, "field_unit": self.lens.fields.unit}
         about = {} if self.arrivals is None else {"reference": self.reference, "weights": self.weights}
         return {**unit, "results": [self._entry(*place) for place in places], **about}
 
-    def _entry(self, f: int, w: int) -> dict:
-        """What JSON says of a spot: null where no ray arrives."""
-        found = {
+    def _entry(self, *place: int) -> dict:
+        """What JSON says of the spot of a field and a wavelength, of a lens of a batch: null where no ray arrives."""
+        *of_lens, f, w = place
+        found = {"lens": of_lens[0]} if of_lens else {}
+        found |= {
             "field": numbers(self.fields[:, f]),
             "wavelength": number(self.lens.wavelengths[w]),
-            "centroid": numbers(self.centroid[:, f, w]),
-            "rms_radius_um": number(1e3 * self.rms_radius[f, w]),
-            "geometric_radius_um": number(1e3 * self.geometric_radius[f, w]),
-            "rays": int(self.rays[f, w]),
+            "centroid": numbers(self.centroid[:, *place]),
+            "rms_radius_um": number(1e3 * self.rms_radius[place]),
+            "geometric_radius_um": number(1e3 * self.geometric_radius[place]),
+            "rays": int(self.rays[place]),
         }
         if self.arrivals is None:
-            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[f, w])
+            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[place])
         else:
-            found["vignetted"] = int((self.arrivals.status[f, w] == STATUS.index("vignetted")).sum())
+            found["vignetted"] = int((self.arrivals.status[place] == STATUS.index("vignetted")).sum())
         return {**found, "launched": self.launched}
 
     def tables(self) -> list[Table]:
-        """A row for each spot, and one for each field of several wavelengths together."""
+        """A row for each spot, and one for each field of several wavelengths together; of a batch one for each spot."""
+        if self.lens.count is not None:
+            columns = self.columns()
+            return [Table({**columns, "lost": self.launched - columns.pop("rays")})]
         waves = [f"{wavelength:g}" for wavelength in self.lens.wavelengths.tolist()]
         several = len(waves) > 1
         together = [""] * several
@@ -125,8 +132,11 @@ class Spots(Result):
         """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
         All panels have the same scale, are centred on the centroid over all wavelengths or on the chief ray of
-        the primary one (`reference`), and print the RMS and the geometric radius about it.
+        the primary one (`reference`), and print the RMS and the geometric radius about it. Raises ValueError for a
+        batch of lenses.
         """
+        if self.lens.count is not None:
+            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
         lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
@@ -205,7 +215,7 @@ def spot(
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
         if word not in known:
             raise ValueError(f"{name} {word!r}: expected one of {', '.join(known)}")
-    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    lens = aligned(lens if wavelengths is None else with_wavelengths(lens, wavelengths), 3)
     fields = field_points(fields, like=lens)
     warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     if rays is not None:
@@ -226,7 +236,7 @@ def spot(
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
     warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
-    hits, valid = found.rays.position[:2].flatten(2), found.rays.valid.flatten(1)
+    hits, valid = found.rays.position[:2].flatten(-2), found.rays.valid.flatten(-2)
     about = None if about is None else about[..., 0]
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
     if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):

@@ -32,7 +32,7 @@ _UNITS = {"rms": "waves RMS", "rim": "waves at the rim"}
 
 @value
 class WavefrontMap(Analysis):
-    """The wavefront of every field and wavelength.
+    """The wavefront of every field and wavelength, of a batch of every lens, field and wavelength (L, F, W).
 
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
     coefficients: (F, W, J) Zernike coefficients 1 … J over the entrance pupil, numbered as `numbering` says: "noll", in
@@ -149,10 +149,11 @@ def wavefront(
     )
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
     parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
-    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _BY_FIELD}
+    over = 0 if lens.count is None else 1
+    joined = {name: torch.cat([getattr(part, name) for part in parts], over) for name in _BY_FIELD}
     found = dataclasses.replace(parts[0], fields=fields, **joined)
     unknown = found.coefficients.detach()[..., 0].isnan() & found.rms.detach().isfinite()
-    for f in torch.nonzero(unknown.any(1))[:, 0].tolist():
+    for f in torch.nonzero(unknown.any(-1).reshape(-1, F).any(0))[:, 0].tolist():
         field = f"field {field_words(lens, fields[:, f])}"
         words = f"{field}: the light fills too little of the entrance pupil for Zernike coefficients"
         warnings.warn(words, Incomplete, stacklevel=calling_level())
@@ -166,20 +167,21 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
     dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, **like(lens))[2])
     front = wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
     wave = 1e-3 * lens.wavelengths
-    opd = drawn.opd.new_zeros(*drawn.opd.shape[1:3], size, size)
-    opd[..., inside] = drawn.opd[0] / wave[:, None]
+    of = (lambda numbers: numbers[0]) if lens.count is None else (lambda numbers: numbers)
+    opd = drawn.opd.new_zeros(*of(drawn.opd).shape[:-1], size, size)
+    opd[..., inside] = of(drawn.opd) / wave[:, None]
     valid = torch.zeros_like(opd, dtype=torch.bool)
-    valid[..., inside] = drawn.valid[0]
+    valid[..., inside] = of(drawn.valid)
     return WavefrontMap(
         lens=lens,
         fields=fields,
         pupil=line,
         opd=opd,
         valid=valid,
-        coefficients=zernike_coefficients(front, terms, numbering)[0] / wave[:, None],
-        rms=rms(front)[0] / wave,
-        peak_to_valley=peak_to_valley(dense)[0] / wave,
-        strehl=_strehl(view),
+        coefficients=of(zernike_coefficients(front, terms, numbering)) / wave[:, None],
+        rms=of(rms(front)) / wave,
+        peak_to_valley=of(peak_to_valley(dense)) / wave,
+        strehl=of(_strehl(view)),
         numbering=numbering,
         listed=listed,
     )
@@ -194,14 +196,14 @@ def _grid(size: int, **like) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _strehl(view: Scene) -> Tensor:
-    """Strehl ratios (F, W); nan for a field whose blur would need too many rays."""
+    """Strehl ratios (D, F, W); nan for a field whose blur would need too many rays."""
     ratios = []
     for field in view.fields.split(1, 1):
         try:
-            ratios.append(strehl(Scene(view.lens, field, view.wavelengths))[0])
+            ratios.append(strehl(Scene(view.lens, field, view.wavelengths)))
         except ValueError:  # a map of so many waves is still worth seeing
-            ratios.append(torch.full_like(view.wavelengths, torch.nan)[None])
-    return torch.cat(ratios)
+            ratios.append(view.wavelengths.new_full((view.shape[0], 1, view.shape[2]), torch.nan))
+    return torch.cat(ratios, 1)
 
 
 def _diverging(values: np.ndarray):

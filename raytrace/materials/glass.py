@@ -467,6 +467,12 @@ def with_index_errors(
     return dataclasses.replace(glass, coefficients=torch.stack(torch.broadcast_tensors(*parts)))
 
 
+def has_abbe_number(glass: Glass) -> bool:
+    """Whether a medium has indices at the lines d, F and C that differ."""
+    yellow, blue, red = (refractive_index(glass, LINES[line]).detach() for line in "dFC")
+    return bool(((yellow > 0) & (red > 0) & (blue > red)).all())
+
+
 def label(glass: Glass) -> str:
     """The name of a medium; of one without a name n_d/V_d of a model glass, "n 1.5" of a constant index, "" of air."""
     if glass.name or glass.coefficients.dim() > 1:

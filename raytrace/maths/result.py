@@ -128,8 +128,8 @@ class Result:
     def plot(self, path: str | PathLike | None = None, **options):
         """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given.
 
-        It is not a figure of pyplot: `plt.show` and `plt.savefig` do not show it. A notebook shows it where it is the
-        value of a cell; `figure.savefig(…)` saves it.
+        It is not a figure of pyplot, whose `show` and `savefig` do not know it. A notebook shows it where it is the
+        value of a cell; its own `savefig` saves it.
         """
         figure = self.draw(**options)
         if path is not None:

@@ -27,7 +27,7 @@ from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
-from raytrace.system.lens import Lens, field_points, with_object_distance
+from raytrace.system.lens import Lens, field_points, one_lens, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
@@ -239,6 +239,7 @@ def psf(
         does not move. The kernels are the same.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
     normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
+    Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead.
     execution: memory, processes and progress, see `Execution`.
 
     Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
@@ -278,7 +279,11 @@ def psf(
 
     base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
     fields = fields if isinstance(fields, Tensor) else field_points(fields, like=lens)
-    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else row(object_distances)
+    distances = lens.surfaces[0].thickness.reshape(-1) if object_distances is None else row(object_distances)
+    if (lenses := lens.count) is not None:
+        if len(distances) not in (1, lenses):
+            raise ValueError(f"{len(distances)} object_distances for a batch of {lenses} lenses; expected one")
+        distances = distances.expand(lenses)
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
     wavelengths = like if wavelengths is None else row(wavelengths)
     weights = torch.ones_like(wavelengths) if weights is None else row(weights)
@@ -328,7 +333,7 @@ def psf(
     points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
-        trial = with_object_distance(lens, distances[0].detach())
+        trial = with_object_distance(lens if lenses is None else one_lens(lens, 0), distances[0].detach())
         failures = ray_failures(trial, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
         reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
         raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
@@ -341,9 +346,10 @@ def psf(
     dark = psfs.ray_centroid[0].detach().isnan()
     if bool(dark.any()):  # warn LostRays of every field with a wavelength of which no ray reaches the sensor
         dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
-        for distance, failed in zip(distances.detach(), dark, strict=True):
-            at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
-            trial = with_object_distance(lens, distance)
+        for number, (distance, failed) in enumerate(zip(distances.detach(), dark, strict=True)):
+            where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
+            at = where if len(distances) > 1 else ""
+            trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
             warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
     return dataclasses.replace(
         psfs,
@@ -574,7 +580,7 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
         distances, fields, wavelengths = block = _block(scene.shape, cut, share.rank % math.prod(cut))
         part = dataclasses.replace(
             scene,
-            lens=with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[distances]),
+            lens=one_lens(scene.lens, distances),
             fields=scene.fields[:, fields],
             wavelengths=scene.wavelengths[wavelengths],
         )

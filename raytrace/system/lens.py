@@ -2,10 +2,11 @@
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.materials.catalogs import medium
 from raytrace.materials.environment import (
@@ -17,7 +18,7 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
-from raytrace.maths.numerics import check_precision, value
+from raytrace.maths.numerics import broadcast_shape, check_precision, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
@@ -48,6 +49,150 @@ APERTURE_KINDS = {
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",
 }
+
+# -- batches of lenses -------------------------------------------------------------------------------------------------
+# Behind the axes that a number has by itself (the terms of an asphere, say) the axis of the lenses follows. `aligned`
+# puts axes of 1 behind it, against which fields, wavelengths and pupil points broadcast: rays (3, L, F, W, P).
+
+#: Axes that numbers have by themselves, by the name of their field; all others are single numbers.
+_OWN_AXES = {"coefficients": 1, "heights": 2, "first": 1, "second": 1, "rotation": 2, "shift": 1}
+
+#: The parts of a lens whose numbers may differ between the lenses of a batch.
+_PARTS = ("surfaces", "aperture", "environment")
+
+
+def lens_count(lens: "Lens") -> int | None:
+    """L, how many lenses the numbers of a lens describe; None for a single lens.
+
+    Raises ValueError for numbers of different counts.
+    """
+    counts: dict[int, str] = {}
+
+    def note(number: Tensor, own: int, place: str) -> Tensor:
+        if number.dim() > own and number.shape[own] != 1:
+            counts.setdefault(number.shape[own], place)
+        elif number.dim() > own:
+            counts.setdefault(1, place)
+        return number
+
+    _mapped(lens, note)
+    several = {count: place for count, place in counts.items() if count != 1}
+    if len(several) > 1:
+        (one, here), (other, there), *_ = several.items()
+        raise ValueError(f"{here} has numbers of {one} lenses, {there} of {other}; expected as many, or one")
+    return next(iter(several or counts), None)
+
+
+def batch_shape(lens: "Lens") -> torch.Size:
+    """The shape (L, 1, …) that the numbers of an `aligned` batch broadcast to; () of a single lens."""
+    shapes: list[torch.Size] = [torch.Size()]
+
+    def note(number: Tensor, own: int, place: str) -> Tensor:
+        shapes.append(number.shape[own:])
+        return number
+
+    _mapped(lens, note)
+    return broadcast_shape(*{*shapes})
+
+
+def aligned(lens: "Lens", axes: int) -> "Lens":
+    """The lens with numbers (…, L) of a batch as (…, L, 1, …), at least so many axes of 1 behind the lenses.
+
+    A number that is common to all lenses, or has the axes, stays the same tensor.
+    """
+
+    def align(number: Tensor, own: int, place: str) -> Tensor:
+        missing = own + 1 + axes - number.dim()
+        return number if number.dim() <= own or missing <= 0 else number.reshape(*number.shape, *(1,) * missing)
+
+    return _mapped(lens, align)
+
+
+def one_lens(lens: "Lens", number: int | slice | Tensor) -> "Lens":
+    """Lens `number` of a batch, from 0; of a slice or of a tensor of numbers, a batch of them.
+
+    Raises TypeError for a single lens, IndexError beyond the last lens.
+    """
+    count = lens_count(lens)
+    if count is None:
+        raise TypeError("a single lens, not a batch of lenses: no number has the shape (L,)")
+    if isinstance(number, int) and not -count <= number < count:
+        raise IndexError(f"lens {number} of a batch of {count} lenses; expected 0 to {count - 1}")
+
+    def take(entries: Tensor, own: int, place: str) -> Tensor:
+        if entries.dim() <= own:
+            return entries
+        chosen = (slice(None),) * own
+        if entries.shape[own] == 1:
+            return entries[(*chosen, 0)] if isinstance(number, int) else entries
+        return entries[(*chosen, number)]
+
+    return _mapped(lens, take)
+
+
+def batch(lenses: Sequence["Lens"]) -> "Lens":
+    """One batch of several lenses that differ in their numbers alone.
+
+    What is equal in all of them stays single. Raises ValueError for none, and for lenses of different structure: other
+    surfaces, glass formulas, apertures.
+    """
+    if not lenses:
+        raise ValueError("a batch of no lenses; expected one or more")
+    if any(lens_count(lens) is not None for lens in lenses):
+        raise ValueError("a lens of the batch is a batch itself; expected single lenses")
+    parts = [{name: part for name in _PARTS if (part := getattr(lens, name)) is not None} for lens in lenses]
+    flat = [pytree.tree_flatten(found) for found in parts]
+    leaves, structures = zip(*flat, strict=True)
+    for k, (numbers, structure) in enumerate(zip(leaves, structures, strict=True)):
+        if structure != structures[0] or [n.shape for n in numbers] != [n.shape for n in leaves[0]]:
+            raise ValueError(f"lens {k} has other surfaces, glasses or apertures than lens 0; expected other numbers")
+    rows = {id(column[0]): column for column in zip(*leaves, strict=True)}
+
+    def join(number: Tensor, own: int, place: str) -> Tensor:
+        column = rows[id(number)]
+        if all(entry is number or (not entry.requires_grad and torch.equal(entry, number)) for entry in column):
+            return number
+        return torch.stack(column, own)
+
+    return _mapped(lenses[0], join)
+
+
+def _mapped(lens: "Lens", change: Callable[[Tensor, int, str], Tensor]) -> "Lens":
+    """The lens with changed numbers; change: number, how many axes it has by itself, its place in words -> number.
+
+    A number that occurs in several places (the coefficients of air, say) stays one.
+    """
+    made: dict[int, Tensor] = {}
+
+    def walk(part, name: str, place: str):
+        if isinstance(part, Tensor):
+            if id(part) not in made:
+                made[id(part)] = change(part, _OWN_AXES.get(name, 0), place.replace("_", " "))
+            return made[id(part)]
+        if isinstance(part, tuple):
+            places = [f"surface {k}" if name == "surfaces" else place for k in range(len(part))]
+            found = tuple(walk(entry, name, where) for entry, where in zip(part, places, strict=True))
+            return part if all(a is b for a, b in zip(found, part, strict=True)) else found
+        if not dataclasses.is_dataclass(part):
+            return part
+        changes = {}
+        for field in dataclasses.fields(part):
+            before = getattr(part, field.name)
+            after = walk(before, field.name, f"{place}: {field.name}")
+            if after is not before:
+                changes[field.name] = after
+        return dataclasses.replace(part, **changes) if changes else part
+
+    changes = {}
+    for name in _PARTS:
+        before = getattr(lens, name)
+        after = walk(before, name, name)
+        if after is not before:
+            changes[name] = after
+    return dataclasses.replace(lens, **changes) if changes else lens
+
+
+# -- the lens ----------------------------------------------------------------------------------------------------------
 
 
 @value
@@ -110,6 +255,8 @@ class Lens:
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
     optimization_data: variables, solves and the merit function of the file; None without any.
+    A number of the surfaces, the aperture or the environment may be a tensor (L,), and a coefficient (m, L): a batch of
+    `count` lenses, of which `lens[k]` is one and `lens[:10]` some.
     """
 
     surfaces: tuple[Surface, ...]
@@ -127,6 +274,9 @@ class Lens:
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
     optimization_data: OptimizationData | None = None
+
+    count = property(lens_count)
+    __getitem__ = one_lens
 
     with_configurations = multiple.made
     configuration = multiple.chosen
@@ -270,7 +420,7 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")
         radius = _like(given.pop("radius"), like)
-        if bool(radius == 0):
+        if bool((radius == 0).any()):
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
     made = {name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()}
@@ -517,16 +667,19 @@ def check(lens: Lens) -> None:
     if not 1 <= lens.primary_wavelength <= len(lens.wavelengths):
         last_one = len(lens.wavelengths)
         raise ValueError(f"primary wavelength number {lens.primary_wavelength}; expected one from 1 to {last_one}")
-    if not float(lens.aperture.value) > 0:
-        raise ValueError(f"aperture {lens.aperture.kind} {float(lens.aperture.value):g}: expected a number above 0")
+    lens_count(lens)  # refuses numbers of different counts
+    if not bool((lens.aperture.value > 0).all()):
+        smallest = float(lens.aperture.value.min())
+        raise ValueError(f"aperture {lens.aperture.kind} {smallest:g}: expected a number above 0")
     for number, surface in enumerate(lens.surfaces[1:], 1):
-        if not bool(torch.isfinite(surface.thickness)):
-            raise ValueError(f"surface {number} has thickness {float(surface.thickness)}; only the object's may be inf")
-    if bool(torch.isnan(lens.surfaces[0].thickness)):
+        if not bool((finite := torch.isfinite(surface.thickness)).all()):
+            wrong = float(surface.thickness[~finite][0])
+            raise ValueError(f"surface {number} has thickness {wrong}; only the object's may be inf")
+    if bool(torch.isnan(lens.surfaces[0].thickness).any()):
         raise ValueError("the object distance is nan; expected mm, or inf")
     if not bool((torch.isfinite(lens.fields.x) & torch.isfinite(lens.fields.y)).all()):
         raise ValueError("`fields` hold a number that is not finite; expected numbers y, or pairs (x, y)")
-    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness))
+    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness).any())
     if at_infinity and lens.fields.kind == "object_height":
         raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")
     if at_infinity and lens.fields.telecentric:
@@ -568,11 +721,11 @@ def _check_kinds(surface: Surface, where: str) -> None:
 def _check_cone(lens: Lens) -> None:
     """Refuse a cone at the object of a right angle, of 180° and more, or of an NA that is not below the index."""
     # Of a cone beyond a right angle rays leave on the same lines forwards, within 180 degrees less the angle.
-    kind, number = lens.aperture.kind, float(lens.aperture.value)
+    kind, number = lens.aperture.kind, float(lens.aperture.value.max())
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")
     if kind == "object_na":
-        index = float(index_behind(lens, 0, lens.primary))
+        index = float(index_behind(lens, 0, lens.primary).min())
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")
 

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.glass import is_air
+from raytrace.materials.glass import has_abbe_number, is_air
 from raytrace.system import configurations
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve
@@ -427,6 +427,8 @@ def _objection(lens: Lens, row: Tolerance, surface: Surface) -> str:
         return "the surface is a plane, whose radius has no error; expected power (fringes) or curvature"
     if row.kind in ("index", "abbe") and (surface.is_mirror or is_air(surface.glass)):
         return f"the surface is {'a mirror' if surface.is_mirror else 'followed by air'}; expected one before glass"
+    if row.kind == "abbe" and not has_abbe_number(surface.glass):
+        return "the medium has no dispersion at the lines d, F and C; expected a glass"
     if row.kind == "thickness" and not bool(torch.isfinite(surface.thickness).all()):
         return "the thickness is infinite"
     return ""

@@ -16,7 +16,7 @@ from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, dot, is_any, safe_sqrt, unit, value, varies
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, batch_shape, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
@@ -189,7 +189,7 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
         moving = torch.cat([stop.position[:2].flip(0), image.position, image.direction])
         return moving, (arrives, last.position, *(way.direction for way in ways))
 
-    batch = broadcast_shape(aim.shape[1:], distance.shape, wavelength.shape)
+    batch = broadcast_shape(aim.shape[1:], distance.shape, wavelength.shape, batch_shape(lens))
     figures, slopes, (valid, last, *ways) = _linearised(traced, aim.new_zeros(4, *batch), (lens, wavelength))
     position, direction = figures[2:5], figures[5:]
     to_stop, moved, D = slopes.split((2, 3, 3))
@@ -216,7 +216,7 @@ def _aim(lens: Lens, wavelength: Tensor) -> Tensor:
     The axis where that is straight, where chief rays are parallel to it, or where no ray finds the middle of the stop.
     """
     distance = object_distance_of(lens)
-    axis = distance.new_zeros(2, *broadcast_shape(distance.shape, wavelength.shape))
+    axis = distance.new_zeros(2, *broadcast_shape(distance.shape, wavelength.shape, batch_shape(lens)))
     if lens.fields.telecentric or not is_bent(lens):
         return axis
 

@@ -41,6 +41,7 @@ from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,
     Lens,
+    aligned,
     field_points,
     index_behind,
     name_of_field,
@@ -81,7 +82,7 @@ def rays(
         raise TypeError(f"rays: `pupil` is {named_value(pupil)}; {expected}")
     if points.dim() != 2 or len(points) != 2:
         raise ValueError(f"rays: `pupil` has the shape {tuple(points.shape)}; {expected}")
-    wavelengths = wavelengths_of(lens, wavelengths)
+    lens, wavelengths = aligned(lens, 3), wavelengths_of(lens, wavelengths)
     launched = launch(lens, points, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
     return dataclasses.replace(launched, wavelength=wavelengths[:, None])
 
@@ -265,7 +266,7 @@ def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
     paraxial, entrance = first_order(lens), _entrance(lens)
     radius = _stop_radius(lens, paraxial, entrance)[0]
     target = pupil if entrance is None else _turned(entrance.turn, pupil)
-    return _signed(radius, paraxial, entrance) * target, radius
+    return _scaled(target, _signed(radius, paraxial, entrance)), radius
 
 
 def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
@@ -460,7 +461,8 @@ class Filling:
     """How far rays miss the stop, fractions of its semi-diameter; inf for a ray that does not reach it.
 
     chief: (F,) chief ray from the centre. marginal: (F,) the worst of four marginal rays, from its point of the rim, or
-    of the vignetted rim. lost: (F,) whether no ray reaches the stop; radius: () mm, semi-diameter of the stop.
+    of the vignetted rim. lost: (F,) whether no ray reaches the stop; radius: () mm, semi-diameter of the stop. Of a
+    batch of lenses (L, F), and the radius (L, 1, 1, 1).
     """
 
     chief: Tensor
@@ -475,15 +477,15 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 
     Five rays a field are traced. The real marginal ray of the axial beam defines the semi-diameter of the stop.
     """
-    lens, fields = detached(lens), fields.detach()
-    wavelength = lens.primary
+    lens, fields = detached(aligned(lens, 3)), fields.detach()
+    wavelength, points = lens.primary, fields[:, :, None, None]
     five = fields.new_tensor([[0.0, 0.0, 0.0, -1.0, 1.0], [0.0, -1.0, 1.0, 0.0, 0.0]])
-    pupil = vignette(lens, fields[:, :, None], five)
+    pupil = vignette(lens, points, five)
     target, radius = points_of_stop(with_ray_aiming(lens, "real"), pupil)
-    position, arrives = at_stop(lens, rays_of_field(lens, fields[:, :, None], pupil, wavelength=wavelength), wavelength)
+    position, arrives = at_stop(lens, rays_of_field(lens, points, pupil, wavelength=wavelength), wavelength)
     missed = torch.linalg.vector_norm(position - target, dim=0) / radius
-    missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)
-    return Filling(missed[:, 0], missed[:, 1:].amax(1), ~arrives.any(1), radius)
+    missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)[..., 0, :]
+    return Filling(missed[..., 0], missed[..., 1:].amax(-1), ~arrives.any(-1)[..., 0], radius)
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
@@ -501,6 +503,10 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
+    if worst.dim() > 1:  # of a batch: the lens whose stop is missed most
+        at = int(worst.amax(-1).argmax())
+        radius = beams.radius.expand(len(worst), 1, 1, 1)[at, 0, 0, 0]
+        beams, worst = Filling(beams.chief[at], beams.marginal[at], beams.lost[at], radius), worst[at]
     if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
         return
     at = int(worst.argmax())

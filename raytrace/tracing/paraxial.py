@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
 from raytrace.maths.result import flat
-from raytrace.system.lens import Lens, is_round_about_axis, media
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
 
@@ -223,6 +223,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
     wavelength = lens.primary if wavelength is None else wavelength
+    lens = aligned(lens, wavelength.dim()) if wavelength.dim() else lens
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     data = gaussian(lens, n, wavelength)

@@ -9,7 +9,7 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import value
 from raytrace.maths.sampling import hexapolar
-from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -118,6 +118,10 @@ def warn_of_failures(
     """
     if not bool(dark.any()):
         return
+    if dark.dim() > 2:  # of a batch: the first lens that loses a field
+        of_lens = dark.any(-1).any(-1)
+        first, several = int(of_lens.int().argmax()), f"{int(of_lens.sum())} of {len(of_lens)} lenses"
+        lens, dark, at = one_lens(lens, first), dark[first], f"{at}lens {first} ({several} lose fields): "
     some = dark.any(1)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)

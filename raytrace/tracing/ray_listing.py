@@ -19,7 +19,7 @@ from raytrace.files import write_atomically
 from raytrace.io.ray_tables import read_rays
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.system.lens import Lens, field_points, media, vector, wavelengths_of
+from raytrace.system.lens import Lens, aligned, field_points, media, one_lens, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling
@@ -115,8 +115,25 @@ class Traced(Rays, Result):
         self.write(text.write)
         return text.getvalue().rstrip("\n")
 
+    def of_lens(self, number: int) -> "Traced":
+        """The rays of one lens of a batch."""
+        parts = (self.position, self.direction, self.launched.position, self.launched.direction)
+        position, direction, *start = (part[:, number] for part in parts)
+        path, begun = (
+            rays.opl if rays.opl is None else rays.opl.expand(rays.shape)[number] for rays in (self, self.launched)
+        )
+        launched = Rays(*start, self.launched.valid[number], begun, self.launched.wavelength)
+        labels = None if self.labels is None else self.labels[:, number]
+        ends = position, direction, self.valid[number], path, self.wavelength
+        return Traced(*ends, one_lens(self.lens, number), launched, labels)
+
     def _parts(self) -> Iterator[dict[str, Tensor]]:
-        """The columns of the table in chunks of _BATCH rays."""
+        """The columns of the table in chunks of _BATCH rays; of a batch with the number of the lens."""
+        for number in range(self.lens.count or 0):
+            for part in self.of_lens(number)._parts():
+                yield {"lens": torch.full_like(part["ray"], number), **part}
+        if self.lens.count is not None:
+            return
         valid = self.launched.valid.flatten()
         labels = () if self.labels is None else self.labels.reshape(len(LABELS), -1)[:, valid]
         for first, way in zip(itertools.count(0, _BATCH), self._ways(), strict=False):
@@ -129,6 +146,10 @@ class Traced(Rays, Result):
 
     def _ways(self) -> Iterator["_Way"]:
         """The surface data of the rays launched, in chunks of _BATCH rays."""
+        if self.lens.count is not None:
+            for number in range(self.lens.count):
+                yield from self.of_lens(number)._ways()
+            return
         rays, valid = self.launched, self.launched.valid.flatten()
         opl = torch.zeros_like(rays.position[0]) if rays.opl is None else rays.opl
         opl, wavelength = (t.detach().expand(rays.shape).flatten()[valid] for t in (opl, rays.wavelength))
@@ -153,10 +174,11 @@ def trace(
     rays: in front of surface 1, as `rt.rays` returns them, or a table of rays (.csv) with columns x, y, z, l, m, n and
     optionally wavelength; rays without one have that of `wavelengths`, by default the primary one. By default: chief,
     upper, lower and side ray of every object distance, field and wavelength, batch shape (D, F, W, 4), or (F, W, 4) for
-    the lens's distance; fields as for `rt.rays`, wavelengths the primary one unless given. Paths count from the
-    wavefront of the object point that passes the vertex of surface 1.
+    the lens's distance; fields as for `rt.rays`, wavelengths the primary one unless given. Rays of a batch of lenses
+    have their axis first, (3, L, …). Paths count from the wavefront of the object point that passes the vertex of
+    surface 1.
     """
-    labels = None
+    labels, lens = None, aligned(lens, 3)
     if rays is None:
         launched, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:

@@ -17,7 +17,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, value, varies
 from raytrace.system.apertures import SHAPES, Aperture
-from raytrace.system.lens import Lens, is_round_about_axis, media, with_object_distance
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
@@ -260,8 +260,8 @@ def _combined(rays: Rays, weights: Tensor) -> Rays:
 class Scene:
     """Object distance × field × wavelength: batch shape (D, F, W) of everything a model computes.
 
-    lens: its object distance is (D, 1, 1), all finite or all inf; fields: (2, F) in the lens's kind of field;
-    wavelengths: (W,) µm; memo: stored rays of earlier scenes, if any.
+    lens: its object distance is (D, 1, 1), all finite or all inf, and of a batch so are other numbers; fields: (2, F)
+    in the lens's kind of field; wavelengths: (W,) µm; memo: stored rays of earlier scenes, if any.
     largest: maximum of numbers () or (K,) over the whole scene that this one is a chunk of, by which decisions common
     to all its kernels are made. By default the scene is the whole.
     """
@@ -283,8 +283,12 @@ class Scene:
 
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
-    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm."""
-    return Scene(with_object_distance(lens, object_distances[:, None, None]), fields, wavelengths, memo)
+    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm.
+
+    Of a batch of lenses (L,) there is an object distance for each, and D is L.
+    """
+    lens = aligned(with_object_distance(lens, object_distances), 2)
+    return Scene(lens, fields, wavelengths, memo)
 
 
 def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
@@ -337,8 +341,7 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    return lens, scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
+    return aligned(scene.lens, 3), scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
 
 
 def chief_landing(scene: Scene) -> Tensor:

@@ -128,7 +128,7 @@ _KEPT_BYTES = 100  # of a ray on the sensor, with its status
 
 @value
 class Arrivals(Result):
-    """Rays (3, F, W, P) on the sensor, every ray of the pupil for every field and wavelength.
+    """Rays (3, F, W, P) on the sensor, all of the pupil for every field and wavelength; (3, L, F, W, P) of a batch.
 
     status: (F, W, P), index in STATUS of the first failure; reached: (F, W, P), whether the ray has a point on the
     sensor, as a vignetted ray may. weight: (W, P), sum 1 for a field. pupil: (2, P); fields: (2, F); wavelengths: (W,)
@@ -178,8 +178,10 @@ def arrivals(
     """
     fields = field_points(fields, like=lens)
     F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
-    count = f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points)"
-    afford(RAY_BYTES * W * P + _KEPT_BYTES * F * W * P, count, helps="ask for fewer, or by `rays`, which keeps none")
+    L = lens.count or 1
+    count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
+    helps = "ask for fewer, or by `rays`, which keeps none"
+    afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
     each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
     for field in progress(fields.unbind(1)):
         rays = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
@@ -189,13 +191,13 @@ def arrivals(
             on_sensor = crossing.rays, status, reached
         each.append(on_sensor)
     joined = Rays(
-        torch.cat([rays.position for rays, *_ in each], 1),
-        torch.cat([rays.direction for rays, *_ in each], 1),
-        torch.cat([rays.valid for rays, *_ in each]),
+        torch.cat([rays.position for rays, *_ in each], -3),
+        torch.cat([rays.direction for rays, *_ in each], -3),
+        torch.cat([rays.valid for rays, *_ in each], -3),
     )
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     weight = shares[:, None] * weights / weights.sum()
-    status, reached = (torch.cat(parts) for parts in zip(*(rest for _, *rest in each), strict=True))
+    status, reached = (torch.cat(parts, -3) for parts in zip(*(rest for _, *rest in each), strict=True))
     return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
 
 

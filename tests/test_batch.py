@@ -1,0 +1,162 @@
+"""A batch of lenses gives what a loop over its lenses gives, values and derivatives, in one call."""
+
+import warnings
+
+import pytest
+import torch
+
+import raytrace as rt
+
+LENSES = ("cooke_triplet", "double_gauss", "phone")
+
+
+@pytest.fixture(autouse=True)
+def _quiet():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rt.UnfilledStop)
+        yield
+
+
+def perturbed(name, count=3, ray_aiming="off", posed=True):
+    """A batch of lenses whose curvatures, thicknesses, conics, aspheric terms and poses differ."""
+    lens = rt.focus(rt.read_lens(name).at(ray_aiming=ray_aiming)).lens
+    error = torch.linspace(-1, 1, count, dtype=torch.float64)
+    last = len(lens.surfaces) - 1
+    for k, surface in enumerate(lens.surfaces[1:last], 1):
+        change = {"thickness": surface.thickness * (1 + 1e-3 * k * error)}
+        if surface.curvature is not None:
+            change["curvature"] = surface.curvature * (1 + 1e-3 * error / k)
+        if surface.conic is not None:
+            change["conic"] = surface.conic + 1e-3 * error
+        if surface.coefficients is not None:
+            change["coefficients"] = surface.coefficients[:, None] * (1 + 1e-3 * error)
+        lens = lens.replace(k, **change)
+    if not posed:
+        return lens
+    lens = lens.replace(2, before=rt.Pose(y=0.002 * error, tilt_x=0.01 * error))
+    return lens.replace(3, after=rt.Pose(tilt_x=-0.01 * error, tilts_first=True))
+
+
+def psf_of(model):
+    """Kernels (L, F, 21, 21), (F, 21, 21) of a single lens."""
+
+    def kernels(lens):
+        found = rt.psf(lens, model, pixel=0.004)
+        return found.kernel if lens.count else found.kernel[0]
+
+    return kernels
+
+
+#: PSF models whose kernels of one call do not share a decision: the number of cells of DRT is that of the widest.
+MODELS = {"paraxial": rt.Paraxial(order=0), "fourier": rt.Fourier(order=1), "gaussian": rt.Gaussian(order=6)}
+MODELS |= {"wave": rt.Wave(order=0)}
+
+VERBS = {
+    "effective focal length": lambda lens: rt.first_order(lens).effective_focal_length,
+    "rays": lambda lens: rt.rays(lens).position.movedim(0, -1),
+    "rms": lambda lens: rt.spot(lens).rms_radius,
+    "centroid": lambda lens: rt.spot(lens).centroid.movedim(0, -1),
+    "spots of all wavelengths": lambda lens: rt.spot(lens, reference="chief").whole.mean_square_radius,
+    "wavefront": lambda lens: rt.wavefront(lens, size=31).rms,
+    "zernike": lambda lens: rt.wavefront(lens, size=31, terms=9).coefficients,
+    "strehl": lambda lens: rt.wavefront(lens, size=31).strehl,
+    "geometric mtf": lambda lens: rt.mtf(lens, [30.0], geometric=True).tangential,
+    **{f"psf {name}": psf_of(model) for name, model in MODELS.items()},
+    "trace": lambda lens: rt.trace(lens).position.movedim(0, -1),
+    "hexapolar": lambda lens: rt.spot(lens, sampling="hexapolar", rings=4).mean_square_radius,
+}
+
+
+#: What takes seconds: sums of waves over a wide blur.
+LONG = ("wavefront", "zernike", "strehl", "psf wave", "psf fourier")
+
+
+def compare(verb, name, ray_aiming):
+    lenses = perturbed(name, ray_aiming=ray_aiming, posed=verb not in ("psf paraxial", "psf fourier"))
+    assert lenses.count == 3
+    together = VERBS[verb](lenses)
+    each = torch.stack([VERBS[verb](lenses[k]) for k in range(3)])
+    torch.testing.assert_close(together, each, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb not in LONG])
+def test_batch_is_a_loop(verb):
+    compare(verb, "cooke_triplet", "off")
+
+
+def test_the_beam_that_misses_the_stop_is_that_of_the_worst_lens():
+    lens = rt.read_lens("cooke_triplet")
+    gap = lens.surfaces[2].thickness + torch.tensor([0.0, 0.5], dtype=torch.float64)
+    with warnings.catch_warnings(record=True) as of_batch:
+        warnings.simplefilter("always")
+        rt.spot(lens.replace(2, thickness=gap))
+    with warnings.catch_warnings(record=True) as of_worst:
+        warnings.simplefilter("always")
+        for k in range(2):
+            rt.spot(lens.replace(2, thickness=gap[k]))
+    assert str(of_batch[0].message) in [str(one.message) for one in of_worst]
+
+
+@pytest.mark.parametrize("verb", ["rms", "psf gaussian"])
+def test_batch_of_aimed_rays_is_a_loop(verb):
+    compare(verb, "cooke_triplet", "real")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ray_aiming", ["off", "real"])
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("verb", VERBS)
+def test_batch_is_a_loop_for_all_lenses(verb, name, ray_aiming):
+    compare(verb, name, ray_aiming)
+
+
+def test_derivative_of_every_lens():
+    error = torch.tensor([-0.01, 0.0, 0.02], dtype=torch.float64, requires_grad=True)
+    lens = rt.read_lens("cooke_triplet")
+
+    def merit(change):
+        return rt.spot(lens.replace(2, thickness=lens.surfaces[2].thickness + change)).mean_square_radius
+
+    (slopes,) = torch.autograd.grad(merit(error).sum(), error)
+    for k in range(3):
+        one = error[k].detach().clone().requires_grad_()
+        (slope,) = torch.autograd.grad(merit(one).sum(), one)
+        assert abs(float(slopes[k]) / float(slope) - 1) < 1e-10
+
+
+def test_batch_of_lenses_in_a_list():
+    lens = rt.read_lens("double_gauss")
+    lenses = [lens.replace(1, radius=radius) for radius in (60.0, 61.0, 62.0)]
+    found = rt.batch(lenses)
+    assert found.surfaces[1].curvature.shape == (3,)
+    assert found.surfaces[2].curvature is lens.surfaces[2].curvature
+    assert torch.equal(rt.spot(found).rms_radius[1], rt.spot(lenses[1]).rms_radius)
+    assert found[2].surfaces[1].curvature.shape == ()
+    assert found[:2].count == 2
+    assert [float(1 / one.surfaces[1].curvature) for one in found] == pytest.approx([60, 61, 62])
+
+
+def test_wrong_batches_are_refused():
+    lens, two = rt.read_lens("double_gauss"), torch.ones(2, dtype=torch.float64)
+    with pytest.raises(ValueError, match="surface 1: thickness has numbers of 2 lenses, surface 2: thickness of 3"):
+        lens.replace(1, thickness=two).replace(2, thickness=torch.ones(3, dtype=torch.float64)).at(ray_aiming="off")
+    with pytest.raises(TypeError, match="a single lens"):
+        lens[0]
+    with pytest.raises(IndexError, match="lens 2 of a batch of 2"):
+        lens.replace(1, thickness=two)[2]
+    with pytest.raises(ValueError, match="no lenses"):
+        rt.batch([])
+    with pytest.raises(ValueError, match="lens 1 has other surfaces"):
+        rt.batch([lens, rt.read_lens("singlet")])
+    with pytest.raises(ValueError, match="one lens, not a batch"):
+        rt.spot(lens.replace(1, thickness=8.0 + two)).plot()
+
+
+def test_table_and_document_have_the_lens():
+    lens = rt.read_lens("cooke_triplet").replace(2, thickness=torch.tensor([6.0, 6.1], dtype=torch.float64))
+    spots = rt.spot(lens)
+    frame = spots.to_frame()
+    assert sorted(set(frame["lens"])) == [0, 1]
+    assert len(frame) == spots.rms_radius.numel()
+    assert spots.document()["results"][-1]["lens"] == 1
+    assert "lens" in str(spots)
