@@ -782,3 +782,25 @@ def test_tolerances_print_and_are_saved(nominal, tmp_path):
         **{"sigmas": 2.0, "pivot": 0.0, "term": 0, "configuration": 0, "source": "limits radius=0.1%"},
     }
     assert (tmp_path / "tolerances.csv").read_text("utf-8").count("radius of surface") == 5
+
+
+def test_errors_go_through_transforms_and_single_precision(asphere):
+    rows = [row for row, _ in ROWS]
+    sensor, values = sensor_of(asphere, rows), errors().requires_grad_()
+    weights = torch.tensor([1.0, -0.7], dtype=torch.float64)[:, None, None, None]
+    (slope,) = torch.autograd.grad((weights * sensor(values)).sum(), values)
+    forward = torch.func.jacfwd(sensor)(errors())
+    close((weights[..., None] * forward).flatten(0, -2).sum(0), slope, 1e-10)
+    batch = torch.stack([errors(), errors(-0.5)])
+    close(torch.func.vmap(sensor)(batch).transpose(0, 1), sensor(batch), 1e-12)
+    single = rt.perturbed(rt.to(asphere, dtype=torch.float32), rows, batch).surfaces[1:]
+    numbers = [number for surface in single for number in (surface.thickness, surface.curvature) if number is not None]
+    assert {number.dtype for number in numbers} == {torch.float32}
+
+
+def sensor_of(lens, rows):
+    """Errors -> (2, ...) mm on the sensor."""
+    points = torch.tensor([[0.0, 0.3, -0.8], [0.0, 0.7, -0.4]], dtype=torch.float64)
+    fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
+    rays = launch(lens, points, fields=fields, wavelengths=lens.wavelengths)
+    return lambda values: trace_lens(rt.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]).position[:2]
