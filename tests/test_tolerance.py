@@ -1,4 +1,4 @@
-"""The lens as built: changes at the limits against brute force, the expectation against Monte Carlo, files of trials."""
+"""The lens as built: changes at the limits by brute force, expectation against Monte Carlo, files of trials."""
 
 import dataclasses
 import math

@@ -780,7 +780,7 @@ COMMANDS = (
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
-        rings={"help": "rings of the pupil (default 4)"}, checkpoint={"metavar": "FILE", "type": output_file},
+        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE,
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
