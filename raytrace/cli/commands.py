@@ -40,6 +40,7 @@ from raytrace.cli.options import (
 )
 from raytrace.cli.types import (
     count,
+    count_or_none,
     data_file,
     file_name,
     file_of,
@@ -780,7 +781,7 @@ COMMANDS = (
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
-        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE,
+        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
