@@ -21,7 +21,7 @@ def triplet():
 
 @pytest.fixture(scope="module")
 def built(triplet):
-    return rt.tolerance(triplet, limits=LIMITS, trials=1000)
+    return rt.tolerance(triplet, limits=LIMITS, trials=500)
 
 
 def rms(lens):
@@ -38,17 +38,28 @@ def focused(lens):
     ).fun
 
 
-def test_changes_at_the_limits_are_those_of_refocused_lenses(triplet):
-    rows = rt.tolerances(triplet, "radius:3=0.1% thickness:3=0.05 element_decenter:3=0.05 element_tilt:3=0.05")
+def check_changes(lens, rows, judge, accuracy):
+    """The changes at both limits of every row are those of single lenses, judged one by one."""
     arms = rt.gauss_rings(4)[0].shape[1] // 4
-    found = rt.tolerance(triplet, rows, trials=0, arms=arms)
-    nominal = focused(triplet)
-    assert float(found.nominal) == pytest.approx(nominal, abs=1e-9)
+    found = rt.tolerance(lens, rows, trials=0, arms=arms)
+    nominal = judge(lens)
+    assert float(found.nominal) == pytest.approx(nominal, abs=accuracy)
     for n in range(len(rows)):
         for limit, change in ((rows.minimum[n], found.minimum[n]), (rows.maximum[n], found.maximum[n])):
             errors = torch.zeros(len(rows), dtype=torch.float64)
             errors[n] = limit
-            assert float(change) == pytest.approx(focused(rt.perturbed(triplet, rows, errors)) - nominal, abs=1e-8)
+            assert float(change) == pytest.approx(judge(rt.perturbed(lens, rows, errors)) - nominal, abs=accuracy)
+
+
+def test_changes_at_the_limits_are_those_of_single_lenses(triplet):
+    rows = rt.tolerances(triplet, "radius:3=0.1% thickness:3=0.05 element_tilt:3=0.05", compensators=[])
+    check_changes(triplet, rows, rms, 1e-9)
+
+
+@pytest.mark.slow
+def test_changes_at_the_limits_are_those_of_refocused_lenses(triplet):
+    rows = rt.tolerances(triplet, "radius:3=0.1% thickness:3=0.05 element_decenter:3=0.05 element_tilt:3=0.05")
+    check_changes(triplet, rows, focused, 1e-8)
 
 
 def test_slope_is_the_derivative_of_the_change(triplet):
@@ -69,7 +80,7 @@ def test_expectation_is_the_mean_of_the_trials(built):
 
 def test_percentiles_and_yield(built):
     median = built.percentile(50)
-    assert built.yield_at(float(median)) == pytest.approx(0.5, abs=0.002)
+    assert built.yield_at(float(median)) == pytest.approx(0.5, abs=0.003)
     assert built.yield_at(0.0) == 0
     predicted = torch.quantile(built.predicted, 0.9)
     assert float(predicted) == pytest.approx(float(built.percentile(90)), rel=0.01)
@@ -81,23 +92,23 @@ def test_rss_is_as_opticstudio_prints_it(built):
 
 
 def test_a_trial_is_the_same_in_any_study(triplet, built):
-    fewer = rt.tolerance(triplet, limits=LIMITS, trials=300)
-    torch.testing.assert_close(fewer.trials, built.trials[:300], rtol=1e-10, atol=0)
+    fewer = rt.tolerance(triplet, limits=LIMITS, trials=260)
+    torch.testing.assert_close(fewer.trials, built.trials[:260], rtol=1e-10, atol=0)
     other = rt.tolerance(triplet, limits=LIMITS, trials=20, seed=1)
     assert not torch.allclose(other.trials, built.trials[:20])
 
 
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
     file = tmp_path / "trials.jsonl"
-    first = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    first = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
     lines = file.read_text().splitlines(keepends=True)
-    assert len(lines) == 4  # the study, and three pieces
-    file.write_text("".join(lines[:3]) + lines[3][:40])  # as a killed process leaves it
-    again = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    assert len(lines) == 3  # the study, and two pieces
+    file.write_text("".join(lines[:2]) + lines[2][:40])  # as a killed process leaves it
+    again = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
     assert torch.equal(first.trials, again.trials)
     assert torch.equal(first.changes, again.changes)
     with pytest.raises(rt.BadTolerance, match="trials of another study"):
-        rt.tolerance(triplet, limits="radius=0.2%", trials=600, checkpoint=file)
+        rt.tolerance(triplet, limits="radius=0.2%", trials=300, checkpoint=file)
 
 
 def test_compensators_stay_within_their_limits(triplet):
@@ -119,7 +130,7 @@ def test_wavefront_as_built(triplet):
 
 def test_report_table_and_figure(built, tmp_path):
     text = str(built)
-    assert "1,000 trials (seed 0)" in text
+    assert "500 trials (seed 0)" in text
     assert "compensator thickness of surface 7" in text
     frame = built.to_frame()
     assert list(frame["tolerance"][:1]) == [built.tolerances.labels[int(built.worst[0])]]
@@ -156,6 +167,7 @@ def test_compensators_that_the_lens_does_not_have_or_need(triplet):
 FILES = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(FILES.glob("*.zmx")), ids=lambda file: file.stem)
 def test_tolerances_of_a_file(file):
     found = rt.tolerance(rt.read_lens(file), trials=50)
