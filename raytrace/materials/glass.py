@@ -453,22 +453,29 @@ def with_index_errors(
     """
     if glass.formula == "mirror":
         raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
-    own = glass.coefficients.double()
     if not glass.formula.endswith(WITH_ERRORS):
+        if abbe is not None and not has_abbe_number(glass):
+            raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
+        own = glass.coefficients.double()
         numbers = torch.stack([refractive_index(glass, LINES[line]) for line in "dFC"])
         n, v = numbers[0], safe_divide(numbers[0] - 1.0, numbers[1] - numbers[2])
         deviation = own[2] if glass.formula == "model" else torch.zeros_like(n)
         parts = torch.broadcast_tensors(*own.unbind(0), 0 * n, n, v, 0 * n, deviation)
         name = f"{glass.formula}{WITH_ERRORS}"
         glass = dataclasses.replace(glass, formula=name, coefficients=torch.stack(parts), catalog="", status="")
-    parts = list(glass.coefficients.unbind(0))
+    *own, change, n, v, abbe_change, deviation = glass.coefficients.unbind(0)
     if index is not None:
-        parts[-5] = parts[-5] + index
+        change = change + index.double()
     if abbe is not None:
-        if not bool((parts[-3].detach() > 0).all()):
-            raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
-        parts[-2] = parts[-2] + (parts[-3] * abbe / 100 if percent else abbe)
-    return dataclasses.replace(glass, coefficients=torch.stack(torch.broadcast_tensors(*parts)))
+        abbe_change = abbe_change + (v * abbe.double() / 100 if percent else abbe.double())
+    parts = torch.broadcast_tensors(*own, change, n, v, abbe_change, deviation)
+    return dataclasses.replace(glass, coefficients=torch.stack(parts))
+
+
+def has_abbe_number(glass: Glass) -> bool:
+    """Whether a medium has indices at the lines d, F and C that differ."""
+    yellow, blue, red = (refractive_index(glass, LINES[line]).detach() for line in "dFC")
+    return bool(((yellow > 0) & (red > 0) & (blue > red)).all())
 
 
 def label(glass: Glass) -> str:
