@@ -23,7 +23,6 @@ from raytrace.optimization.operands.operand import (
 )
 from raytrace.system.optimization_data import Row
 
-
 _ADDED = "; rows added by + count from 1 among themselves, as in [Row('DIMX'), Row('OPLT', 1)]"
 
 
