@@ -102,6 +102,10 @@ PUBLIC = {
     "draw_errors": "tolerancing.sampling",
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
+    "read_tolerances": "tolerancing.files",
+    "Toleranced": "tolerancing.study",
+    "tolerance": "tolerancing.study",
+    "tolerances": "tolerancing.grades",
     # images and analyses
     "Memo": "tracing.scene",
     "DRT": "psf_models",

@@ -36,6 +36,8 @@ _KINDS = {
 }
 #: Values that functions make, by the name of their class: how to get one.
 _MADE = {"Element": "an Element of rt.elements (a name, a file) or rt.element (an array)"}
+#: Of an array where the name or the file of an element is expected.
+_OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=…, aperture=…, glass=…)"
 
 
 @functools.cache
@@ -154,7 +156,8 @@ def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
         return value
     words = {_KINDS.get(kind) or _MADE.get(kind.__name__) or with_article(kind.__name__) for kind in kinds}
     expected = " or ".join(sorted(words))
-    raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}")
+    hint = _OF_HEIGHTS if verb in ("elements", "read_element") and hasattr(value, "__len__") else ""
+    raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}{hint}")
 
 
 def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:

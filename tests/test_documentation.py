@@ -39,6 +39,17 @@ def test_frozen_sections_name_their_commit():
     assert len(FROZEN) > 10
     for page, line in FROZEN:
         assert re.match(r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", line), page
+        assert "The command is not part of the package any more" in line, page
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/**/*.md")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_in_sentences_exist(page):
+    known = {c.name for c in COMMANDS} | {"wave psf", "wave design", "wave restore"}
+    text = re.sub(r"^Frozen: .*$", "", page.read_text("utf-8"), flags=re.MULTILINE)
+    for words in re.findall(r"`raytrace ([a-z][^`]*)`", text):
+        first, *more = words.split()
+        name = f"{first} {more[0]}" if first == "wave" and more else first
+        assert name in known, f"`raytrace {words}`"
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("docs/*.md")), ids=lambda path: path.name)

@@ -6,11 +6,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from differences import slopes_by_differences
 from problems import double_gauss, lens, number, scalar, surface, vector
 
 import raytrace as rt
 from raytrace.maths.numerics import to
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import SystemAperture
+from raytrace.system.optimization_data import Vary
 from raytrace.system.surface import Aperture
 from raytrace.tracing.clear_pupil import arms_of, clear_pupil, is_clipped
 from raytrace.tracing.scene import scene, trace_scene
@@ -204,3 +208,18 @@ def test_arms_of_a_pupil_that_is_not_clipped_are_whole():
     batch = scene(double_gauss(), number([[0.0], [10.0]]), vector(math.inf), vector(0.53))
     assert not is_clipped(batch, number([[0.0], [0.0]]))
     assert float(arms_of(batch, 16).rule(4)[1].sum()) == pytest.approx(1, abs=1e-14)
+
+
+def test_a_merit_function_of_a_clipped_spot_has_the_derivatives_of_the_light():
+    """By the system aperture and the thicknesses before and behind the stop, whose rims clip at 72 % of the pupil."""
+    glass, _ = clipped(*(scalar(n) for n in NUMBERS.values()), rims=2)
+
+    def size(glass):
+        return rt.spot(glass, fields=[10.0]).rms_radius[0, 0]
+
+    model = Model(glass, (Vary(0, "aperture"), Vary(5, "thickness"), Vary(6, "thickness")))
+    evaluation = Evaluation(model, [rt.Row(rt.Measure("size", size), weight=1.0)])
+    found = evaluation(model.start, derivatives=True)
+    expected = slopes_by_differences(evaluation, model.start, 1e-4)
+    np.testing.assert_allclose(found.jacobian, expected, rtol=1e-6)
+    assert float(found.values[0]) == pytest.approx(float(size(glass)), rel=1e-12)

@@ -349,3 +349,15 @@ def test_an_index_at_a_plain_number_is_that_of_a_tensor():
     glass = Glass("", "schott", float64([2.27, -0.01, 0.01, 1e-4, 0.0, 0.0]))
     assert float(refractive_index(glass, 0.5876)) == float(refractive_index(glass, float64(0.5876)))
     assert refractive_index(glass, [0.4861, 0.6563]).shape == (2,)
+
+
+def test_a_glass_is_shown_in_a_line():
+    assert repr(BK7) == "<Glass: N-BK7 (SCHOTT), n_d 1.5168, V_d 64.1673>"
+    assert repr(constant(1.0)) == "<Glass: air>"
+    assert repr(constant(1.5)) == "<Glass: n 1.5>"
+    two = replace(BK7, coefficients=torch.stack([BK7.coefficients, 1.1 * BK7.coefficients], 1))
+    indices = nd(two).tolist()
+    assert f"n_d {indices[0]:.6g} to {indices[1]:.6g}, V_d " in repr(two)
+    shown = []
+    torch.func.vmap(lambda k: shown.append(repr(replace(BK7, coefficients=k))) or k.sum(), 1)(two.coefficients)
+    assert shown == ["<Glass: N-BK7 (SCHOTT)>"]

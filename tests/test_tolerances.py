@@ -1,6 +1,7 @@
 """Tolerances: errors of manufacture against explicit coordinate breaks, closed forms and finite differences."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from raytrace.system.poses import undone
 from raytrace.system.sag_terms import FringeSag, GridSag, PolynomialSag, TiltSag, ZernikeSag, spline
 from raytrace.system.surface import sag_at
 from raytrace.system.tolerance_data import KINDS
+from raytrace.tolerancing.grades import GRADES
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import trace_lens
 
@@ -384,8 +386,12 @@ def test_a_glass_with_errors_keeps_its_thermal_coefficients():
 
 
 def test_a_glass_without_dispersion_has_no_abbe_error(nominal):
-    with pytest.raises(InvalidIndex, match="no Abbe number"):
+    with pytest.raises(rt.BadTolerance, match="no dispersion"):
         rt.perturbed(nominal, [T("abbe", (1,), -1, 1)], [0.5])
+    with pytest.raises(InvalidIndex, match="no Abbe number"):
+        with_index_errors(nominal.surfaces[1].glass, abbe=number(0.5))
+    assert not [row for row in rt.tolerances(nominal, grade="precision") if row.kind == "abbe"]
+    assert [row.surfaces for row in rt.tolerances("cooke_triplet", "abbe=1%")] == [(1,), (3,), (6,)]
 
 
 # -- elements ---------------------------------------------------------------------------------------------------------
@@ -493,3 +499,308 @@ def test_a_surface_that_no_ray_reaches_has_no_fringes(nominal):
     lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, 1e-9), centre=(500.0, 0.0)),))
     with pytest.raises(rt.BadTolerance, match="no semi-diameter"):
         rt.perturbed(lens, [T("power", (1,), -1, 1)], [1.0])
+
+
+# -- the lines of a file ----------------------------------------------------------------------------------------------
+
+TAIL = """TOL COMP 5 0 -2 2 0 0 0
+TCMM Default compensator on back focus.
+TOL TWAV 0 0 0.5461 0 0 0 0
+TOL TRAD 1 0 -0.2 0.2 0 0 0
+TOL TRAD 2 1 -0.1 0.1 0 0 0
+TOL TFRN 4 0 -1 2 0 0 0
+TOL TTHI 1 3 -0.1 0.1 0 0 0
+TOL TTHI 3 3 -0.1 0.1 0 0 0
+TOL STAT 1 0 0 0 0 0 0
+TOL TETX 1 3 -0.2 0.2 0 0 0
+TOL SAVE 7 0 0 0 0 0 0
+TOL TSDY 4 0 -0.2 0.2 0 0 0
+TOL STAT 0 3 0 0 0 0 0
+TOL TIRR 4 0 -0.5 0.5 0 0 0
+TOL TEZI 5 6 -3e-4 3e-4 4 0 0
+TOL TIND 1 0 -1e-3 1e-3 0 0 0
+TOL TPAR 4 2 -1e-6 1e-6 0 0 0
+TOL CPAR 4 3 -1e-8 1e-8 0 0 0
+TOL TEXI 4 9 -1 1 0 0 0
+TOL TQQQ 4 9 -1 1 0 0 0
+TOL TOFF 0 0 0 0 0 0 0
+"""
+
+
+def with_lines(tmp_path, tail: str, head: str = HEAD):
+    text = "\n".join(
+        [head, "SURF 0\n  TYPE STANDARD\n  DISZ INFINITY", *(f"SURF {k}\n{s}" for k, s in enumerate(blocks(), 1))]
+    )
+    path = tmp_path / "made.zmx"
+    path.write_text(f"{text}\nSURF 6\n  TYPE STANDARD\n  DISZ 0\n{tail}MNUM 1\n", encoding="utf-8")
+    return path
+
+
+def test_every_line_is_read_or_named(tmp_path):
+    path = with_lines(tmp_path, TAIL)
+    found = rt.read_tolerances(path)
+    assert found.test_wavelength == 0.5461
+    assert [(row.kind, row.surfaces, row.minimum, row.maximum) for row in found[:6]] == [
+        ("radius", (1,), -0.2, 0.2),
+        ("radius", (2,), -0.1, 0.1),
+        ("power", (4,), -1.0, 2.0),
+        ("thickness", (1,), -0.1, 0.1),
+        ("thickness", (3,), -0.1, 0.1),
+        ("element_tilt_x", (1, 3), -0.2, 0.2),
+    ]
+    assert [found[k].unit for k in (0, 1, 2)] == ["mm", "%", "fringes"]
+    assert [found[k].adjust for k in (3, 4)] == [3, None]
+    assert [found[k].distribution for k in (0, 5, 6, 7)] == ["normal", "uniform", "uniform", "normal"]
+    assert [found[k].sigmas for k in (0, 7)] == [2.0, 3.0]
+    assert found.saves == ((5, 7),)
+    kinds = [row.kind for row in found[7:]]
+    assert kinds == ["irregularity", "irregularity_angle", *["zernike"] * 3, "index", "parameter"]
+    assert [row.term for row in found[9:12]] == [4, 5, 6]
+    assert found[9].maximum == pytest.approx(3e-4 / math.sqrt(3))
+    assert found[-1].parameter == "a4"
+    line = path.read_text("utf-8").splitlines().index("TOL TRAD 1 0 -0.2 0.2 0 0 0") + 1
+    assert found[0].source == f"made.zmx:{line}"
+    assert [(one.surface, one.parameter, one.minimum) for one in found.compensators] == [
+        (5, "thickness", -2.0),
+        (4, "a6", -1e-8),
+    ]
+    assert [text.split(": ")[1] for text in found.unread] == ["TEXI", "TQQQ", "TOFF"]
+    draws = rt.draw_errors(found, 4)
+    assert rt.perturbed(rt.read_lens(path), found, draws).surfaces[4].coefficients.shape == (2, 4, 1, 1, 1)
+
+
+def test_lengths_of_a_file_in_inches_become_millimetres(tmp_path):
+    lines = "TOL COMP 5 0 -2 2\nTOL TRAD 1 0 -0.2 0.2\nTOL TCUR 1 0 -0.1 0.1\nTOL TETX 1 3 -1 1\nTOL TPAR 4 2 -1 1\n"
+    found = rt.read_tolerances(with_lines(tmp_path, lines, HEAD.replace("UNIT MM", "UNIT IN")))
+    limits = [row.maximum for row in found]
+    assert limits == pytest.approx([0.2 * 25.4, 0.1 / 25.4, 1.0, 25.4**-3])
+    assert found.compensators[0].maximum == pytest.approx(2 * 25.4)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("TOL TRAD 9 0 -1 1", r"made.zmx:\d+: TRAD: surface 9; this lens has surfaces 0 to 6"),
+        ("TOL TRAD 1 0 -1 x", r"made.zmx:\d+: TRAD: maximum is 'x', expected a finite number"),
+        ("TOL TRAD 1 0 2 1", r"TRAD: minimum 2 above maximum 1"),
+        ("TOL TETX 4 2 -1 1", r"TETX: last surface 2 before 4"),
+        ("TOL TUDX 4 0 -1 1", r"TUDX: surface 4 is no coordinate break"),
+        ("TOL TMCO 1 1 -1 1", r"TMCO: row 1; this lens has 0 operands"),
+        ("TOL TWAV 0 0 0", r"TWAV: test wavelength in µm is 0, expected more than 0"),
+        ("TOL TEZI 4 300 -1 1", r"TEZI: terms 2 to 300"),
+        ("TOL STAT 0 -1", r"STAT: -1 standard deviations"),
+    ],
+)
+def test_a_line_that_the_lens_does_not_have_is_refused(line, message, tmp_path):
+    with pytest.raises(rt.LensFileError, match=message):
+        rt.read_tolerances(with_lines(tmp_path, line + "\n"))
+
+
+def test_a_file_without_tolerances_is_refused(tmp_path):
+    with pytest.raises(rt.LensFileError, match="no lines of tolerances"):
+        rt.read_tolerances(with_lines(tmp_path, ""))
+
+
+DEVELOPMENT = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+#: Rows of each file, with an angle for each irregularity.
+REAL = {"SC_Tol_Cooke": 47, "SC_Tol_singlet2": 11, "sc_tol_DblPass3": 17, "sc_tol_scan1": 26, "ASL10142-1064": 9}
+
+
+@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.parametrize("name", REAL)
+def test_files_of_others_are_read_and_their_lenses_made(name):
+    path = DEVELOPMENT / f"{name}.zmx"
+    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    text = path.read_bytes()
+    text = text.decode("utf-16" if text[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
+    lines = [line for line in text.splitlines() if line.startswith("TOL ")]
+    angles = sum(row.kind == "irregularity_angle" for row in found)
+    assert len(found) - angles + len(found.compensators) + 1 == len(lines)
+    assert len(found) == REAL[name]
+    assert not found.unread
+    draws = rt.draw_errors(found, 2, seed=5)
+    for one in lens.configurations:
+        together = rt.perturbed(one, found, draws)
+        alone = rt.perturbed(one, found, draws[1])
+        rays = launch(one, torch.tensor([[0.0, 0.3], [0.2, -0.4]], dtype=torch.float64))
+        ends = [trace_lens(made, rays, one.primary) for made in (together, alone)]
+        assert ends[1].valid.any()
+        close(ends[0].position[:, 1], ends[1].position, 1e-12)
+
+
+@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+def test_errors_of_a_lens_in_double_pass_are_in_both_passes():
+    path = DEVELOPMENT / "sc_tol_DblPass3.zmx"
+    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    errors = torch.zeros(len(found), dtype=torch.float64)
+    values = {"radius of surface 2": 0.2, "thickness of surface 2": 0.1, "index of surface 2": 1e-3}
+    values |= {"parameter x of surface 1": 0.15, "parameter tilt_x of surface 1": 0.1}
+    values |= {"irregularity of surface 3": 0.2, "surface_decenter_x of surface 2": 0.05}
+    for label, value in values.items():
+        errors[found.labels.index(label)] = value
+    s = rt.perturbed(lens, found, errors).surfaces
+    assert float(1 / s[10].curvature) == pytest.approx(float(1 / s[2].curvature), rel=1e-14)
+    assert float(1 / s[2].curvature - 1 / lens.surfaces[2].curvature) == pytest.approx(0.2, rel=1e-9)
+    assert [float(s[k].thickness) for k in (2, 3, 4)] == pytest.approx([4.3, -4.3, 4.3])
+    assert float(s[9].thickness) == pytest.approx(-4.3)
+    assert s[9].glass is s[2].glass
+    assert [float(s[k].before.x) for k in (1, 4, 8, 11)] == pytest.approx([0.15, -0.15, 0.15, -0.15])
+    assert [float(s[k].before.tilt_x) for k in (1, 4, 8, 11)] == pytest.approx([0.1, -0.1, 0.1, -0.1])
+    h = number(7.0)
+    sags = [float(sag_at(s[k], 0 * h, h) - sag_at(lens.surfaces[k], 0 * h, h)) for k in (3, 9)]
+    assert sags[0] == pytest.approx(sags[1], rel=1e-12)
+    assert abs(sags[0]) > 1e-6
+    assert [float(s[k].before.x) for k in (2, 10)] == pytest.approx([0.05, 0.05])
+
+
+@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+def test_an_error_of_an_operand_is_in_its_configuration_alone():
+    path = DEVELOPMENT / "sc_tol_scan1.zmx"
+    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    place = next(k for k, row in enumerate(found) if row.kind == "operand" and row.configuration == 2)
+    made = rt.perturbed(lens, found, torch.zeros(len(found)).index_fill(0, torch.tensor(place), 0.5))
+    angles = [float(one.surfaces[3].before.tilt_x) for one in made.configurations]
+    assert angles == pytest.approx([-10, -4.5, 0, 5, 10])
+    assert [float(one.surfaces[5].before.tilt_x) for one in made.configurations] == pytest.approx([10, 4.5, 0, -5, -10])
+
+
+# -- grades and limits ------------------------------------------------------------------------------------------------
+
+
+def test_a_grade_has_rows_for_every_face_element_and_gap_with_their_source(nominal):
+    found = rt.tolerances(nominal, grade="precision")
+    places = {kind: [row.surfaces for row in found if row.kind == kind] for kind in KINDS}
+    assert sorted(places["radius"] + places["power"]) == [(1,), (2,), (3,), (4,), (5,)]
+    assert places["irregularity"] == [(1,), (2,), (3,), (4,), (5,)]
+    assert places["thickness"] == [(1,), (2,), (4,), (3,)]
+    assert [row.adjust for row in found if row.kind == "thickness"] == [3, 3, 5, None]
+    assert places["element_tilt_x"] == [(1, 3), (4, 5)]
+    assert places["surface_runout_x"] == [(2,), (3,), (5,)]
+    assert places["index"] == [(1,), (2,), (4,)]
+    assert all(row.source for row in found)
+    assert [one.surface for one in found.compensators] == [5]
+    assert "Manufacturing Tolerance Chart" in str(found)
+
+
+def test_a_radius_may_differ_by_the_larger_of_its_part_and_of_fringes(nominal):
+    """One fringe is N λ |R|/h² of a radius: 0.0494 % of surface 1, 0.066 % of surface 2."""
+    found = rt.tolerances(nominal, grade="high")
+    assert [row.surfaces for row in found if row.kind == "radius"] == [(1,), (4,)]
+    assert [row.surfaces for row in found if row.kind == "power"] == [(2,), (3,), (5,)]
+    plane = rt.tolerances(nominal.replace(1, curvature=None), grade="high")
+    assert (1,) in [row.surfaces for row in plane if row.kind == "power"]
+    made = rt.perturbed(nominal, [T("power", (1,), -1, 1)], [1.0]).surfaces[1]
+    assert abs(0.02 / float(made.curvature) - 1) == pytest.approx(0.6328e-3 / (0.02 * 64), rel=0.02)
+
+
+def test_the_page_has_the_figures_of_the_grades():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "tolerances.md").read_text("utf-8")
+    table = page.partition("| limit ± |")[2]
+    for word in GRADES["precision"]:
+        figures = [GRADES[name][word] for name in ("commercial", "precision", "high")]
+        parts = [
+            f"{one.limit:g}{one.unit}" + (f" or {one.fringes:g} fringes" if one.fringes else "") for one in figures
+        ]
+        line = next(line for line in table.splitlines() if line.startswith(f"| `{word}`"))
+        assert [cell.strip() for cell in line.split("|")[2:5]] == parts
+        assert all(part in line for one in figures for part in one.source.split("; "))
+
+
+def test_the_grades_get_tighter():
+    grades = [GRADES[name] for name in ("commercial", "precision", "high")]
+    for word in grades[0]:
+        limits = [grade[word].limit for grade in grades]
+        assert limits == sorted(limits, reverse=True), word
+        assert len({*limits}) == 3
+
+
+def test_limits_take_the_place_of_a_grade(nominal):
+    text = "radius=0.3% power:2=-1..4 thickness=0.02 air=0 element_tilt=0.05 irregularity:1,3=0.25 element_roll=1"
+    found = rt.tolerances(nominal, text, grade="commercial", distribution="uniform")
+    limits = {(row.kind, row.surfaces): (row.minimum, row.maximum, row.unit) for row in found}
+    assert limits["radius", (1,)] == (-0.3, 0.3, "%")
+    assert ("radius", (2,)) not in limits
+    assert limits["power", (2,)] == (-1.0, 4.0, "fringes")
+    assert limits["thickness", (1,)] == (-0.02, 0.02, "mm")
+    assert ("thickness", (3,)) not in limits
+    assert limits["element_tilt_y", (1, 3)] == (-0.05, 0.05, "degrees")
+    assert limits["irregularity", (1,)] == (-0.25, 0.25, "fringes")
+    assert limits["irregularity", (2,)] == (-2.0, 2.0, "fringes")
+    assert limits["element_roll", (4, 5)] == (-1.0, 1.0, "degrees")
+    row = next(row for row in found if row.kind == "radius")
+    assert (row.source, row.distribution) == ("limits radius=0.3%", "uniform")
+    assert rt.perturbed(nominal, found, rt.draw_errors(found, 1)[0]).surfaces[1] is not nominal.surfaces[1]
+
+
+def test_limits_alone_and_of_a_file(nominal, tmp_path):
+    assert [row.kind for row in rt.tolerances(nominal, "curvature=1e-5")] == ["curvature"] * 5
+    lens = rt.read_lens(with_lines(tmp_path, TAIL))
+    read = rt.read_tolerances(tmp_path / "made.zmx")
+    assert [dataclasses.replace(row, source="", group="") for row in rt.tolerances(lens)] == [
+        dataclasses.replace(row, source="", group="") for row in read
+    ]
+    found = rt.tolerances(lens, "thickness=0.5")
+    assert [(row.surfaces, row.maximum) for row in found if row.kind == "thickness"] == [
+        ((3,), 0.1),
+        ((1,), 0.5),
+        ((2,), 0.5),
+        ((4,), 0.5),
+    ]
+    assert len(found.compensators) == 2
+
+
+@pytest.mark.parametrize(
+    ("limits", "grade", "message"),
+    [
+        ("", None, "no tolerances of its own"),
+        ("", "fine", "expected one of commercial, precision, high"),
+        ("radius", None, "expected a kind and its limit"),
+        ("raduis=1", None, "no tolerance 'raduis'; did you mean radius"),
+        ("index=1%", None, "only radius and abbe"),
+        ("index=x", None, "expected a number"),
+        ("index=-1", None, "expected a positive number"),
+        ("index=2..1", None, "limits 2 to 1"),
+        ("index:3=1e-3", None, "surface 3 has no index; it belongs to 1, 2, 4"),
+        ("radius:1--2=1", None, "is no surface number"),
+    ],
+)
+def test_limits_that_no_lens_has_are_refused(limits, grade, message, nominal):
+    with pytest.raises(rt.BadTolerance, match=message):
+        rt.tolerances(nominal, limits, grade=grade)
+
+
+def test_tolerances_print_and_are_saved(nominal, tmp_path):
+    found = rt.tolerances(nominal, "radius=0.1% element_tilt=0.05")
+    assert "radius of surface 1" in str(found)
+    assert "element_tilt_x of surfaces 1-3" in str(found)
+    assert "compensator: thickness of surface 5" in str(found)
+    found.save(tmp_path / "tolerances.json")
+    found.save(tmp_path / "tolerances.csv")
+    rows = json.loads((tmp_path / "tolerances.json").read_text("utf-8"))["tolerances"]
+    assert rows[0] == {
+        **{"kind": "radius", "surfaces": [1], "minimum": -0.1, "maximum": 0.1, "unit": "%", "distribution": "normal"},
+        **{"sigmas": 2.0, "pivot": 0.0, "term": 0, "configuration": 0, "source": "limits radius=0.1%"},
+    }
+    assert (tmp_path / "tolerances.csv").read_text("utf-8").count("radius of surface") == 5
+
+
+def test_errors_go_through_transforms_and_single_precision(asphere):
+    rows = [row for row, _ in ROWS]
+    sensor, values = sensor_of(asphere, rows), errors().requires_grad_()
+    weights = torch.tensor([1.0, -0.7], dtype=torch.float64)[:, None, None, None]
+    (slope,) = torch.autograd.grad((weights * sensor(values)).sum(), values)
+    forward = torch.func.jacfwd(sensor)(errors())
+    close((weights[..., None] * forward).flatten(0, -2).sum(0), slope, 1e-10)
+    batch = torch.stack([errors(), errors(-0.5)])
+    close(torch.func.vmap(sensor)(batch).transpose(0, 1), sensor(batch), 1e-12)
+    single = rt.perturbed(rt.to(asphere, dtype=torch.float32), rows, batch).surfaces[1:]
+    numbers = [number for surface in single for number in (surface.thickness, surface.curvature) if number is not None]
+    assert {number.dtype for number in numbers} == {torch.float32}
+
+
+def sensor_of(lens, rows):
+    """Errors -> (2, ...) mm on the sensor."""
+    points = torch.tensor([[0.0, 0.3, -0.8], [0.0, 0.7, -0.4]], dtype=torch.float64)
+    fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
+    rays = launch(lens, points, fields=fields, wavelengths=lens.wavelengths)
+    return lambda values: trace_lens(rt.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]).position[:2]

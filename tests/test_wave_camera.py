@@ -96,7 +96,7 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     powers = lens.profile.coefficients.new_zeros(5)
     powers[:1] = lens.profile.coefficients
     smooth = Element(EvenPowers(powers), lens.radius, lens.glass)
-    before = expected_error(transfer(psf(scene([smooth], SMALL)), 128), S, SMALL.noise)
+    before, watched = expected_error(transfer(psf(scene([smooth], SMALL)), 128), S, SMALL.noise), []
     best = best_of_starts(
         lambda: PhaseVariables(smooth, basis=radial_powers(smooth.radius, 5)),
         SMALL,
@@ -104,9 +104,14 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
         starts=2,
         spread=0.3,
         steps=30,
+        watch=lambda *report: watched.append(report),
     )
     after = expected_error(transfer(psf(scene(best(), SMALL)), 128), S, SMALL.noise)
     assert float(psnr(after.detach()) - psnr(before.detach())) > 2
+    for start in (1, 2):
+        evaluations = [evaluation for number, evaluation, _ in watched if number == start]
+        assert evaluations == [*range(1, len(evaluations) + 1)]
+    assert min(error for *_, error in watched) == pytest.approx(float(after.detach()), rel=1e-6)  # of another sampling
 
 
 @pytest.mark.parametrize(
@@ -138,7 +143,10 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
 def test_a_run_is_that_of_its_pictures(tmp_path):
     """As many others are refused, whether it has finished or not."""
     settings, others = dataclasses.replace(QUICK, steps=1), dead_leaves(8, size=64, seed=6, smallest=2.5)
-    learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    initial = learn(settings, SMALL, LEAVES, tmp_path, "finished").initial
+    again = learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    assert torch.equal(again.initial[0].numbers, initial[0].numbers)
+    assert not torch.equal(again.variables()[0].numbers, initial[0].numbers)
     for _ in range(2):
         with pytest.raises(OtherSettings, match=f"pictures was '8, blake2 .*, now '{digest(others.samples)}'"):
             learn(settings, SMALL, others, tmp_path, "others")

@@ -63,12 +63,23 @@ def test_scenes_are_simulated_and_restored(capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_element_is_learned_kept_and_gone_on_with(capsys, tmp_path):
+def test_an_element_is_learned_kept_and_gone_on_with(capsys, tmp_path, monkeypatch):
+    phases, progress = [], wave_run.progress
+    monkeypatch.setattr(
+        wave_run, "progress", lambda *work, what, **more: phases.append(what) or progress(*work, what=what, **more)
+    )
     words = ("design", "--element", "smooth", "--starts", "1", "--steps", "3", "-o", str(tmp_path / "run"), "--json")
     code, out, err = run(capsys, *words)
     assert code == 0, err
     outcome = json.loads(out)
     assert outcome["settings"]["kind"] == "smooth"
+    assert outcome["initial"]["by_depth"].keys() == outcome["by_depth"].keys()
+    assert outcome["initial"]["mean"] != outcome["mean"]
+    assert outcome["expected_error"].keys() == {"initial", "designed"}
+    for phase in ("training pictures", "spectrum of the pictures", "initial element", "compiling the trace"):
+        assert f"smooth, seed 0: {phase}" in phases
+    assert "smooth, seed 0: optimisation" in phases
+    assert "smooth, seed 0: image quality" in phases
     assert np.load(tmp_path / "run" / "heights.npy").ndim == 2
     code, again, err = run(capsys, *words)
     assert code == 0

@@ -343,6 +343,12 @@ def test_an_array_alone_is_no_element():
         rt.hybrid_psf("double_gauss", "cubic")
 
 
+@pytest.mark.parametrize("function", [rt.elements, rt.read_element])
+def test_an_array_in_place_of_a_file_is_refused_with_the_function_that_takes_it(function):
+    with pytest.raises(TypeError, match=r"a ndarray; expected a path or a text; an array of heights: rt\.element\("):
+        function(np.zeros((4, 4)), aperture=1.0)
+
+
 @pytest.mark.parametrize("option", [{"levels": 8}, {"aperture": 3.0}, {"glass": "PMMA"}, {"design_wavelength": 0.5}])
 def test_options_of_a_name_are_refused_for_an_element(option):
     (element,) = rt.elements("singlet", aperture=2.0)

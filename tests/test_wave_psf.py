@@ -9,11 +9,13 @@ from differences import gradcheck
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
+import raytrace as rt
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import InvalidIndex, OutOfRange, sellmeier
 from raytrace.maths.numerics import to
 from raytrace.psf_models.dft import phasor
 from raytrace.tracing.scene import Memo
+from raytrace.wave_optics import compute, pupil
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave_optics.plan import plan
@@ -212,3 +214,19 @@ def test_a_memo_of_the_pupil_engine(kind):
         moved = dataclasses.replace(s, elements=(dataclasses.replace(elements[0], profile=profile),))
         assert torch.equal(psf(moved, plan=made, memo=memo).kernel, psf(moved, plan=made).kernel)
     assert memo.made == 1
+
+
+@pytest.mark.parametrize("size", [6, 7])
+def test_kernels_one_by_one_are_those_at_once_and_share_the_light_behind_the_pixels(monkeypatch, size):
+    element = plate("pixels")
+    options = {"sensor": float(Z), "depths": [500.0, 1000.0, math.inf], "wavelengths": [0.46, 0.55], "size": size}
+    at_once = rt.wave_psf(element, **options)
+    monkeypatch.setattr(compute, "_CHUNK", 0.0)
+    made, behind = [], pupil.behind_pixels
+    monkeypatch.setattr(pupil, "behind_pixels", lambda *scene: made.append(scene) or behind(*scene))
+    alone = rt.wave_psf(element, **options)
+    assert len(made) == 2  # of the wavelengths
+    assert relative(alone.kernel, at_once.kernel) < 1e-14
+    assert (alone.axial is None) == (size == 7)
+    assert alone.axial is None or torch.allclose(alone.axial, at_once.axial, rtol=1e-14, atol=0)
+    assert alone.kernel.shape == (3, 2, size, size)

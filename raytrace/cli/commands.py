@@ -40,6 +40,7 @@ from raytrace.cli.options import (
 )
 from raytrace.cli.types import (
     count,
+    count_or_none,
     data_file,
     file_name,
     file_of,
@@ -767,6 +768,20 @@ COMMANDS = (
         tessar --plot encircled.png
         double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
         lens, conditions, plot("the curves"), table,
+    ),
+    _command(
+        "tolerance",
+        "the lens as built: sensitivities, expectation and Monte Carlo",
+        "Change of the RMS spot radius or wavefront by every tolerance at its limits, the mean of the lens as built by "
+        "second derivatives, and its distribution over perturbed and compensated lenses. The tolerances are those of "
+        "the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the sensor distance unless the "
+        "file has others.",
+        """
+        cooke_triplet --grade precision --plot as_built.png
+        lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
+        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
+        lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
+        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(

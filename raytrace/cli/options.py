@@ -78,7 +78,7 @@ LENS_SUFFIXES = Names(_written_formats)
 #: Parameters that are no options: arguments of the runner, and objects.
 NO_OPTIONS = (
     *("lens", "path", "catalogs", "progress", "watch", "share", "execution", "grid", "window", "pupil", "folder"),
-    "merit",
+    *("merit", "tolerances"),
 )
 
 _MM, _UM = {"metavar": "MM"}, {"metavar": "UM", "type": positive_finite, "nargs": "+"}

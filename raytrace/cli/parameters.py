@@ -99,7 +99,12 @@ def flag(name: str) -> str:
 def add_parameter(group, name: str, parameter: Parameter, row: Mapping, *, keep_default: bool = True) -> None:
     """Add the option of a parameter: row, else the annotation and the docstring. Without the option the value is that
     of the default, or None; a help text that does not mention the default is completed by it."""
-    settings = {**_reader(parameter.annotation), "help": parameter.help, "default": parameter.default, **row}
+    settings = {
+        **_reader(parameter.annotation),
+        "help": parameter.help.replace("%", "%%"),
+        "default": parameter.default,
+    }
+    settings |= row
     default, flags = settings.pop("default"), settings.pop("flags", (flag(name),))
     usual = " ".join(map(_shown, default)) if isinstance(default, tuple) else _shown(default)
     if usual and "action" not in settings and "default" not in settings["help"]:

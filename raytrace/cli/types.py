@@ -134,6 +134,14 @@ def count(text: str) -> int:
     return number
 
 
+def count_or_none(text: str) -> int:
+    """A whole number, or 0 for none."""
+    number = _whole(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is below 0")
+    return number
+
+
 def count_or_all(text: str) -> int | str:
     """A whole number above 0, or `all`."""
     return text if text == "all" else count(text)

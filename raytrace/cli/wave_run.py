@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -28,6 +29,7 @@ from raytrace.imaging.wave_design import WaveCamera, begin, learn_element
 from raytrace.io.pictures import read_channels, write_picture
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.settings import DesignSettings
+from raytrace.tracing.compiled import prepare
 from raytrace.wave_optics.compute import elements
 from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.element_files import write_element
@@ -60,39 +62,50 @@ def _config(arguments: argparse.Namespace) -> WaveCameraConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DesignedElement(ElementReport):
-    """A designed element and its image quality."""
+    """A designed element and its image quality; errors: expected in closed form, of the initial and of this element."""
 
     settings: DesignSettings
+    errors: tuple[float, float]
 
     def document(self) -> dict:
         inputs = {"settings": dataclasses.asdict(self.settings), "world": dataclasses.asdict(self.config)}
-        return plain(inputs | dataclasses.asdict(self.quality))
+        before = {"initial": dataclasses.asdict(self.initial.quality)}
+        errors = {"expected_error": dict(zip(("initial", "designed"), self.errors, strict=True))}
+        return plain(inputs | dataclasses.asdict(self.quality) | errors | before)
 
     def tables(self) -> list[Table]:
-        result = self.quality
-        both = zip(*result.by_depth.values(), strict=True), (result.mean.values(), result.spread.values())
-        wiener, invariant = zip(*(row for rows in both for row in rows), strict=True)
-        lowest = min(min(row) for row in result.energy)
-        columns = {
-            Column("object at"): [*map(depth_text, self.config.depths), "mean", "spread"],
-            Column("Wiener", "dB", ".2f"): wiener,
-            Column("invariant", "dB", ".2f"): invariant,
-        }
-        title = "PSNR of restored pictures; invariant: the depth-invariant filter"
+        columns = {Column("object at"): [*map(depth_text, self.config.depths), "mean", "spread"]}
+        for filter, heading in (("wiener", "Wiener"), ("blind", "invariant")):
+            for rating, which in ((self.initial.quality, "initial"), (self.quality, "designed")):
+                values = *rating.by_depth[filter], rating.mean[filter], rating.spread[filter]
+                columns[Column(f"{filter}_{which}", "dB", ".2f", f"{heading}\n{which}")] = values
+        lowest = min(min(row) for row in self.quality.energy)
+        titles = ["PSNR of restored pictures; invariant: the depth-invariant filter"]
+        before, after = self.errors
         size = f"{self.config.size} × {self.config.size} pixels"
-        return [Table(columns, [title], [f"light inside the window of {size}: {lowest:.3f} or more"])]
+        remarks = [
+            f"expected mean square error behind the depth-invariant filter: {before:.6f} initial, {after:.6f} designed",
+            f"light inside the window of {size}: {lowest:.3f} or more",
+        ]
+        return [Table(columns, titles, remarks)]
 
 
 def design(arguments: argparse.Namespace) -> DesignedElement:
     """Design an element, or resume its design, and compute its image quality."""
     config, settings, folder = _config(arguments), _design_settings(arguments), Path(arguments.folder)
-    train, test = split(training_pictures(arguments, "sharp leaves"))
-    camera = learn(settings, config, train, folder, f"{settings.kind}, seed {settings.seed}")
+    label = f"{settings.kind}, seed {settings.seed}"
+    with progress(None, what=f"{label}: training pictures"):
+        train, test = split(training_pictures(arguments, "sharp leaves"))
+    camera = learn(settings, config, train, folder, label)
+    pictures = {"train": periodic(train, WIDE), "test": periodic(test, WIDE)}
     with torch.no_grad():
-        parts = camera.variables()
-        psf = kernels(parts, config)
-        rating = quality(parts, config, train=periodic(train, WIDE), test=periodic(test, WIDE), psf=psf)
-    designed = DesignedElement(parts, config, psf, rating, settings)
+        parts, reports, errors = camera.variables(), [], []
+        for either in progress([camera.initial, parts], "element", what=f"{label}: image quality"):
+            psf = kernels(either, config)
+            reports.append(ElementReport(either, config, psf, quality(either, config, **pictures, psf=psf)))
+            errors.append(float(camera.expected(either)))
+    initial, after = reports
+    designed = DesignedElement(parts, config, after.kernels, after.quality, settings, tuple(errors), initial=initial)
     write_json(folder / "outcome.json", designed.document())
     heights = fabricated(parts[0]) if settings.kind == "rings" else as_pixels(parts[0], config.pixel)
     write_element(heights, folder / "heights.npy", design_wavelength=config.wavelengths[len(config.wavelengths) // 2])
@@ -117,19 +130,31 @@ def _design_settings(arguments: argparse.Namespace) -> DesignSettings:
 
 def learn(settings: DesignSettings, config: WaveCameraConfig, train: Pictures, folder: Path, label: str) -> WaveCamera:
     """An optimised camera: the remaining steps of its run, with a bar."""
-    S, images = spectrum(periodic(train, settings.size)), digest(train.samples)
-    camera, run = begin(
-        settings, config, S, folder, pictures=images, progress=lambda starts: progress(starts, "start", what=label)
-    )
-    bar = None
-    for step, record in learn_element(camera, train, settings, run):
-        bar = bar or progress(settings.steps, what=label, initial=step)
-        bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
-        bar.update()
-    if bar is None:
+    with progress(None, what=f"{label}: spectrum of the pictures"):
+        S, images = spectrum(periodic(train, settings.size)), digest(train.samples)
+    bars = []
+
+    def starts(items: Iterable) -> Iterable:
+        bars.append(progress(items, "start", what=f"{label}: initial element"))
+        return bars[-1]
+
+    def watch(start: int, evaluation: int, error: float) -> None:
+        bars[-1].set_postfix_str(f"start {start}: evaluation {evaluation}, error {error:.6f}", refresh=False)
+
+    with progress(None, what=f"{label}: initial element"):
+        camera, run = begin(settings, config, S, folder, pictures=images, progress=starts, watch=watch)
+    with progress(None, what=f"{label}: compiling the trace"):
+        prepare()
+    record = None
+    with progress(settings.steps, what=f"{label}: optimisation") as bar:
+        for step, record in learn_element(camera, train, settings, run):
+            if bar.n < step:  # resumed
+                bar.n = bar.initial = step
+            bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
+            bar.update()
+    if record is None:
         say(f"{label}: finished before, nothing to learn")
     else:
-        bar.close()
         say(f"{label}: loss {record['loss']:.6f} after {settings.steps} steps")
     return camera
 

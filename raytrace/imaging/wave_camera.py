@@ -23,7 +23,7 @@ from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_
 from raytrace.maths.result import Result
 from raytrace.maths.sampling import grid
 from raytrace.optimization.least_squares import NoOptimum
-from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
+from raytrace.plotting.style import FIELD_COLOURS, GREY, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf
 from raytrace.wave_optics.element import Element, Rings, height
@@ -266,27 +266,33 @@ def quality(
 
 @dataclasses.dataclass(frozen=True)
 class ElementReport(Result):
-    """Elements of a camera, their kernels and image quality."""
+    """Elements of a camera, their kernels and image quality; initial: those before an optimisation, to compare with."""
 
     elements: Sequence[Element]
     config: WaveCameraConfig
     kernels: ElementPsf
     quality: Quality
+    initial: "ElementReport | None" = dataclasses.field(default=None, kw_only=True)
 
     @styled
     def draw(self):
         """Height over the radius, and its difference from a fitted paraboloid where it is many waves high; PSNR over
-        depth, kernels over depth and wavelength."""
-        figure = new_figure(9.2, 7.0)
-        top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
+        depth, kernels over depth and wavelength; of the initial elements, too."""
+        figure = new_figure(9.2, 7.0 if self.initial is None else 11.2)
+        top, *bottom = figure.subfigures(
+            2 if self.initial is None else 3, 1, height_ratios=(1, *[1.75] * (1 + (self.initial is not None)))
+        )
         radius = self.elements[0].radius
         r = torch.linspace(0, float(radius) * (1 - 1e-9), 4000, dtype=radius.dtype)
-        heights = [1e3 * array(height(element, r, torch.zeros_like(r)).detach()) for element in self.elements]
+        drawn = [(element, FIELD_COLOURS[k % 3], element.glass.name) for k, element in enumerate(self.elements)]
+        if self.initial is not None:
+            drawn = [(element, GREY, "initial") for element in self.initial.elements] + drawn
+        heights = [1e3 * array(height(element, r, torch.zeros_like(r)).detach()) for element, *_ in drawn]
         tall = [h for h in heights if np.ptp(h) > _TALL]
         profile, *texture, psnrs = top.subplots(1, 3 if tall else 2)
         r = array(r)
-        for number, (element, h) in enumerate(zip(self.elements, heights, strict=True)):
-            look = {"lw": 0.9, "color": FIELD_COLOURS[number % 3], "label": element.glass.name}
+        for (_, colour, label), h in zip(drawn, heights, strict=True):
+            look = {"lw": 0.9, "color": colour, "label": label}
             profile.plot(r, h - h.min(), **look)
             if np.ptp(h) > _TALL:
                 texture[0].plot(r, h - np.polyval(np.polyfit(r * r, h, 1), r * r), **look)
@@ -298,14 +304,19 @@ class ElementReport(Result):
         labels = {"wiener": "Wiener, 1 m kernel", "blind": "best depth-invariant filter"}
         for filter, mark, colour in (("wiener", "o--", FIELD_COLOURS[0]), ("blind", "s-", FIELD_COLOURS[1])):
             psnrs.plot(dioptres, self.quality.by_depth[filter], mark, ms=4, label=labels[filter], color=colour)
+            if self.initial is not None:
+                look = {"ms": 3, "color": colour, "alpha": 0.4, "label": f"{labels[filter]}, initial"}
+                psnrs.plot(dioptres, self.initial.quality.by_depth[filter], mark, **look)
         mark_depths(psnrs, self.config)
         psnrs.set(xlabel="object distance", ylabel="PSNR (dB)")
         psnrs.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1), borderaxespad=0)
-        _draw_kernels(bottom, self.kernels)
+        if self.initial is not None:
+            _draw_kernels(bottom[0], self.initial.kernels, "PSFs of the initial element")
+        _draw_kernels(bottom[-1], self.kernels)
         return figure
 
 
-def _draw_kernels(figure, psf: ElementPsf) -> None:
+def _draw_kernels(figure, psf: ElementPsf, title: str = "PSFs") -> None:
     kernels, (D, W) = array(psf.kernel.detach()), psf.kernel.shape[:2]
     axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(psf.wavelengths.tolist())
     half = 1e3 * float(psf.pitch) * kernels.shape[-1] / 2
@@ -320,7 +331,8 @@ def _draw_kernels(figure, psf: ElementPsf) -> None:
     for panel, depth in zip(axes[0], psf.depths.tolist(), strict=True):
         panel.set_title(depth_text(depth, "∞"), fontsize=9)
     figure.supxlabel(
-        f"PSFs, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row", fontsize=8
+        f"{title}, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row",
+        fontsize=8,
     )
 
 

@@ -9,6 +9,7 @@ follows the depth-invariant filter. Steps, logs and checkpoints are those of `tr
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -37,6 +38,13 @@ _NETWORK_RATE = 1e-3
 _CROPS = 4  # patches of a picture in an epoch
 _SAMPLE, _START = 20, 21  # last numbers of the keys of random numbers
 
+#: Called with a random start, an evaluation of its error, and that error.
+Watch = Callable[[int, int, float], None]
+
+
+def _unwatched(start: int, evaluation: int, error: float) -> None:
+    """No report."""
+
 
 class WaveCamera(nn.Module):
     """A camera with a trainable phase element and filter.
@@ -57,6 +65,7 @@ class WaveCamera(nn.Module):
         super().__init__()
         self.network = network
         self.variables, self.config, self.restoration = variables, config, restoration
+        self.initial: tuple[Element, ...] = detached(variables())
         self.register_buffer("spectrum", spectrum, persistent=False)
         if restoration == "towards":
             like = variables.change
@@ -98,6 +107,7 @@ def start(
     spectrum: Tensor,
     *,
     progress: Callable[[Iterable], Iterable] = iter,
+    watch: Watch = _unwatched,
 ) -> PhaseVariables:
     """The initial element: a lens for the design depth with random Zernike terms; the best smooth element of several
     random starts; or the rings, of any height or in equal steps, nearest to that in phase."""
@@ -128,6 +138,7 @@ def start(
         steps=settings.start_steps,
         seed=settings.seed,
         progress=progress,
+        watch=watch,
     )
     if settings.kind == "smooth":
         return best
@@ -149,10 +160,12 @@ def best_of_starts(
     steps: int,
     seed: int = 0,
     progress: Callable[[Iterable], Iterable] = iter,
+    watch: Watch = _unwatched,
 ) -> PhaseVariables:
     """The lowest minimum of the closed-form error by L-BFGS from random starts; several minima exist.
 
-    variables: new ones at each call; spread: standard deviation of the initial changes; starts 0: unchanged variables.
+    variables: new ones at each call; spread: standard deviation of the initial changes; starts 0: unchanged variables;
+    watch: called with the start, the evaluation, both from 1, and its error.
     """
     best, least = variables(), math.inf
     for number in progress(range(starts)):
@@ -160,10 +173,12 @@ def best_of_starts(
         with torch.no_grad():
             for p in trial.parameters():
                 p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
-        expected = ClosedForm(trial(), config, spectrum)
+        expected, evaluations = ClosedForm(trial(), config, spectrum), itertools.count(1)
 
-        def error(trial=trial, expected=expected) -> Tensor:
-            return expected(trial())
+        def error(trial=trial, expected=expected, number=number, evaluations=evaluations) -> Tensor:
+            found = expected(trial())
+            watch(number + 1, next(evaluations), float(found.detach()))
+            return found
 
         lowest = min(minimise_tensors(list(trial.parameters()), error, steps=steps).values)
         if lowest < least:
@@ -193,6 +208,7 @@ def begin(
     *,
     pictures: str,
     progress: Callable[[Iterable], Iterable] = iter,
+    watch: Watch = _unwatched,
 ) -> tuple[WaveCamera, Run]:
     """The camera at the start of a run, and its folder, where the initial element is stored.
 
@@ -211,7 +227,7 @@ def begin(
         except (KeyError, RuntimeError, TypeError) as error:
             raise DamagedRun(f"{file}: not the start of this run; remove it to compute it again") from error
     else:
-        variables = start(settings, config, spectrum, progress=progress)
+        variables = start(settings, config, spectrum, progress=progress, watch=watch)
         state = {"start": variables.start, "change": variables.change.detach()}
         write_state(file, state)
     network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.words import calling_level
@@ -277,6 +278,9 @@ class Glass:
     comment: str = ""
     records: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<Glass: {', '.join(_description(self))}>"
+
 
 # -- the index --------------------------------------------------------------------------------------------------------
 
@@ -449,22 +453,29 @@ def with_index_errors(
     """
     if glass.formula == "mirror":
         raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
-    own = glass.coefficients.double()
     if not glass.formula.endswith(WITH_ERRORS):
+        if abbe is not None and not has_abbe_number(glass):
+            raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
+        own = glass.coefficients.double()
         numbers = torch.stack([refractive_index(glass, LINES[line]) for line in "dFC"])
         n, v = numbers[0], safe_divide(numbers[0] - 1.0, numbers[1] - numbers[2])
         deviation = own[2] if glass.formula == "model" else torch.zeros_like(n)
         parts = torch.broadcast_tensors(*own.unbind(0), 0 * n, n, v, 0 * n, deviation)
         name = f"{glass.formula}{WITH_ERRORS}"
         glass = dataclasses.replace(glass, formula=name, coefficients=torch.stack(parts), catalog="", status="")
-    parts = list(glass.coefficients.unbind(0))
+    *own, change, n, v, abbe_change, deviation = glass.coefficients.unbind(0)
     if index is not None:
-        parts[-5] = parts[-5] + index
+        change = change + index.double()
     if abbe is not None:
-        if not bool((parts[-3].detach() > 0).all()):
-            raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
-        parts[-2] = parts[-2] + (parts[-3] * abbe / 100 if percent else abbe)
-    return dataclasses.replace(glass, coefficients=torch.stack(torch.broadcast_tensors(*parts)))
+        abbe_change = abbe_change + (v * abbe.double() / 100 if percent else abbe.double())
+    parts = torch.broadcast_tensors(*own, change, n, v, abbe_change, deviation)
+    return dataclasses.replace(glass, coefficients=torch.stack(parts))
+
+
+def has_abbe_number(glass: Glass) -> bool:
+    """Whether a medium has indices at the lines d, F and C that differ."""
+    yellow, blue, red = (refractive_index(glass, LINES[line]).detach() for line in "dFC")
+    return bool(((yellow > 0) & (red > 0) & (blue > red)).all())
 
 
 def label(glass: Glass) -> str:
@@ -475,6 +486,18 @@ def label(glass: Glass) -> str:
     if glass.formula == "model":
         return f"{numbers[0]:.6g}/{numbers[1]:.4g}"
     return f"n {numbers[0]:.6g}" if glass.formula == "constant" and numbers[0] != 1 else ""
+
+
+def _description(glass: Glass) -> list[str]:
+    """Name and catalog, n_d and V_d as its coefficients give them; of a batch the smallest and the largest."""
+    name = label(glass) or ("air" if glass.formula == "constant" and glass.coefficients.dim() == 1 else "no name")
+    words = [f"{name} ({glass.catalog})" if glass.catalog else name]
+    if glass.formula in ("mirror", "constant") or is_functorch_wrapped_tensor(glass.coefficients):
+        return words
+    for symbol, number in (("n_d", nd(glass).detach()), ("V_d", abbe_number(glass).detach())):
+        low, high = (f"{float(extreme):.6g}" for extreme in (number.min(), number.max()))
+        words.append(f"{symbol} {low}" if low == high else f"{symbol} {low} to {high}")
+    return words
 
 
 def mil_glass(code: str) -> Glass:

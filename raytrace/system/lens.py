@@ -95,15 +95,17 @@ def batch_shape(lens: "Lens") -> torch.Size:
     return broadcast_shape(*{*shapes})
 
 
-def aligned(lens: "Lens", axes: int) -> "Lens":
-    """The lens with numbers (…, L) of a batch as (…, L, 1, …), at least so many axes of 1 behind the lenses.
+def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
+    """The lens with numbers (…, L) of a batch as (…, L, 1, …), at least, or exactly, so many axes of 1 behind.
 
     A number that is common to all lenses, or has the axes, stays the same tensor.
     """
 
     def align(number: Tensor, own: int, place: str) -> Tensor:
         missing = own + 1 + axes - number.dim()
-        return number if number.dim() <= own or missing <= 0 else number.reshape(*number.shape, *(1,) * missing)
+        if number.dim() <= own or missing == 0 or (missing < 0 and not exactly):
+            return number
+        return number.reshape(*number.shape[: own + 1], *(1,) * axes)
 
     return _mapped(lens, align)
 

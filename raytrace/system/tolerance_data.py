@@ -122,7 +122,8 @@ class Compensator:
         return Vary(self.surface, self.parameter, self.configuration, self.operand)
 
     def __str__(self) -> str:
-        return f"{self.variable} changes by {self.minimum:g} to {self.maximum:g}"
+        open_ended = self.minimum == -float("inf") and self.maximum == float("inf")
+        return str(self.variable) + ("" if open_ended else f", from {self.minimum:g} to {self.maximum:g}")
 
 
 class Gauge(NamedTuple):

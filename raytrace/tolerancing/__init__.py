@@ -4,6 +4,9 @@ tolerances      `Tolerances`: rows, compensators and the wavelength of the test
 elements        elements and cemented groups of a lens, found from its media and mirrors
 perturbation    `perturbed`: the lens with an error for each row, one lens or many
 sampling        `draw_errors`: random errors, the same for a trial in any batch
+files           `read_tolerances`: the rows of a .zmx file
+study           `tolerance`: sensitivities, expectation by second order, Monte Carlo
+grades          `tolerances`: rows of published grades and of limits
 
 A kind of error is a row of `KINDS` in `system/tolerance_data.py`.
 """

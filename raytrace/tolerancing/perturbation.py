@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.glass import is_air
+from raytrace.materials.glass import has_abbe_number, is_air
 from raytrace.system import configurations
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve
@@ -106,14 +106,14 @@ def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, 
     k = row.surfaces[0]
     gauge = gauges.get(k, Gauge(None, 0.0))
     if row.kind == "parameter":
-        gauge = gauge._replace(path=_path(lens.surfaces[k], row.parameter))
+        gauge = gauge._replace(path=path_of(lens.surfaces[k], row.parameter))
         surfaces[k] = modelled(surfaces[k], row.parameter)
     surfaces[k] = change(surfaces[k], value, row, gauge)
     if row.kind == "thickness" and row.adjust not in (None, k):
         surfaces[row.adjust] = change(surfaces[row.adjust], -value, row, gauge)
 
 
-def _path(nominal: Surface, quantity: str) -> ParameterPath | None:
+def path_of(nominal: Surface, quantity: str) -> ParameterPath | None:
     """Where a surface holds a quantity; None: nowhere."""
     if quantity == "thickness":
         return ParameterPath((quantity,))
@@ -144,7 +144,7 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
     changes = {place: step(place) for place in solves if solves[place].quantity != "glass"}
     for (k, quantity), change in changes.items():
         if change is not None:
-            surface, path = modelled(surfaces[k], quantity), _path(lens.surfaces[k], quantity)
+            surface, path = modelled(surfaces[k], quantity), path_of(lens.surfaces[k], quantity)
             surfaces[k] = with_number(surface, path, number_at(surface, path) + change)
     for (k, quantity), solve in solves.items():
         source = solve.source
@@ -163,7 +163,7 @@ def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
 
 def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
     """How much a number differs from that of the lens; None where it is the same tensor, or none."""
-    old, new, path = lens.surfaces[k], surfaces[k], _path(lens.surfaces[k], quantity)
+    old, new, path = lens.surfaces[k], surfaces[k], path_of(lens.surfaces[k], quantity)
     if old is new or path is None:
         return None
     old, new = (_part(surface, path) for surface in (old, new))
@@ -427,6 +427,8 @@ def _objection(lens: Lens, row: Tolerance, surface: Surface) -> str:
         return "the surface is a plane, whose radius has no error; expected power (fringes) or curvature"
     if row.kind in ("index", "abbe") and (surface.is_mirror or is_air(surface.glass)):
         return f"the surface is {'a mirror' if surface.is_mirror else 'followed by air'}; expected one before glass"
+    if row.kind == "abbe" and not has_abbe_number(surface.glass):
+        return "the medium has no dispersion at the lines d, F and C; expected a glass"
     if row.kind == "thickness" and not bool(torch.isfinite(surface.thickness).all()):
         return "the thickness is infinite"
     return ""

@@ -8,7 +8,7 @@ et al., "Aperture-aware lens design", SIGGRAPH 2024):
 
 Here the pupil is a bundle of arms from a point inside it, and the rule fills each arm from edge to edge, so that both
 terms are the derivative of one sum. An edge ρ of the clear part of an arm is a zero of a clearance c of
-`apertures.clearances`. It is found with traced rays without derivatives. Two Newton steps with a constant slope s,
+`clearances_of`. It is found with traced rays without derivatives. Two Newton steps with a constant slope s,
 ρ - c(ρ)/s, then carry its derivatives.
 
 Where the images of two rims cross in the pupil, ρ has a kink as a function of the angle of the arm, at which the

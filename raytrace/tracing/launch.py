@@ -381,7 +381,10 @@ def _map_of(lens: Lens, field: Tensor) -> Tensor:
     maps = _rotated(maps, torch.cos(angle), torch.sin(angle)).reshape(5, *listed.shape[1:])
     same = (listed == field[:, None]).all(0)
     first = same & (same.to(torch.int64).cumsum(0) == 1)
-    return torch.where(same.any(0), torch.where(first, maps, 0.0).sum(1), _between(listed, maps, field[:, None]))
+    listed_ones, known = torch.where(first, maps, 0.0).sum(1), same.any(0)
+    if not is_any(~known):
+        return listed_ones
+    return torch.where(known, listed_ones, _between(listed, maps, field[:, None]))
 
 
 def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:

@@ -190,31 +190,39 @@ def system_matrix(
     surfaces: Sequence[Surface],
     indices: Sequence[Tensor],
     wavelength: Tensor | None = None,
-    *,
-    to_next: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω from the first vertex, before it, to behind the last surface.
-
-    to_next: up to the vertex that follows it.
 
     The axis is straightened: tilts, decentres and the mean slope of a grating are left out, and what bends differently
     along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
     µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
-    powers = [power(s, n1, n2, wavelength) for s, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True)]
+    powers, gaps = _powers_and_gaps(surfaces, indices, wavelength)
+    return _matrices(powers, gaps[:-1], indices[0])[-1]
+
+
+def _powers_and_gaps(surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None) -> tuple:
+    """Powers in 1/mm of surfaces, and t/n behind each."""
+    pairs = zip(surfaces, indices[:-1], indices[1:], strict=True)
     gaps = [surface.thickness / n for surface, n in zip(surfaces, indices[1:], strict=True)]
-    gaps = gaps if to_next else gaps[:-1]
-    one = torch.ones_like(indices[0])
-    return tuple(one * part for part in brackets(powers, gaps))
+    return [power(surface, before, behind, wavelength) for surface, before, behind in pairs], gaps
+
+
+def _matrices(powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor) -> list[tuple[Tensor, ...]]:
+    """(A, B, C, D) up to before each surface and at last behind the last one: `ynu` of two rays at once."""
+    axes = max(number.dim() for number in (like, *powers, *gaps))
+    y, one = like.new_tensor([1.0, 0.0]).reshape(2, *[1] * axes), torch.ones_like(like)
+    return [(*(one * y).unbind(0), *(one * omega).unbind(0)) for y, omega in ynu(y, y.flip(0), powers, gaps)]
 
 
 def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
     """The system matrices of a lens; n: signed indices (...) from the object's to that before the image."""
     surfaces, stop = lens.surfaces[1:-1], lens.stop - 1
+    powers, gaps = _powers_and_gaps(surfaces, n, wavelength)
+    matrices = _matrices(powers, gaps[:-1], n[0])
     # The stop seen from the front (transfer to its vertex) and from the back.
-    A1, B1, _, _ = system_matrix(surfaces[:stop], n[: stop + 1], wavelength, to_next=True)
-    _, B2, _, D2 = system_matrix(surfaces[stop:], n[stop:], wavelength)
-    return Gaussian(*system_matrix(surfaces, n, wavelength), (A1, B1), (B2, D2), n[0], n[-1])
+    _, B, _, D = _matrices(powers[stop:], gaps[stop:-1], n[0])[-1]
+    return Gaussian(*matrices[-1], matrices[stop][:2], (B, D), n[0], n[-1])
 
 
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:

@@ -287,7 +287,7 @@ def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Ten
 
     Of a batch of lenses (L,) there is an object distance for each, and D is L.
     """
-    lens = aligned(with_object_distance(lens, object_distances), 2)
+    lens = aligned(with_object_distance(lens, object_distances), 2, exactly=True)
     return Scene(lens, fields, wavelengths, memo)
 
 

@@ -162,22 +162,24 @@ class ElementPsf(Result):
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def psf(scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, **sampling) -> ElementPsf:
+def psf(
+    scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, behind: Tensor | None = None, **sampling
+) -> ElementPsf:
     """PSFs of a scene, differentiable in every number of it.
 
     sampling: engine, samples, nodes, tol, pad, band_limit as `plan.plan` takes them, and its errors. plan: of an
     earlier call, instead of them: for loops. memo: sums that do not depend on the heights, reused while the rest of the
-    scene stays as it is.
+    scene stays as it is. behind: `plan.behind` of the same elements and wavelengths, for several depths or windows.
     """
     plan = planning.plan(scene, **sampling) if plan is None else plan
     engine, sums = planning.ENGINES[plan.engine], None
     if engine.prepare is not None:
-        sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
+        sums = engine.prepare(scene, plan, behind) if memo is None else _remembered(memo, scene, plan, engine.prepare)
     return ElementPsf(engine.kernels(scene, sums, plan), scene, plan)
 
 
-def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
-    """`make(scene, plan)` without graph, from memory where nothing but heights and coefficients has changed."""
+def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan, None], Any]) -> Any:
+    """`make(scene, plan, None)` without graph, from memory where nothing but heights and coefficients has changed."""
     numbers, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
     for element in scene.elements:
         free = element.numbers
@@ -190,9 +192,9 @@ def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveSc
         structure = (structure, *kind)
     if torch._C._are_functorch_transforms_active() or any(n.requires_grad for n in numbers):
         memo.made += 1
-        return make(scene, plan)
+        return make(scene, plan, None)
     with torch.no_grad():
-        return memo.find(numbers, (structure, plan), lambda: make(scene, plan), most=_KEPT)
+        return memo.find(numbers, (structure, plan), lambda: make(scene, plan, None), most=_KEPT)
 
 
 COLOURS = (0.46, 0.55, 0.64)
@@ -273,10 +275,9 @@ def wave_psf(
     distances, window = [_double(numbers) for numbers in (sensor, depths, wavelengths)], grid(_double(pixel), size)
     scene = WaveScene(parts, *distances, window, exact)
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
-    kernel, axial = _kernels(scene, chosen, progress), None
-    if size % 2 == 0:  # a corner of four pixels lies on the axis
-        axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
-    return ElementPsf(kernel, scene, chosen, name, axial)
+    windows = [window, grid(_double(pixel), 1)] if size % 2 == 0 else [window]  # a corner of four pixels on the axis
+    kernel, *axial = _kernels(scene, windows, chosen, progress)
+    return ElementPsf(kernel, scene, chosen, name, axial[0][..., 0, 0] if axial else None)
 
 
 def elements(
@@ -332,21 +333,33 @@ def elements(
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
 
 
-def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
-    """All kernels at once, or one after the other where that would take too much memory."""
+def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: Progress) -> list[Tensor]:
+    """The kernels (D, W, rows, columns) of each window, of which that of the scene is the largest.
+
+    All at once, or one after the other where that would take too much memory.
+    """
     D, W = len(scene.depths), len(scene.wavelengths)
     whole = chosen.memory < min(_CHUNK, allowed_bytes())
     helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
+
+    def each(part: WaveScene, behind: Tensor | None) -> list[Tensor]:
+        scenes = (dataclasses.replace(part, grid=window) for window in windows)
+        return [psf(one, plan=chosen, behind=behind).kernel for one in scenes]
+
     if whole:
-        return psf(scene, plan=chosen).kernel
-    kernels = []
-    for d, w in progress([(d, w) for d in range(D) for w in range(W)], "kernel"):
+        return each(scene, planning.behind(scene, chosen))
+    kernels, behind = [], None
+    for w, d in progress([(w, d) for w in range(W) for d in range(D)], "kernel"):
         point = {"depths": scene.depths[d : d + 1], "wavelengths": scene.wavelengths[w : w + 1]}
-        kernels.append(psf(dataclasses.replace(scene, **point), plan=chosen).kernel)
-    return torch.cat(kernels).reshape(D, W, *scene.grid.shape)
+        part = dataclasses.replace(scene, **point)
+        if d == 0:
+            behind = None  # frees the light of the last wavelength first
+            behind = planning.behind(part, chosen)
+        kernels.append(each(part, behind))
+    return [torch.cat(found).unflatten(0, (W, D))[:, :, 0].movedim(1, 0) for found in zip(*kernels, strict=True)]
 
 
 @torch.no_grad()

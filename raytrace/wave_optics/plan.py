@@ -571,11 +571,16 @@ def _aligned(scene: WaveScene, s: Setting, samples: int) -> tuple[int, float]:
     return across * math.ceil(samples * extent / across), extent
 
 
-def _pupil_sums(scene: WaveScene, plan: Plan) -> pupil.PupilSums | mixed.MixedSums:
+def behind(scene: WaveScene, plan: Plan) -> Tensor | None:
+    """The light behind the elements that all depths and windows of a scene share; None where the plan has none."""
+    return pupil.behind_pixels(scene, plan.parts) if plan.engine == "pupil" and plan.cells == "flat" else None
+
+
+def _pupil_sums(scene: WaveScene, plan: Plan, behind: Tensor | None) -> pupil.PupilSums | mixed.MixedSums:
     if plan.cells == "mixed":
         return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
     if plan.cells == "flat":
-        return pupil.prepare_pixels(scene, plan.nodes, plan.inner, parts=plan.parts)
+        return pupil.prepare_pixels(scene, plan.nodes, plan.inner, parts=plan.parts, behind=behind)
     return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
 
 
@@ -600,12 +605,13 @@ class Engine(NamedTuple):
     """A way from the elements to the pixels.
 
     plan: (scene, its numbers, the request) -> Plan, with cost and error; kernels: (scene, sums, plan) -> light in the
-    pixels (D, W, rows, columns); prepare: (scene, plan) -> sums that the heights do not change, if any.
+    pixels (D, W, rows, columns); prepare: (scene, plan, light of `behind` or None) -> sums that the heights do not
+    change, if any.
     """
 
     plan: Callable[..., Plan]
     kernels: Callable[[WaveScene, Any, Plan], Tensor]
-    prepare: Callable[[WaveScene, Plan], Any] | None = None
+    prepare: Callable[[WaveScene, Plan, Tensor | None], Any] | None = None
 
 
 ENGINES = {
@@ -615,7 +621,7 @@ ENGINES = {
     "radial": Engine(
         _radial,
         lambda scene, sums, plan: propagation.radial_kernels(scene, sums),
-        lambda scene, plan: propagation.prepare_radial(scene, plan.samples, propagation.order_of(scene, plan.nodes)),
+        lambda scene, plan, _: propagation.prepare_radial(scene, plan.samples, propagation.order_of(scene, plan.nodes)),
     ),
     # Paraboloids, true spheres; light that wraps round, or that the band limit cuts off.
     "fresnel": Engine(_transfer, _transfer_kernels),

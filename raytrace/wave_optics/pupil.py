@@ -29,13 +29,14 @@ _MARGIN = 3  # cells beyond the aperture: half the points of the interpolation a
 class PupilSums:
     """Sums that do not depend on the heights: the matrices of the transform and the cells of the aperture.
 
-    x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell; sphere: (D, N, N) mm or None where
-    the matrices hold it; along_x: (W, X, N) or (D, W, X, N), along_y likewise, or if `folded` cosine and sine of one
-    half of the points of both axes, (2, W, X/2, N/2); pixel: (n,) weights of the nodes in a pixel of the sensor.
+    x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell, or behind the element as of
+    `behind_pixels`, where x and y are None; sphere: (D, N, N) mm or None where the matrices hold it; along_x: (W, X, N)
+    or (D, W, X, N), along_y likewise, or if `folded` cosine and sine of one half of the points of both axes,
+    (2, W, X/2, N/2); pixel: (n,) weights of the nodes in a pixel of the sensor.
     """
 
-    x: Tensor
-    y: Tensor
+    x: Tensor | None
+    y: Tensor | None
     weight: Tensor
     sphere: Tensor | None
     along_x: Tensor
@@ -88,29 +89,57 @@ def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> tuple[Tensor, Tensor, 
     return along(u), along(v), pixel, folded
 
 
-def prepare_pixels(scene: WaveScene, nodes: int, inner: int, *, parts: int = 1) -> PupilSums:
+def prepare_pixels(
+    scene: WaveScene, nodes: int, inner: int, *, parts: int = 1, behind: Tensor | None = None
+) -> PupilSums:
     """The same for one map of flat pixels, each cut into parts × parts cells for the edge of the aperture.
 
-    inner: Gauss nodes for the paraboloid and the plane wave across a cell.
+    inner: Gauss nodes for the paraboloid and the plane wave across a cell; behind: of `behind_pixels`, if it is known.
     """
-    R, z, wavelength = aperture(scene), scene.sensor_distance, millimetres(scene)
-    profile = scene.elements[0].profile
+    x, y, pitch = _lattice(scene, parts)
+    u, v, pixel = sub_pixels(scene.grid, nodes)
+    along = [_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v))]
+    if behind is not None:
+        return PupilSums(None, None, behind, None, *along, pixel)
+    weight = _light_of_pixels(scene, x, y, pitch)
+    return PupilSums(*torch.broadcast_tensors(x, y[:, None]), weight, None, *along, pixel)
+
+
+def behind_pixels(scene: WaveScene, parts: int) -> Tensor:
+    """Light (W, N, N) in the cells of `prepare_pixels` with the phase of the element, for all depths and windows."""
+    x, y, pitch = _lattice(scene, parts)
+    weight = _light_of_pixels(scene, x, y, pitch)
+    return _delayed(scene, weight, *torch.broadcast_tensors(x, y[:, None]))
+
+
+def _lattice(scene: WaveScene, parts: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres x (X,), y (Y,) mm of the cells of one map of pixels, and their pitch."""
+    profile, R = scene.elements[0].profile, aperture(scene)
     pitch = profile.pitch / parts
     counts = (parts * cells_across(profile.pitch, n, R) for n in profile.heights.shape[::-1])
     x, y = (pitch * (torch.arange(n, dtype=R.dtype, device=R.device) - 0.5 * (n - 1)) for n in counts)
-    weight = covered(x, y, pitch, R) / (z * math.sqrt(math.pi) * R)
-    u, v, pixel = sub_pixels(scene.grid, nodes)
-    along = [_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v))]
-    x, y = torch.broadcast_tensors(x, y[:, None])
-    return PupilSums(x, y, weight / wavelength[:, None, None], None, *along, pixel)
+    return x, y, pitch
+
+
+def _light_of_pixels(scene: WaveScene, x: Tensor, y: Tensor, pitch: Tensor) -> Tensor:
+    """Light (W, Y, X) through the part of each cell that lies in the aperture."""
+    R = aperture(scene)
+    weight = covered(x, y, pitch, R) / (scene.sensor_distance * math.sqrt(math.pi) * R)
+    return weight / millimetres(scene)[:, None, None]
+
+
+def _delayed(scene: WaveScene, weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    waves = path(scene.elements, x, y, scene.wavelengths)
+    return weight * phasor(waves / millimetres(scene)[:, None, None])
 
 
 def intensity(scene: WaveScene, sums: PupilSums) -> Tensor:
     """Light per mm² (D, W, Y, X) at the nodes of the pixels, 1 = all through the aperture."""
+    if sums.x is None:
+        return light_of(scene, sums, sums.weight)
     if sums.sphere is None:
-        waves = path(scene.elements, sums.x, sums.y, scene.wavelengths)
-    else:
-        waves = residual(scene, sums.x, sums.y, sums.sphere)
+        return light_of(scene, sums, _delayed(scene, sums.weight, sums.x, sums.y))
+    waves = residual(scene, sums.x, sums.y, sums.sphere)
     return light_of(scene, sums, sums.weight * phasor(waves / millimetres(scene)[:, None, None]))
 
 

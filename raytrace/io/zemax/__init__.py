@@ -4,6 +4,7 @@ surfaces          the tables: keywords, values with path, unit and operand (`ROW
 read              the system, and the lens
 configurations    multi-configuration operands, read; environments of surfaces, read and written
 optimization      variables, solves, pickups, merit function and tolerances, read and written
+tolerances        the lines of tolerances as rows
 write             the system, surfaces, apertures and operands, written; the unit of the file
 archive           members of a .zar archive, unpacked
 

@@ -1,0 +1,290 @@
+"""Tolerances of a .zmx file: the lines behind its merit function, as rows.
+
+    TOL TRAD   1   0           -0.2            0.2   0 0 0        operand, two whole numbers, minimum, maximum, a third
+    TCMM Default radius tolerances.                               comment on the line above
+
+As OpticStudio's help has them, in the unit of length of the file, degrees and fringes at TWAV's wavelength:
+
+    COMP surface code       compensator: 0 thickness, 1 curvature, 2 conic
+    CPAR surface parameter  compensator: PARM of a surface; CMCO row configuration: an operand of configurations
+    TWAV 0 0 µm             wavelength of fringes
+    TTHI surface adjuster   the adjuster's thickness changes by the opposite; none if it is the surface itself
+    TEDX first last         of an element; TETX … about the vertex of its first surface
+    TEZI surface most - … least   Noll's terms from the third whole number (2 where it is 0) to the second; their RMS is
+                            the maximum, and each has the share RMS/√terms
+    TIRR surface            and an angle of its astigmatism, which is uniform
+    STAT n sigmas           distribution of the lines below: 0 normal, 1 uniform, 2 parabolic
+    SAVE number             the lens of the line above is saved under that number
+
+Every other operand is listed with the reason why it is not read.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import PurePath
+from typing import NamedTuple
+
+from raytrace.io.source import LensFileError, Place, Record
+from raytrace.io.zemax.surfaces import in_millimetres, type_of, types
+from raytrace.system.configurations import count
+from raytrace.system.lens import Lens
+from raytrace.system.shapes import EVEN
+from raytrace.system.shapes import KINDS as KINDS_OF_SAG
+from raytrace.system.surface import is_even
+from raytrace.system.tolerance_data import KINDS, TEST_WAVELENGTH, Compensator, Tolerance
+
+#: Kinds by their operands; those with further rules are read by functions.
+_KINDS = {operand: name for name, kind in KINDS.items() for operand in kind.operand.split()}
+_DISTRIBUTIONS = {0: "normal", 1: "uniform", 2: "parabolic"}
+_COMPENSATORS = {0: "thickness", 1: "curvature", 2: "conic"}
+_BREAKS = {"TUDX": "x", "TUDY": "y", "TUTX": "tilt_x", "TUTY": "tilt_y", "TUTZ": "tilt_z"}
+_SIGMAS = 2.0
+
+#: Operands that are known and not read, with the reason.
+_UNREAD = {
+    "TOFF": "off",
+    "NOP": "off",
+    "TSDI": "a semi-diameter clips no ray by itself",
+    "TSDR": "a radial decentre, at a random angle; TSDX and TSDY are read",
+    "TEDR": "a radial decentre, at a random angle; TEDX and TEDY are read",
+    "TARX": "a roll at a random angle; TETX and TETY are read",
+    "TRLX": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
+    "TRLY": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
+    "TRLR": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
+    "TEXI": "irregularity by random fringe terms; TEZI is read",
+    "TPAI": "the inverse of a parameter",
+    "TEDV": "an extra datum",
+    "TNPA": "a parameter of non-sequential objects",
+    "TNPS": "a position of a non-sequential object",
+    "TNMA": "material of a non-sequential object",
+    "TMCS": "a multi-configuration offset",
+    "TCMU": "a coating",
+    "TCIO": "a coating",
+    "TCEO": "a coating",
+    "CEDV": "an extra datum",
+    "CNPA": "a parameter of non-sequential objects",
+    "CNPS": "a position of a non-sequential object",
+    "SEED": "the seed is an option of the Monte Carlo analysis",
+    "MPVT": "the pivot of a tilt other than the vertex of the first surface",
+}
+
+
+class ToleranceLines(NamedTuple):
+    """The tolerances of a file: rows, compensators, wavelength in µm, saved rows (row, number), and lines not read."""
+
+    rows: tuple[Tolerance, ...]
+    compensators: tuple[Compensator, ...]
+    test_wavelength: float
+    saves: tuple[tuple[int, int], ...]
+    unread: tuple[str, ...]
+
+
+def read_lines(lens: Lens, lines: Sequence[str], file: str = "", numbers: Sequence[int] = ()) -> ToleranceLines:
+    """The tolerances of the lines of a lens (`OptimizationData.tolerances`).
+
+    numbers: their lines in the file, for messages. Raises LensFileError naming file, line and operand.
+    """
+    reader = _Reader(lens)
+    for k, line in enumerate(lines):
+        keyword, *words = line.split()
+        if keyword != "TOL" or not words:
+            continue  # a comment on the line above
+        place = Place(file or "tolerance line", numbers[k] if k < len(numbers) else k + 1)
+        reader.read(Record(words[0], tuple(words[1:]), line, place))
+    return reader.result()
+
+
+def _source(record: Record) -> str:
+    """File name and line."""
+    return f"{PurePath(record.place.file).name}:{record.place.line}"
+
+
+class _Reader:
+    """The rows while lines are read; `distribution` and `sigmas` are those of the last STAT."""
+
+    def __init__(self, lens: Lens):
+        self.lens, self.data = lens, lens.optimization_data
+        self.unit = 1.0 if self.data is None else self.data.unit
+        self.distribution, self.sigmas, self.wavelength = "normal", _SIGMAS, TEST_WAVELENGTH
+        self.rows: list[Tolerance] = []
+        self.compensators: list[Compensator] = []
+        self.saves: list[tuple[int, int]] = []
+        self.unread: list[str] = []
+
+    def result(self) -> ToleranceLines:
+        rows = tuple(self.rows)
+        return ToleranceLines(rows, tuple(self.compensators), self.wavelength, tuple(self.saves), tuple(self.unread))
+
+    def read(self, record: Record) -> None:
+        name = record.keyword
+        if name == "TWAV":
+            self.wavelength = self._positive(record, 2, "test wavelength in µm")
+        elif name == "STAT":
+            self._statistics(record)
+        elif name == "SAVE":
+            if self.rows:
+                self.saves.append((len(self.rows) - 1, record.integer(0, "number of the file", 0)))
+        elif name in ("COMP", "CPAR", "CMCO"):
+            self._compensator(record)
+        elif name == "TMCO":
+            self._operand(record)
+        elif name == "TEZI":
+            self._zernike(record)
+        elif name == "TPAR" or name in _BREAKS:
+            self._parameter(record)
+        elif name in _KINDS:
+            self._row(record, _KINDS[name])
+        else:
+            self._leave(record, _UNREAD.get(name, "an operand that is not known"))
+
+    def _leave(self, record: Record, reason: str) -> None:
+        self.unread.append(f"{record.place}: {record.keyword}: {reason}")
+
+    def _add(self, record: Record, kind: str, surfaces: tuple[int, ...], low: float, high: float, **more) -> None:
+        if low > high:
+            raise LensFileError(f"{record.keyword}: minimum {low:g} above maximum {high:g}", record.place)
+        given = {"distribution": self.distribution, "sigmas": self.sigmas, "source": _source(record)}
+        self.rows.append(Tolerance(kind, surfaces, low, high, **(given | more)))
+
+    def _limits(self, record: Record, power: int = 0) -> tuple[float, float]:
+        low, high = record.number(2, "minimum"), record.number(3, "maximum")
+        return in_millimetres(low, power, self.unit), in_millimetres(high, power, self.unit)
+
+    def _surface(self, record: Record, position: int, last: int | None = None) -> int:
+        k = record.integer(position, "surface")
+        last = len(self.lens.surfaces) - 1 if last is None else last
+        if not 0 <= k <= last:
+            raise LensFileError(f"{record.keyword}: surface {k}; this lens has surfaces 0 to {last}", record.place)
+        return k
+
+    def _positive(self, record: Record, position: int, quantity: str) -> float:
+        number = record.number(position, quantity)
+        if not number > 0:
+            raise LensFileError(f"{record.keyword}: {quantity} is {number:g}, expected more than 0", record.place)
+        return number
+
+    def _row(self, record: Record, kind: str) -> None:
+        low, high = self._limits(record, KINDS[kind].length)
+        more, first = {}, self._surface(record, 0)
+        surfaces = (first,)
+        if KINDS[kind].elements:
+            surfaces = (first, self._surface(record, 1) or first)
+            if surfaces[1] < first:
+                raise LensFileError(f"{record.keyword}: last surface {surfaces[1]} before {first}", record.place)
+        elif kind == "thickness":
+            adjuster = self._surface(record, 1, len(self.lens.surfaces) - 2)
+            more = {} if adjuster == first else {"adjust": adjuster}
+        elif kind == "radius" and record.integer(1, "unit", 0) == 1:  # in % of the radius
+            (low, high), more = self._limits(record), {"unit": "%"}
+        if kind == "irregularity_angle":
+            kind = "irregularity"
+        self._add(record, kind, surfaces, low, high, **more)
+        if kind == "irregularity":
+            self._add(record, "irregularity_angle", surfaces, -90.0, 90.0, distribution="uniform")
+
+    def _statistics(self, record: Record) -> None:
+        code, sigmas = record.integer(0, "distribution", 0), record.number(1, "standard deviations", 0.0)
+        if code not in _DISTRIBUTIONS:
+            self._leave(record, f"distribution {code}, of a table of the user; {self.distribution} is kept")
+            return
+        if sigmas < 0:
+            raise LensFileError(f"STAT: {sigmas:g} standard deviations, expected more than 0", record.place)
+        self.distribution, self.sigmas = _DISTRIBUTIONS[code], sigmas or _SIGMAS
+
+    def _compensator(self, record: Record) -> None:
+        limits = {"minimum": record.number(2, "minimum", 0.0), "maximum": record.number(3, "maximum", 0.0)}
+        limits = {name: number for name, number in limits.items() if number}
+        source = _source(record)
+        if record.keyword == "CMCO":
+            operand, configuration = self._place_of_operand(record)
+            number = self.lens.operands[operand].number
+            one = Compensator(number, configuration=configuration, operand=operand, source=source, **limits)
+        elif record.keyword == "CPAR":
+            place = self._name(record)
+            if place is None:
+                return
+            k, name, scale = place
+            scaled = {key: number * scale for key, number in limits.items()}
+            one = Compensator(k, name, source=source, **scaled)
+        else:
+            k, code = self._surface(record, 0), record.integer(1, "code", 0)
+            if code not in _COMPENSATORS:
+                self._leave(record, f"compensator {code}; expected 0 (thickness), 1 (curvature) or 2 (conic)")
+                return
+            name = _COMPENSATORS[code]
+            power = {"thickness": 1, "curvature": -1, "conic": 0}[name]
+            scaled = {key: in_millimetres(number, power, self.unit) for key, number in limits.items()}
+            one = Compensator(k, name, source=source, **scaled)
+        self.compensators.append(one)
+
+    def _place_of_operand(self, record: Record) -> tuple[int, int]:
+        row, configuration = record.integer(0, "row of the operands"), record.integer(1, "configuration")
+        operands, most = self.lens.operands, count(self.lens.operands)
+        if not 1 <= row <= len(operands):
+            message = f"row {row}; this lens has {len(operands)} operands of configurations"
+            raise LensFileError(f"{record.keyword}: {message}", record.place)
+        if not 1 <= configuration <= most:
+            message = f"configuration {configuration}; this lens has configurations 1 to {most}"
+            raise LensFileError(f"{record.keyword}: {message}", record.place)
+        return row - 1, configuration
+
+    def _operand(self, record: Record) -> None:
+        operand, configuration = self._place_of_operand(record)
+        held = self.lens.operands[operand]
+        if held.numbers is None:
+            self._leave(record, f"operand {held} is no number")
+            return
+        path = held.paths[0].path if held.paths else ()
+        power = {"thickness": 1, "curvature": -1}.get(path[2], 0) if len(path) == 3 else 0
+        power = 1 if path[-1:] in (("x",), ("y",)) and "before" in path else power
+        low, high = self._limits(record, power)
+        surfaces = (held.number,) if held.number else ()
+        self._add(record, "operand", surfaces, low, high, operand=operand, configuration=configuration)
+
+    def _zernike(self, record: Record) -> None:
+        k, most = self._surface(record, 0), record.integer(1, "highest term")
+        rms, least = self._limits(record, 1)[1], record.integer(4, "lowest term", 0) or 2
+        if not 2 <= least <= most <= 231:
+            message = f"terms {least} to {most}, expected numbers of Noll's from 2 to 231"
+            raise LensFileError(f"TEZI: {message}", record.place)
+        if rms < 0:
+            raise LensFileError(f"TEZI: an RMS of {rms:g}, expected 0 or more", record.place)
+        share = rms / math.sqrt(most - least + 1)
+        for term in range(least, most + 1):
+            group = _source(record) if most > least else ""
+            self._add(record, "zernike", (k,), -share, share, term=term, group=group)
+
+    def _parameter(self, record: Record) -> None:
+        if record.keyword in _BREAKS:
+            k, name = self._surface(record, 0), _BREAKS[record.keyword]
+            if not self.lens.surfaces[k].is_break:
+                message = f"surface {k} is no coordinate break; TEDX … and TETX … move others"
+                raise LensFileError(f"{record.keyword}: {message}", record.place)
+            length = name in ("x", "y")
+            low, high = self._limits(record, int(length))
+            self._add(record, "parameter", (k,), low, high, parameter=name, unit="mm" if length else "degrees")
+            return
+        place = self._name(record)
+        if place is None:
+            return
+        k, name, scale = place
+        low, high = sorted(number * scale for number in self._limits(record))
+        unit = "degrees" if name.startswith("tilt") else "mm" if name in ("x", "y", "z") else ""
+        self._add(record, "parameter", (k,), low, high, parameter=name, unit=unit)
+
+    def _name(self, record: Record) -> tuple[int, str, float] | None:
+        """Surface and name of PARM j, and the number of the lens in that of the file; None: it is not read."""
+        k, j = self._surface(record, 0), record.integer(1, "parameter")
+        surface = self.lens.surfaces[k]
+        row = types().get(type_of(surface) or "")
+        if row is not None:
+            numbers = row.numbers(surface)._replace(size=surface.semi_diameter)
+            names, _ = row.names(surface, numbers, "PARM", j)
+            power = row.power("PARM", j)
+            if len(names) == 1 and isinstance(power, int):
+                (name, factor), *_ = names.items()
+                return k, name, factor * in_millimetres(1.0, power, self.unit)
+        if is_even(surface) and surface.kind == EVEN and 1 <= j <= KINDS_OF_SAG[EVEN].parameters:
+            return k, f"a{2 * j}", in_millimetres(1.0, 1 - 2 * j, self.unit)
+        self._leave(record, f"parameter {j} of surface {k} is no single number of the lens")
+        return None

@@ -1,0 +1,35 @@
+"""The tolerances of a lens file: those of its own lines."""
+
+from os import PathLike, fspath
+from pathlib import Path
+
+from raytrace.io import read_lens
+from raytrace.io.source import LensFileError, Place, read_text
+from raytrace.io.zemax.surfaces import records
+from raytrace.io.zemax.tolerances import read_lines
+from raytrace.system.lens import Lens
+from raytrace.tolerancing.tolerances import Tolerances
+
+
+def read_tolerances(path: str | PathLike, **options) -> Tolerances:
+    """The tolerances of a .zmx file: TRAD, TTHI, TETX … as rows, COMP and CPAR as compensators, TWAV, STAT, SAVE.
+
+    options: of `read_lens`. Operands that are not read are listed in `unread`, each with the reason; see [Tolerances](
+    tolerances.md) for what each operand means. Raises LensFileError with file, line and operand.
+    """
+    lens, file = read_lens(path, **options), fspath(path)
+    if lens.optimization_data is None or not lens.optimization_data.tolerances:
+        raise LensFileError("no lines of tolerances (TOL); give limits or a grade by `tolerances`", Place(file))
+    numbers = []
+    if Path(path).suffix.lower() == ".zmx":
+        numbers = [record.place.line for record in records(read_text(Path(path)), file) if record.keyword in _LINES]
+    return Tolerances(*read_lines(lens, lens.optimization_data.tolerances, file, numbers))
+
+
+_LINES = ("TOL", "TCMM")
+
+
+def tolerances_of(lens: Lens) -> Tolerances:
+    """The tolerances of the file that a lens comes from; none where it has no lines of them."""
+    lines = () if lens.optimization_data is None else lens.optimization_data.tolerances
+    return Tolerances(*read_lines(lens, lines, lens.name))

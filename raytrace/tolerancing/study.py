@@ -1,0 +1,510 @@
+"""Tolerancing: sensitivities, the expectation of the lens as built, and its distribution by Monte Carlo.
+
+The criterion f of a lens with errors e and compensators c is √q, q its mean square, or q itself; the lens as built has
+the compensators that minimise the mean square q_c. Of one trial they come from Newton's method with the exact gradient
+and differences of gradients, all lenses of a batch at once.
+
+Second order: with g and H the derivatives of q by the errors, H those of differences of exact gradients and with the
+compensators eliminated,
+
+    H = q_ee - q_ec q_cc⁻¹ q_ce,     E[q] = q₀ + g·m + ½ (tr(H Σ) + m·H m),
+
+m and Σ the means and variances of the errors. The distribution of f is that of the root of the same quadratic form.
+Source: Koch, Wimmer and others on wavefront differentials; Rimmer, Appl. Opt. 9, 533 (1970).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.special import ndtr
+from torch import Tensor
+
+from raytrace.maths.numerics import value
+from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.sampling import gauss_rings
+from raytrace.plotting.style import GREY, INK, new_figure, styled
+from raytrace.shards import Share, total
+from raytrace.stores import Kind, Records, listed, number, record, whole
+from raytrace.system.identity import digest, identity
+from raytrace.system.lens import Lens, aligned, field_points
+from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, with_number
+from raytrace.system.tolerance_data import Compensator, Tolerance
+from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
+from raytrace.tolerancing.perturbation import path_of, perturbed
+from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tracing.scene import scene
+from raytrace.tracing.spot import image_rays, spot_of_points
+from raytrace.tracing.wavefront import wavefront_of, without
+
+_STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
+_NEWTON = 3  # steps of the compensators
+_CHUNK = 256  # lenses traced at once
+_MODEL = 2**15  # draws of the second-order model
+#: Percentages of the table of percentiles.
+PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Criterion:
+    """What is judged: its unit, its mean square q of a batch (L,), and the criterion itself of q."""
+
+    name: str
+    unit: str
+    square: Callable[[Lens, "Sampling"], Tensor]
+    of_square: Callable[[Tensor], Tensor] = torch.sqrt
+
+
+@value
+class Sampling:
+    """Fields (2, F) with weights (F,), and pupil points (2, P) with weights (P,)."""
+
+    fields: Tensor
+    field_weights: Tensor
+    points: Tensor
+    weights: Tensor
+
+
+def _mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field."""
+    rays = image_rays(lens, sampling.points, fields=sampling.fields)
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    hits, valid = rays.position[:2].flatten(-2), rays.valid.flatten(-2)
+    spots = spot_of_points(hits, valid, (shares[:, None] * sampling.weights).flatten())
+    return 1e6 * (sampling.field_weights * spots.mean_square_radius).sum(-1)
+
+
+def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square (L,) of the OPD about its mean and tilt, waves²."""
+    distance = lens.surfaces[0].thickness.reshape(-1).expand(lens.count or 1)
+    front = wavefront_of(scene(lens, sampling.fields, distance, lens.wavelengths), sampling.points, sampling.weights)
+    flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
+    share = front.energy / front.energy.sum(-1, keepdim=True)
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    return (sampling.field_weights * ((share * flat * flat).sum(-1) * shares).sum(-1)).sum(-1)
+
+
+#: Criteria by name.
+CRITERIA = {
+    "rms": Criterion("RMS spot radius", "µm", _mean_square_radius),
+    "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
+}
+
+
+class Study:
+    """A lens with its tolerances, as functions of errors (L, N) and changes (L, C) of compensators.
+
+    lens: nominal; sampling: as `Sampling`.
+    """
+
+    def __init__(self, lens: Lens, tolerances: Tolerances, criterion: Criterion, sampling: Sampling):
+        self.lens, self.tolerances, self.criterion, self.sampling = lens, tolerances, criterion, sampling
+        self.compensators = tolerances.compensators
+        for one in self.compensators:
+            _check(lens, one)
+        like = lens.wavelengths
+        self.least = like.new_tensor([one.minimum for one in self.compensators])
+        self.most = like.new_tensor([one.maximum for one in self.compensators])
+        self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
+
+    def square(self, errors: Tensor, changes: Tensor) -> Tensor:
+        """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
+        lens = with_changes(perturbed(self.lens, self.tolerances, errors), self.compensators, changes)
+        return self.criterion.square(aligned(lens, 3), self.sampling)
+
+    def slope(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """q (L,) and its derivatives by the errors (L, N) and the compensators (L, C)."""
+        with torch.enable_grad():
+            errors, changes = (x.detach().requires_grad_() for x in (errors, changes))
+            q = self.square(errors, changes)
+            found = torch.autograd.grad(q.sum(), (errors, changes), allow_unused=True)
+        by_errors, by_changes = (
+            torch.zeros_like(x) if g is None else g for g, x in zip(found, (errors, changes), strict=True)
+        )
+        return q.detach(), by_errors, by_changes
+
+    def slope_of_compensators(self, errors: Tensor, changes: Tensor) -> Tensor:
+        """Derivatives (L, C) of q by the compensators."""
+        with torch.enable_grad():
+            changes = changes.detach().requires_grad_()
+            q = self.square(errors, changes)
+            found = torch.autograd.grad(q.sum(), changes, allow_unused=True)[0] if q.requires_grad else None
+            return torch.zeros_like(changes) if found is None else found
+
+    def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
+        """q (L,) with the compensators that minimise it, and their changes (L, C)."""
+        changes = errors.new_zeros(len(errors), len(self.compensators))
+        if not self.compensators:
+            with torch.no_grad():
+                return self.square(errors, changes), changes
+        curvature = self.nominal_curvature()
+        for _ in range(_NEWTON):
+            slopes = self.slope_of_compensators(errors, changes)
+            step = torch.linalg.solve(curvature, slopes[..., None])[..., 0]
+            changes = torch.clamp(changes - step, self.least, self.most)
+            if not bool((step.abs() > 1e-9 * (1 + changes.abs())).any()):
+                break
+        with torch.no_grad():
+            return self.square(errors, changes), changes
+
+    def nominal_curvature(self) -> Tensor:
+        """q_cc (C, C) of the nominal lens, by differences of gradients."""
+        if not hasattr(self, "_curvature"):
+            count = len(self.compensators)
+            zero = self.half.new_zeros(2 * count, len(self.half))
+            steps = self.scale_of_compensators()
+            moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
+            slopes = self.slope_of_compensators(zero, moved)
+            found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
+            self._curvature = 0.5 * (found + found.T)
+            dead = torch.diagonal(self._curvature) <= 0
+            if bool(dead.any()):
+                one = self.compensators[int(dead.int().argmax())]
+                raise BadTolerance(f"compensator {one}: it does not improve the criterion; leave it out")
+        return self._curvature
+
+    def scale_of_compensators(self) -> Tensor:
+        """Steps (C,) of the differences by the compensators."""
+        steps = [1e-3 if one.parameter == "thickness" else 1e-6 for one in self.compensators]
+        return self.half.new_tensor(steps)
+
+    def second_order(self) -> tuple[float, Tensor, Tensor]:
+        """q₀, g (N,) and H (N, N) of the compensated q by errors, of the nominal lens with its best compensators."""
+        count, others = len(self.half), len(self.compensators)
+        _, best = self.compensated(self.half.new_zeros(1, count))
+        steps = torch.cat([_STEP * self.half, self.scale_of_compensators()])
+        places = torch.diag(steps)
+        moved = torch.cat([places, -places])
+        moved[:, count:] += best
+        slopes = [self.slope(part[:, :count], part[:, count:]) for part in moved.split(_CHUNK)]
+        both = torch.cat([torch.cat(found[1:], -1) for found in slopes])
+        whole = (both[: count + others] - both[count + others :]) / (2 * steps[:, None])
+        whole = 0.5 * (whole + whole.T)
+        q, slope, _ = self.slope(self.half.new_zeros(1, count), best)
+        H = whole[:count, :count]
+        if others:
+            mixed = whole[:count, count:]
+            H = H - mixed @ torch.linalg.solve(whole[count:, count:], mixed.T)
+        return float(q), slope[0], H
+
+
+def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tensor) -> Lens:
+    """The lens with compensators moved by (L, C)."""
+    surfaces = list(lens.surfaces)
+    for one, change in zip(compensators, changes.unbind(-1), strict=True):
+        surface = modelled(surfaces[one.surface], one.parameter)
+        path = path_of(surface, one.parameter)
+        surfaces[one.surface] = with_number(surface, path, number_at(surface, path) + change.reshape(-1, 1, 1, 1))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def _check(lens: Lens, one: Compensator) -> None:
+    if one.operand is not None:
+        raise BadTolerance(f"compensator {one}: operands of configurations are not adjusted; tolerance a configuration")
+    if not 0 <= one.surface < len(lens.surfaces) - 1:
+        raise BadTolerance(f"compensator {one}: this lens has surfaces 0 to {len(lens.surfaces) - 2}")
+    surface = lens.surfaces[one.surface]
+    if path_of(surface, one.parameter) is None:
+        known = ", ".join(["thickness", *parameter_paths(modelled(surface, one.parameter))])
+        raise BadTolerance(f"compensator {one}: the surface does not have it; expected {known}")
+
+
+def moments(row: Tolerance) -> tuple[float, float]:
+    """Mean and variance of the error of a row."""
+    middle, half = 0.5 * (row.minimum + row.maximum), 0.5 * (row.maximum - row.minimum)
+    if row.distribution == "normal":
+        s = row.sigmas
+        density = math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi)
+        return middle, (half / s) ** 2 * (1 - 2 * s * density / (2 * float(ndtr(s)) - 1))
+    return middle, half * half * {"uniform": 1 / 3, "parabolic": 3 / 5, "end_points": 1.0}[row.distribution]
+
+
+@value
+class Toleranced(Result):
+    """The lens as built.
+
+    nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
+    of the criterion by each tolerance at its limits, compensated; slope: (N,) its derivative times the half width.
+    estimated: () nominal + √Σ ½(Δmin² + Δmax²), as OpticStudio. expected: () the mean of the criterion by second order;
+    expected_square: () that of its square. predicted: (K,) draws of the second-order model. trials: (T,) the criterion
+    of the perturbed and compensated lenses, nan where no ray arrives; changes: (T, C) of the compensators.
+    target: () the criterion that `yield_` of the lenses meet.
+    """
+
+    lens: Lens
+    tolerances: object
+    criterion: str
+    unit: str
+    nominal: Tensor
+    minimum: Tensor
+    maximum: Tensor
+    slope: Tensor
+    estimated: Tensor
+    expected: Tensor
+    expected_square: Tensor
+    predicted: Tensor
+    trials: Tensor
+    changes: Tensor
+    seed: int = 0
+
+    COLUMNS = property(
+        lambda self: (
+            Column("tolerance", form="<"),
+            Column("minimum", form=".5g"),
+            Column("maximum", form=".5g"),
+            Column("change_minimum", self.unit, ".5f", "change\nat min."),
+            Column("change_maximum", self.unit, ".5f", "change\nat max."),
+            Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
+        )
+    )
+
+    @property
+    def worst(self) -> Tensor:
+        """(N,) places of the tolerances, the largest change first."""
+        return torch.argsort(torch.maximum(self.minimum, self.maximum), descending=True)
+
+    def percentile(self, percent: float) -> Tensor:
+        """The criterion that so many percent of the trials are below; failed trials are above all."""
+        return torch.quantile(torch.nan_to_num(self.trials, nan=torch.inf), percent / 100, interpolation="higher")
+
+    def yield_at(self, most: float) -> float:
+        """Share of the trials whose criterion is at most a number."""
+        return float((self.trials <= most).double().mean())
+
+    def columns(self) -> dict[str, Tensor]:
+        order = self.worst
+        return {
+            "tolerance": order,
+            "minimum": self.tolerances.minimum[order],
+            "maximum": self.tolerances.maximum[order],
+            "unit": order,
+            "change_minimum": self.minimum[order],
+            "change_maximum": self.maximum[order],
+            "slope": self.slope[order],
+        }
+
+    def words(self) -> dict[str, Sequence[str]]:
+        return {"tolerance": self.tolerances.labels, "unit": [row.unit for row in self.tolerances]}
+
+    def summary(self) -> dict[str, float]:
+        """Figures of the lens as built, in the unit of the criterion."""
+        found = {
+            "nominal": float(self.nominal),
+            "estimated": float(self.estimated),
+            "expected": float(self.expected),
+            "expected_root_mean_square": math.sqrt(float(self.expected_square)),
+        }
+        if len(self.trials):
+            good = self.trials[~self.trials.isnan()]
+            found |= {"mean": float(good.mean()), "sigma": float(good.std()), "best": float(good.min())}
+            found |= {"worst": float(good.max()), "failed": int(self.trials.isnan().sum())}
+            found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+        return found
+
+    def tables(self) -> list[Table]:
+        found = self.summary()
+        about = [f"{self.criterion}, {self.unit}: nominal {found['nominal']:.6g}"]
+        about.append(
+            f"as built, expected by second order: mean {found['expected']:.6g}, root mean square "
+            f"{found['expected_root_mean_square']:.6g}; estimated by RSS {found['estimated']:.6g}"
+        )
+        if len(self.trials):
+            about.append(
+                f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
+                f"best {found['best']:.6g}, worst {found['worst']:.6g}"
+                + f"; {found['failed']} without light"
+                * (found["failed"] > 0)
+            )
+            about.append(", ".join(f"{p} % ≤ {found[f'percent_{p}']:.5g}" for p in PERCENTILES))
+            for k, one in enumerate(self.tolerances.compensators):
+                c = self.changes[:, k]
+                about.append(
+                    f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
+                    f"σ {float(c.std()):.4g}"
+                )
+        return [Table(self.columns(), about)]
+
+    def document(self) -> dict:
+        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+
+    @styled
+    def draw(self):
+        """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
+        figure = new_figure(9.0, 4.2)
+        left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
+        shown = self.trials[~self.trials.isnan()] if len(self.trials) else self.predicted
+        span = (float(min(shown.min(), self.nominal)), float(torch.quantile(shown, 0.998)))
+        bins = np.linspace(*span, 41)
+        if len(self.trials):
+            left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(self.trials):,} trials")
+        density, _ = np.histogram(self.predicted.numpy(), bins=bins, density=True)
+        left.stairs(density, bins, color=INK, linewidth=1.2, label="second order")
+        left.axvline(float(self.nominal), color=GREY, linestyle=":", label="nominal")
+        left.axvline(float(self.expected), color="#d62728", label="expected")
+        left.set(xlabel=f"{self.criterion}, {self.unit}", ylabel="density", xlim=span)
+        curve = left.twinx()
+        ordered = torch.sort(shown).values
+        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered)), color="#2ca02c", linewidth=1.2)
+        curve.set(ylabel="yield, %", ylim=(0, 100))
+        left.legend(fontsize=8, loc="center right")
+        order = self.worst[:12].flip(0)
+        labels = [self.tolerances.labels[k] for k in order.tolist()]
+        right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
+        right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
+        right.set_yticks(range(len(order)), labels, fontsize=7.5)
+        right.set(xlabel=f"change of the criterion, {self.unit}")
+        right.legend(fontsize=8, loc="lower right")
+        return figure
+
+
+def tolerance(
+    lens: Lens,
+    tolerances: Tolerances | None = None,
+    *,
+    grade: Literal["commercial", "precision", "high"] | None = None,
+    limits: str | Sequence[str] = "",
+    criterion: Literal["rms", "wavefront"] = "rms",
+    trials: int = 1000,
+    seed: int = 0,
+    fields: Tensor | Sequence | None = None,
+    rings: int = 4,
+    arms: int = 6,
+    checkpoint: str | PathLike | None = None,
+    share: Share | None = None,
+    progress: Callable | None = None,
+) -> Toleranced:
+    """The lens as built: sensitivities, expectation by second order and Monte Carlo.
+
+    tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`
+        and `limits`.
+    grade: tolerances of published grades instead of the file's, see `tolerances`.
+    limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
+        the file or the grade, and "index=0" leaves one out.
+    criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
+        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt. The compensators of every
+        lens minimise its square.
+    trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
+    fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
+        symmetric, mirrored along y.
+    rings: of the pupil, Gaussian quadrature, 4 by default.
+    arms: of the pupil, 6 by default.
+    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
+    share: of this process (`shards.share()`), if all processes of a job call alike.
+    progress: (count, unit) -> a progress bar.
+    Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
+    """
+    if criterion not in CRITERIA:
+        raise ValueError(f"criterion {criterion!r}: expected one of {', '.join(CRITERIA)}")
+    if trials < 0:
+        raise ValueError(f"trials {trials}: expected 0 or more")
+    if tolerances is None:
+        tolerances = tolerances_of_grade(lens, limits, grade=grade)
+    elif grade or limits:
+        raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
+    if not len(tolerances):
+        raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
+    chosen = CRITERIA[criterion]
+    study = Study(lens, tolerances, chosen, _sampling(lens, fields, rings, arms))
+    with torch.no_grad():
+        nominal_square, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
+        if not bool(nominal_square.isfinite().all()):
+            raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
+        nominal = chosen.of_square(nominal_square[0])
+        low, high = _at_limits(study)
+        changes = [chosen.of_square(q) - nominal for q in (low, high)]
+        q0, g, H = study.second_order()
+        predicted, mean_square = _model(tolerances, q0, g, H, seed)
+        predicted = chosen.of_square(predicted.clamp_min(0))
+        values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
+    slope = g * study.half / (2 * nominal) if chosen.of_square is torch.sqrt else g * study.half
+    rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
+    return Toleranced(
+        lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
+        minimum=changes[0], maximum=changes[1], slope=slope, estimated=nominal + rss, expected=predicted.mean(),
+        expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
+    )  # fmt: skip
+
+
+def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:
+    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
+    points = field_points(fields, like=lens)
+    weights = lens.fields.weight if fields is None else torch.ones_like(points[0])
+    if fields is None:
+        mirrored = points * points.new_tensor([[1.0], [-1.0]])
+        new = [k for k in range(points.shape[1]) if not bool((points == mirrored[:, k, None]).all(0).any())]
+        points, weights = torch.cat([points, mirrored[:, new]], 1), torch.cat([weights, weights[new]])
+    return Sampling(points, weights / weights.sum(), *gauss_rings(rings, arms, **like))
+
+
+def _at_limits(study: Study) -> tuple[Tensor, Tensor]:
+    """q (N,) of the lenses with one error at its minimum, and at its maximum, compensated."""
+    low, high = study.tolerances.minimum.to(study.half), study.tolerances.maximum.to(study.half)
+    errors = torch.cat([torch.diag(low), torch.diag(high)])
+    found = torch.cat([study.compensated(part)[0] for part in errors.split(_CHUNK)])
+    return found[: len(low)], found[len(low) :]
+
+
+def _model(tolerances: Tolerances, q0: float, g: Tensor, H: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Draws (K,) of the quadratic form, and its exact mean ()."""
+    mean, variance = (g.new_tensor(part) for part in zip(*map(moments, tolerances), strict=True))
+    errors = draw_errors(tolerances, _MODEL, seed + 1).to(g)
+    drawn = q0 + errors @ g + 0.5 * ((errors @ H) * errors).sum(-1)
+    exact = q0 + g @ mean + 0.5 * (torch.diagonal(H) @ variance + mean @ H @ mean)
+    return drawn, exact
+
+
+_JOURNAL = Kind(
+    damaged=BadTolerance,
+    advice="give a new name for `checkpoint`",
+    other=BadTolerance,
+    refusal="{path} holds the trials of another study: {difference}; give a new name for `checkpoint`",
+)
+_TRIALS = record({"first": whole(), "rows": listed(listed(number(infinite=True)))})
+
+
+class _Trials:
+    """Finished trials in a file: rows of the criterion and the compensators, by the number of their first trial."""
+
+    def __init__(self, path: str | PathLike, study: Study, seed: int):
+        rows = [dataclasses.astuple(row) for row in (*study.tolerances, *study.compensators)]
+        about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
+        about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
+        about |= {"fields and pupil": digest(study.sampling)}
+        self.store = Records(path, about, _JOURNAL, _TRIALS)
+        self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
+
+    def put(self, first: int, rows: Tensor) -> None:
+        # JSON has no nan: a trial without light is infinite
+        self.store.append({"first": first, "rows": torch.nan_to_num(rows, nan=math.inf).tolist()})
+
+
+def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
+    """The criterion (T,) of the trials, and the changes (T, C) of their compensators."""
+    count, others = len(study.tolerances), len(study.compensators)
+    found = study.half.new_zeros(trials, 1 + others)
+    chunks = [range(first, min(first + _CHUNK, trials)) for first in range(0, trials, _CHUNK)]
+    mine = (share or Share()).of(range(len(chunks)))
+    stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
+    bar = progress(trials, "lens") if progress and trials else None
+    for k in mine:
+        part = chunks[k]
+        rows = stored.found.get(part.start) if stored else None
+        if rows is None or len(rows) != len(part):
+            errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
+            q, changes = study.compensated(errors.reshape(len(part), count))
+            rows = torch.cat([study.criterion.of_square(q)[:, None], changes], -1)
+            if stored:
+                stored.put(part.start, rows)
+        found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
+        if bar is not None:
+            bar.update(len(part))
+    if bar is not None:
+        bar.close()
+    if share is not None and share.processes > 1:
+        found = total(found)
+    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 1:]

@@ -1,0 +1,176 @@
+"""The lens as built: changes at the limits by brute force, expectation against Monte Carlo, files of trials."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+
+import raytrace as rt
+
+LIMITS = "radius=0.1% thickness=0.03 element_decenter=0.03 element_tilt=0.05"
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0, 8.4, -8.4, 11.9, -11.9])
+    return rt.focus(lens, fields=[0, 8.4, 11.9]).lens
+
+
+@pytest.fixture(scope="module")
+def built(triplet):
+    return rt.tolerance(triplet, limits=LIMITS, trials=500)
+
+
+def rms(lens):
+    """RMS spot radius, µm, of all fields, by `rt.spot` with the same pupil points."""
+    whole = rt.spot(lens, rings=4).whole
+    return 1e3 * float(whole.mean_square_radius.mean().sqrt())
+
+
+def focused(lens):
+    """The least RMS over the sensor distance, by a search that knows no derivative."""
+    start = float(lens.surfaces[-2].thickness)
+    return minimize_scalar(
+        lambda shift: rms(lens.at(sensor_distance=start + shift)), bracket=(-0.2, 0.2), tol=1e-10
+    ).fun
+
+
+def check_changes(lens, rows, judge, accuracy):
+    """The changes at both limits of every row are those of single lenses, judged one by one."""
+    arms = rt.gauss_rings(4)[0].shape[1] // 4
+    found = rt.tolerance(lens, rows, trials=0, arms=arms)
+    nominal = judge(lens)
+    assert float(found.nominal) == pytest.approx(nominal, abs=accuracy)
+    for n in range(len(rows)):
+        for limit, change in ((rows.minimum[n], found.minimum[n]), (rows.maximum[n], found.maximum[n])):
+            errors = torch.zeros(len(rows), dtype=torch.float64)
+            errors[n] = limit
+            assert float(change) == pytest.approx(judge(rt.perturbed(lens, rows, errors)) - nominal, abs=accuracy)
+
+
+def test_changes_at_the_limits_are_those_of_single_lenses(triplet):
+    rows = rt.tolerances(triplet, "radius:3=0.1% thickness:3=0.05 element_tilt:3=0.05", compensators=[])
+    check_changes(triplet, rows, rms, 1e-9)
+
+
+@pytest.mark.slow
+def test_changes_at_the_limits_are_those_of_refocused_lenses(triplet):
+    rows = rt.tolerances(triplet, "radius:3=0.1% thickness:3=0.05 element_decenter:3=0.05 element_tilt:3=0.05")
+    check_changes(triplet, rows, focused, 1e-8)
+
+
+def test_slope_is_the_derivative_of_the_change(triplet):
+    small = rt.tolerances(triplet, "radius=0.0001%")
+    found = rt.tolerance(triplet, small, trials=0)
+    torch.testing.assert_close(found.maximum - found.minimum, 2 * found.slope, rtol=1e-4, atol=1e-10)
+
+
+def test_expectation_is_the_mean_of_the_trials(built):
+    spread = float(built.trials.std()) / math.sqrt(len(built.trials))
+    assert abs(float(built.expected - built.trials.mean())) < 4 * spread
+    assert float(built.expected) == pytest.approx(float(built.trials.mean()), rel=0.02)
+    squares = built.trials.square()
+    error = float(squares.std()) / math.sqrt(len(squares))
+    assert abs(float(built.expected_square - squares.mean())) < 4 * error
+    assert float(built.nominal) < float(built.expected) < float(built.estimated)
+
+
+def test_percentiles_and_yield(built):
+    median = built.percentile(50)
+    assert built.yield_at(float(median)) == pytest.approx(0.5, abs=0.003)
+    assert built.yield_at(0.0) == 0
+    predicted = torch.quantile(built.predicted, 0.9)
+    assert float(predicted) == pytest.approx(float(built.percentile(90)), rel=0.01)
+
+
+def test_rss_is_as_opticstudio_prints_it(built):
+    rss = (0.5 * (built.minimum**2 + built.maximum**2)).sum().sqrt()
+    assert float(built.estimated) == pytest.approx(float(built.nominal + rss), rel=1e-12)
+
+
+def test_a_trial_is_the_same_in_any_study(triplet, built):
+    fewer = rt.tolerance(triplet, limits=LIMITS, trials=260)
+    torch.testing.assert_close(fewer.trials, built.trials[:260], rtol=1e-10, atol=0)
+    other = rt.tolerance(triplet, limits=LIMITS, trials=20, seed=1)
+    assert not torch.allclose(other.trials, built.trials[:20])
+
+
+def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
+    file = tmp_path / "trials.jsonl"
+    first = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
+    lines = file.read_text().splitlines(keepends=True)
+    assert len(lines) == 3  # the study, and two pieces
+    file.write_text("".join(lines[:2]) + lines[2][:40])  # as a killed process leaves it
+    again = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
+    assert torch.equal(first.trials, again.trials)
+    assert torch.equal(first.changes, again.changes)
+    with pytest.raises(rt.BadTolerance, match="trials of another study"):
+        rt.tolerance(triplet, limits="radius=0.2%", trials=300, checkpoint=file)
+
+
+def test_compensators_stay_within_their_limits(triplet):
+    free = rt.tolerances(triplet, LIMITS)
+    held = dataclasses.replace(free, compensators=(rt.Compensator(7, "thickness", -0.02, 0.03),))
+    found = rt.tolerance(triplet, held, trials=100)
+    assert float(found.changes.min()) >= -0.02
+    assert float(found.changes.max()) <= 0.03
+    none = rt.tolerance(triplet, dataclasses.replace(free, compensators=()), trials=100)
+    assert none.changes.shape == (100, 0)
+    assert float(none.trials.mean()) > float(found.trials.mean())
+
+
+def test_wavefront_as_built(triplet):
+    found = rt.tolerance(triplet, limits="radius=0.05% thickness=0.01", criterion="wavefront", trials=64, fields=[0, 5])
+    assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.02)
+    assert found.unit == "waves"
+
+
+def test_report_table_and_figure(built, tmp_path):
+    text = str(built)
+    assert "500 trials (seed 0)" in text
+    assert "compensator thickness of surface 7" in text
+    frame = built.to_frame()
+    assert list(frame["tolerance"][:1]) == [built.tolerances.labels[int(built.worst[0])]]
+    assert built.document()["expected"] == float(built.expected)
+    built.plot(tmp_path / "as_built.png")
+    assert (tmp_path / "as_built.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"criterion": "sharpness"}, "criterion 'sharpness': expected one of rms, wavefront"),
+        ({"trials": -1}, "trials -1"),
+        ({"limits": "radius=0"}, "no tolerances"),
+        ({"grade": "hgih"}, "did you mean high"),
+    ],
+)
+def test_wrong_options_are_refused(triplet, words, message):
+    with pytest.raises(ValueError, match=message):
+        rt.tolerance(triplet, **{"limits": LIMITS, **words})
+
+
+def test_compensators_that_the_lens_does_not_have_or_need(triplet):
+    rows = rt.tolerances(triplet, LIMITS)
+    for one, message in (
+        (rt.Compensator(12), "surfaces 0 to 7"),
+        (rt.Compensator(1, "colour"), "the surface does not have it"),
+        (rt.Compensator(0), "does not improve the criterion"),
+    ):
+        with pytest.raises(rt.BadTolerance, match=message):
+            rt.tolerance(triplet, dataclasses.replace(rows, compensators=(one,)), trials=0)
+
+
+FILES = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", sorted(FILES.glob("*.zmx")), ids=lambda file: file.stem)
+def test_tolerances_of_a_file(file):
+    found = rt.tolerance(rt.read_lens(file), trials=50)
+    assert len(found.tolerances) == len(rt.read_tolerances(file))
+    assert bool(found.trials.isfinite().all())
+    assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.15)
