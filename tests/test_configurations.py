@@ -212,6 +212,7 @@ def test_configurations_are_made_from_plain_numbers(tmp_path):
     assert leaves(read_lens(tmp_path / "zoom.zmx")) == leaves(lens)
     for wrong, said in (
         ({"glass": {1: [1.5]}}, "'glass' does not differ"),
+        ({"fields": [[0, 10], [0, 5]]}, "'fields' does not differ.*as image heights, by `field_kind`"),
         ({"thickness": {99: [1.0]}}, "surface 99"),
         ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "lists of values of one length"),
     ):

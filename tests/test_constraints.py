@@ -95,6 +95,8 @@ def test_a_condition_may_be_of_one_configuration(lens):
         ("f_number=4mm", "'4mm' is no number"),
         ("f_numbr=50", "did you mean f_number?"),
         ("focal_length=50", "nothing to hold; expected one of efl, f_number"),
+        ("focal_length=50", "did you mean efl?"),
+        ("bfl>=30", "did you mean bfd?"),
         ("distortion=2%", "expected distortion<=2%"),
         ("EFFK=50", "did you mean EFFL?"),
         ("REAY(1.5,0)=2", "expected two whole numbers"),

@@ -227,6 +227,14 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
 # -- reading and writing -----------------------------------------------------------------------------------------------
 
 
+def test_an_unknown_name_lists_the_shipped_lenses():
+    for name in ("double_gaus", "double_gaus.zmx"):
+        with pytest.raises(LensFileError, match=r"lenses are .*cooke_triplet.*; did you mean double_gauss\?"):
+            read_lens(name)
+    with pytest.raises(LensFileError, match="no such file or shipped lens; the shipped lenses are"):
+        read_lens("biotar")
+
+
 def test_suffixes_and_paths_that_are_no_lens_files(tmp_path):
     with pytest.raises(LensFileError, match=r"'\.pdf' is that of no format.*\.zmx"):
         read_lens(tmp_path / "lens.pdf")

@@ -168,9 +168,9 @@ def test_values_are_taken_in_the_unit_of_the_rows():
 BAD = {
     "a row that is not there": (
         [Row("CONS"), Row("DIFF", (1, 9))],
-        r"^row 2 of the merit function: DIFF takes the value of row 9: there are rows 1 to 2$",
+        r"^row 2 of the merit function: DIFF takes the value of row 9: there are rows 1 to 2; rows added by ",
     ),
-    "row 0": ([Row("ABSO")], r"^row 1 .* ABSO takes the value of row 0: there are rows 1 to 1$"),
+    "row 0": ([Row("ABSO")], r"^row 1 .* ABSO takes the value of row 0: there are rows 1 to 1; rows added by "),
     "text": (
         [Row("BLNK"), Row("RECI", (1, 0))],
         r"^row 2 .* RECI takes the value of row 1, which has none: BLNK, text$",
@@ -179,7 +179,10 @@ BAD = {
         [Row("DMFS"), Row("OSUM", (1, 1))],
         r"^row 2 .* takes the values of rows 1 to 1: none of them has one$",
     ),
-    "a range beyond": ([Row("CONS"), Row("OSUM", (1, 7))], r"^row 2 .* rows 1 to 7: there are rows 1 to 2$"),
+    "a range beyond": (
+        [Row("CONS"), Row("OSUM", (1, 7))],
+        r"^row 2 .* rows 1 to 7: there are rows 1 to 2; rows added by ",
+    ),
     "a surface": ([Row("REAY", (40, 1))], r"^row 1 .* REAY names surface 40: this lens has surfaces 1 to 4$"),
     "a surface below": ([Row("REAB", (-1, 1))], r"^row 1 .* REAB names surface -1: .* 0 to 4 \(0: the object\)$"),
     "the object at infinity": ([Row("REAY", (0, 1))], r"^row 1 .* REAY names surface 0: .* surfaces 1 to 4.*$"),
@@ -226,3 +229,12 @@ def test_rows_on_rows_that_are_skipped():
     assert evaluation(model.start).merit == pytest.approx(values_of("thick lens", [Row("EFFL")])[0])
     with pytest.raises(UnknownOperand, match=r"row 1 .*: operand WHAT is not known"):
         Evaluation(model, [Row("WHAT", weight=1.0)])
+    with pytest.raises(UnknownOperand, match=r"operand DISG is not known; .*; did you mean DIS"):
+        Evaluation(model, [Row("DISG", weight=1.0)])
+
+
+def test_one_argument_of_a_row_is_its_first():
+    assert Row("OPLT", 3, 0.5) == Row("OPLT", (3, 0), (0.5, 0.0, 0.0, 0.0))
+    assert Row("REAY", [4, 1], (0, 0.7)) == Row("REAY", (4, 1), (0, 0.7, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"row REAY: `integers` \(1, 2, 3\): expected at most 2"):
+        Row("REAY", (1, 2, 3))

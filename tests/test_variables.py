@@ -211,6 +211,7 @@ def test_bounds_hold_after_a_step():
     [
         ("", "no variables"),
         ("focus", "'focus': expected a number of a lens; did you mean sensor"),
+        ("air", "'air': no 'air'; .*; did you mean thickness:"),
         ("focal", "'focal': no 'focal'; this lens has thickness, sensor"),
         ("sensor:3", "'sensor:3': expected sensor without surfaces"),
         ("glass:1", "glass_1 is a variable of optimize alone"),

@@ -1,5 +1,6 @@
 """Modulation transfer: of diffraction, by autocorrelation of the traced wave; of rays, by quadrature."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.analysis.panels import by_field, chart, finished, mark_fields
 from raytrace.analysis.pupil_autocorrelation import MARGIN, beam_of, exit_pupil, otf, points_needed, polynomials_of
@@ -24,7 +26,7 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.result import Table, axis
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, array, number_text, styled
@@ -39,6 +41,7 @@ _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 _LEAST_PHASE = 70.0  # radians along a pupil radius that the former integrate, see `rings_and_arms`
 _FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
+_BUNDLES = 16  # stored of a field: its probe and the fits of its wave
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
 _NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
 _FINE_GRID = 512  # points across the pupil, from where a quadrature of the sheared pupil is tried
@@ -202,22 +205,25 @@ def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bo
     return Mtf(lens, fields, frequencies, *_geometric(lens, fields, frequencies), None, True, by_rays, marked)
 
 
-def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Tangential and sagittal MTF (1, K) of a field (2, 1), and whether of rays."""
+def _of_field(
+    lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor, memo: Memo | None = None
+) -> tuple[Tensor, Tensor, bool]:
+    """Tangential and sagittal MTF (1, K) of a field (2, 1), and whether of rays; memo: of its beam at other sensors."""
     if geometric:
         return *_geometric(lens, field, frequencies), True
-    scene = dataclasses.replace(scene_of(lens, field), memo=Memo(1))  # the beam is aimed and traced once
+    scene = dataclasses.replace(scene_of(lens, field), memo=memo or Memo(_BUNDLES))  # the beam is traced once
     shares = wavelength_shares(lens)
     sheared = _sheared(scene, frequencies)
     if sheared is not None:
         return *sheared, False
+    seconds = None if geometric is False else _SECONDS
     try:
-        return *mtf_on_grid(scene, frequencies, shares, seconds=None if geometric is False else _SECONDS), False
+        return *mtf_on_grid(scene, frequencies, shares, seconds=seconds, fit=True), False
     except TooManyPoints:
         if geometric is False:
             raise
     both = _where_diffraction_is_no_matter(scene, frequencies)
-    return (*mtf_on_grid(scene, frequencies, shares), False) if both is None else (*both, True)
+    return (*mtf_on_grid(scene, frequencies, shares, fit=True), False) if both is None else (*both, True)
 
 
 def _where_diffraction_is_no_matter(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -250,9 +256,21 @@ def _change_by_diffraction(scene: Scene, frequencies: Tensor, both: tuple[Tensor
 def _through_focus(
     lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, choice: Tensor | None
 ) -> ThroughFocusMtf:
-    found = [_mtf(with_sensor_distance(lens, distance), fields, frequency, choice) for distance in distances]
-    tangential, sagittal = (torch.stack([getattr(m, name)[:, 0] for m in found]) for name in ("tangential", "sagittal"))
-    by_rays = torch.stack([m.by_rays for m in found])
+    """The MTF at each sensor distance (S,). A beam is aimed and traced once: for the `Memo` of a field the sensor
+    distance is a variable, so that rays are stored in front of the sensor."""
+    wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
+    constant = not any(varies(number) for number in pytree.tree_leaves((lens, fields, frequency)))
+    tangential, sagittal, by_rays = [], [], []
+    with torch.no_grad() if constant else contextlib.nullcontext():
+        for field, geometric in zip(fields.split(1, 1), wanted, strict=True):
+            memo, rows = Memo(_BUNDLES), []
+            for distance in distances:
+                sensor = distance.detach().requires_grad_() if constant else distance
+                rows.append(_of_field(with_sensor_distance(lens, sensor), field, geometric, frequency, memo))
+            for column, parts in zip((tangential, sagittal, by_rays), zip(*rows, strict=True), strict=True):
+                column.append(parts)
+    tangential, sagittal = (torch.stack([torch.cat(c)[:, 0] for c in some], -1) for some in (tangential, sagittal))
+    by_rays = torch.tensor(by_rays, device=fields.device).T
     whole = bool(by_rays.all())
     return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, whole, by_rays)
 

@@ -15,6 +15,7 @@ Source: Hopkins, Proc. Phys. Soc. B 70, 1957 (the sheared pupil); Golub & Pereyr
 Where polynomials do not describe pupil and wave, the OTF is the autocorrelation of a regular grid of directions.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -124,6 +125,7 @@ def on_grid(polynomial: Tensor, line: Tensor) -> Tensor:
 _DEGREE, _TERMS = 10, 66  # of the Zernike map from directions to the pupil
 _LEAST, _MOST = 128, 1280  # points across the grid
 _TRACED_BYTES, _CELL_BYTES = 480, 96  # of a cell that is traced, and of others
+_RIM_RAYS = 64  # along the rim, from which the wave there is interpolated
 _TRACED = 160  # points across a grid up to which every cell is traced
 _SURFACE_SECONDS = 4e-7  # a ray and surface, one core: 4 million rays through 12 surfaces took 17 to 24 s
 
@@ -146,14 +148,15 @@ class ExitPupil:
 
 
 def exit_pupil(
-    scene: Scene, *, size: int | None = None, least: int = _LEAST, seconds: float | None = None
+    scene: Scene, *, size: int | None = None, least: int = _LEAST, seconds: float | None = None, fit: bool = False
 ) -> ExitPupil:
     """The wave on a regular grid of directions, whose rays are found by a Zernike map from directions to the pupil.
 
     Light is spread evenly over the entrance pupil: |A|² = |∂p/∂(L, M)|. A cell that the rim of the pupil crosses counts
     by its share, so that the grid errs by O(1/N²); one at the rim of another aperture counts or does not.
     Every cell is traced on a grid up to 160 across. On a finer one the wave is a polynomial of directions where it
-    misses no ray by more than 1e-4 waves and no ray fails or is clipped, see `polynomials_of`.
+    misses no ray by more than 1e-4 waves and no ray fails or is clipped, see `polynomials_of`; with `fit` also on a
+    coarser one, and cells are not stored in the memo of the scene, whose rays serve every sensor distance.
     size: N points across, by default as many as keep blurs from overlapping, and `least`. Raises TooManyPoints where
     that is too many, or where the trace is predicted to take more than `seconds`; None: a long one is warned of.
     """
@@ -191,7 +194,7 @@ def exit_pupil(
         inside = own.any(2).any(1)[0]
         own = own[..., inside]
     parts, each = [pupil, by_l, by_m], _TRACED_BYTES
-    if size > _TRACED:
+    if size > _TRACED or fit:
         polynomials = polynomials_of(scene, beam)
         if polynomials is None:
             _afford_time(scene, int(inside.sum()) * probe.opd[..., 0].numel(), seconds)
@@ -199,8 +202,10 @@ def exit_pupil(
             parts.append(on_grid(polynomials[2], line)[None, None])
             each = _CELL_BYTES
     together = piece(each * probe.opd[..., 0].numel())
+    rim = _rim_waves(scene) if fit and len(parts) > 3 else None
+    alone = dataclasses.replace(scene, memo=None) if fit else scene
     cells = [
-        _cells(scene, *some, size=size)
+        _cells(alone, *some, size=size, rim=rim)
         for some in zip(*(part[..., inside].split(together, -1) for part in parts), strict=True)
     ]
     field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
@@ -289,11 +294,19 @@ def _interpolation(size: int, degree: int, like: dict) -> tuple[Tensor, Tensor, 
 
 
 def _cells(
-    scene: Scene, pupil: Tensor, by_l: Tensor, by_m: Tensor, waves: Tensor | None = None, *, size: int
+    scene: Scene,
+    pupil: Tensor,
+    by_l: Tensor,
+    by_m: Tensor,
+    waves: Tensor | None = None,
+    *,
+    size: int,
+    rim: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The wave (1, F, W, P) in cells of `size` across at points of the pupil (2, 1, F, W, P), and its |A|².
 
-    by_l, by_m: derivatives of the points by directions scaled to the disc; waves: (1, 1, F, W, P), traced if None.
+    by_l, by_m: derivatives of the points by directions scaled to the disc; waves: (1, 1, F, W, P), traced if None;
+    rim: of `_rim_waves`, in place of traced rays at the rim.
     """
     radius = safe_sqrt((pupil * pupil).sum(0))
     slope = safe_divide(safe_sqrt((pupil * by_l).sum(0) ** 2 + (pupil * by_m).sum(0) ** 2), radius)
@@ -306,11 +319,35 @@ def _cells(
         waves, valid = _traced(scene, pupil, radius)
         share = torch.where(valid, share, 0.0)
     elif len(at_rim):
-        rim, _ = _traced(scene, pupil[..., at_rim], radius[..., at_rim])
-        waves = torch.where(beyond, torch.zeros_like(waves[0]).index_copy(-1, at_rim, rim), waves[0])
+        some = pupil[..., at_rim]
+        traced = _traced(scene, some, radius[..., at_rim])[0] if rim is None else _at_angles(rim, some)
+        waves = torch.where(beyond, torch.zeros_like(waves[0]).index_copy(-1, at_rim, traced), waves[0])
     else:
         waves = waves[0]
     return share * safe_sqrt(density) * phasor(waves), share * density
+
+
+def _rim_waves(scene: Scene) -> Tensor | None:
+    """Fourier coefficients (1, F, W, M) of the wave along the rim of the pupil, in waves, from a few rays of it.
+
+    None where the upper half of them adds more than _MISSED waves.
+    """
+    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    angle = 2 * math.pi / _RIM_RAYS * torch.arange(_RIM_RAYS, **like)
+    points = torch.stack([torch.cos(angle), torch.sin(angle)])
+    waves, valid = _traced(scene, points, torch.ones_like(angle))
+    terms = torch.fft.rfft(waves) / _RIM_RAYS
+    high = 2 * terms[..., terms.shape[-1] // 2 :].detach().abs().sum(-1).max()
+    return terms if bool(valid.all()) and float(high) <= _MISSED else None
+
+
+def _at_angles(terms: Tensor, pupil: Tensor) -> Tensor:
+    """A Fourier series (..., M) of the angle in the pupil at points (2, ..., P)."""
+    turn = torch.complex(*pupil) / torch.hypot(*pupil)
+    total = torch.zeros_like(turn)
+    for term in terms[..., 1:].flip(-1).movedim(-1, 0):  # by Horner's rule, the highest first
+        total = (total + term[..., None]) * turn
+    return terms[..., :1].real + 2 * total.real
 
 
 def _traced(scene: Scene, pupil: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:

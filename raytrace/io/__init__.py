@@ -59,7 +59,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
-from raytrace.words import calling_level, named_value
+from raytrace.words import calling_level, did_you_mean, named_value
 
 #: Substitutes for glasses of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown glass.
 Substitute = Mapping[str, str] | str | Sequence[str] | None
@@ -177,7 +177,7 @@ def read_lens_with_report(
     """
     path = Path(path)
     if not path.exists():
-        path = shipped_lens(path) or path
+        path = shipped_lens(path) or _refuse_missing(path)
     form, file = _format(path), str(path)
     options = {"configuration": configuration} if form.configurations else {}
     substitutes = substitutes_of(substitute)
@@ -213,6 +213,16 @@ def shipped_lens(name: str | os.PathLike) -> Path | None:
         return None
     candidates = [_LENSES / part / file for part in ("", "examples") for file in (path.name, f"{path.name}.zmx")]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _refuse_missing(path: Path) -> Path:
+    """The path of a file that is not there, whose reader refuses it. Raises LensFileError for a name alone."""
+    names = [file.stem for part in ("", "examples") for file in sorted((_LENSES / part).glob("*.zmx"))]
+    meant = did_you_mean(path.stem, names)
+    if path.parent != Path() or path.suffix not in ("", ".zmx") or (path.suffix and not meant):
+        return path
+    message = f"no such file or shipped lens; the shipped lenses are {', '.join(names)}{meant}"
+    raise LensFileError(message, Place(str(path)))
 
 
 def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:

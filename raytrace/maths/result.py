@@ -125,15 +125,16 @@ class Result:
         """The figure of `plot`. Raises TypeError: no figure."""
         raise TypeError(f"{type(self).__name__} has no figure")
 
-    def plot(self, path: str | PathLike | None = None, **options):
-        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given.
+    def plot(self, path: str | PathLike | None = None, *, dpi: float = 200, **options):
+        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given; dpi: pixels per inch
+        of a .png.
 
         It is not a figure of pyplot, whose `show` and `savefig` do not know it. A notebook shows it where it is the
         value of a cell; its own `savefig` saves it.
         """
         figure = self.draw(**options)
         if path is not None:
-            style.save(figure, path)
+            style.save(figure, path, dpi=dpi)
         return figure
 
     def __str__(self) -> str:

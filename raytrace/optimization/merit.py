@@ -548,17 +548,17 @@ class Evaluation:
         """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
         referred, skipped = {}, set()
 
-        def skip(line: Line, why: str) -> None:
+        def skip(line: Line, why: str, meant: str = "") -> None:
             if line.row.weight != 0 and not skip_unknown:
                 raise UnknownOperand(
-                    f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out"
+                    f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out{meant}"
                 )
             skipped.add(line.number)
 
         for number, (_, line) in placed.items():
             name = line.row.operand
             if name not in OPERANDS:
-                skip(line, f"operand {name} is not known")
+                skip(line, f"operand {name} is not known", did_you_mean(name, OPERANDS))
             elif OPERANDS[name].refers:
                 referred[number] = OPERANDS[name].refers(line, self.rows)
         for number in in_order(referred):

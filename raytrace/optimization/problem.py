@@ -102,7 +102,7 @@ def _condition(lens: Lens, word: str) -> Condition:
             raise BadHold(f"`hold`: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], OPERANDS)}")
         known, arguments = Word(operand[1], "", ""), _arguments(operand[2] or "", word)
     else:
-        meant = did_you_mean(name, WORDS)
+        meant = f"; did you mean {_INSTEAD[name.lower()]}?" if name.lower() in _INSTEAD else did_you_mean(name, WORDS)
         raise BadHold(f"`hold`: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}")
     if known.one_sided and relation != "<=":
         raise BadHold(f"`hold`: {word!r}: {name} is the largest that there is; expected {name}<={number}")
@@ -154,6 +154,16 @@ def _outer_colours(lens: Lens) -> Arguments:
 
 
 #: Quantities of constraint syntax.
+#: Names of quantities in other programs, and the name here.
+_INSTEAD = {
+    **dict.fromkeys(("bfl", "back_focal_length", "back_focal_distance"), "bfd"),
+    **dict.fromkeys(("focal_length", "effective_focal_length", "efy"), "efl"),
+    **dict.fromkeys(("ttl", "oal", "track", "length"), "total_track"),
+    **dict.fromkeys(("fno", "f#", "f/#"), "f_number"),
+    "epd": "entrance_pupil_diameter",
+    "na": "numerical_aperture",
+}
+
 WORDS = {
     "efl": Word("EFFL", "effective focal length"),
     "f_number": Word("ISFN", "focal length / entrance pupil diameter", ""),

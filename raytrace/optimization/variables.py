@@ -217,6 +217,15 @@ def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
     return addresses
 
 
+def _spaces(lens: Lens, kind: str) -> str:
+    """The variable syntax of all air spaces, or of the thicknesses of all elements, by a name such as "air_spaces"."""
+    named = re.fullmatch("(air|glass)(_(space|gap|thickness|thicknesse)s?)?", kind)
+    inside = lens.surfaces[1:-1]
+    in_air = [surface.glass.name in ("", "MIRROR") for surface in inside]
+    numbers = [k for k, air in enumerate(in_air, 1) if named and air == (named[1] == "air")]
+    return f"thickness:{','.join(map(str, numbers))}" if numbers else ""
+
+
 def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     """The numbers that one word names, by surface and configuration. Raises BadVariables."""
     named, _, configurations = word.partition("@")
@@ -227,7 +236,8 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
         meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
         raise BadVariables(f"{word!r}: expected {kind if kind in _ALONE else 'a number of a lens'}{meant}")
     if kind not in known:
-        raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
+        meant = f"; did you mean {spaces}?" if (spaces := _spaces(lens, kind)) else did_you_mean(kind, known)
+        raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{meant}")
     if kind == "aperture":
         if configurations:
             raise BadVariables(f"{word!r}: the system aperture is that of all configurations; leave @ out")

@@ -118,7 +118,11 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
     operands = []
     for name, by_surface in varied.items():
         if name not in _NAMES:
-            raise ValueError(f"{name!r} does not differ between configurations; expected one of {', '.join(_NAMES)}")
+            heights = "; fields as image heights, by `field_kind` of `rt.lens`, suit every focal length of a zoom lens"
+            raise ValueError(
+                f"{name!r} does not differ between configurations; expected one of {', '.join(_NAMES)}"
+                f"{heights if name == 'fields' else ''}"
+            )
         for surface, values in by_surface.items():
             if not 0 <= surface < len(lens.surfaces):
                 raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")

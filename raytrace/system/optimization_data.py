@@ -7,6 +7,7 @@ while the lens is optimised. Nothing here is a tensor, so that two sets compare 
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +95,11 @@ class Row:
     operand: its name, as "TRAC", a key of `optimization.operands.table.OPERANDS` if it is known, or a function from a
         lens to a tensor () or (k,), which may be a `optimization.operands.operand.Measure`; `name` names either.
     integers, numbers: its arguments in the order of OpticStudio: surfaces, a wavelength (from 1, 0 the primary one) or
-        rows; Hx, Hy, Px, Py or data.
+        rows; Hx, Hy, Px, Py or data. One number is the first, and those left out are 0.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: of a row of text, and words after the numbers; further: numbers after those.
     Lengths in `OptimizationData.unit`, unconverted: a merit of lengths and pure numbers depends on the unit.
+    Raises ValueError for more arguments.
     """
 
     operand: str | Callable
@@ -107,6 +109,16 @@ class Row:
     weight: float = 0.0
     text: str = ""
     further: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        for name, size, zero in (("integers", 2, 0), ("numbers", 4, 0.0)):
+            given = getattr(self, name)
+            if isinstance(given, tuple) and len(given) == size:
+                continue
+            given = (given,) if isinstance(given, Real) else tuple(given)
+            if len(given) > size:
+                raise ValueError(f"row {self.name}: `{name}` {given}: expected at most {size}")
+            object.__setattr__(self, name, (*given, *(zero,) * (size - len(given))))
 
     @property
     def name(self) -> str:

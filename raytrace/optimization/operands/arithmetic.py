@@ -23,11 +23,13 @@ from raytrace.optimization.operands.operand import (
 )
 from raytrace.system.optimization_data import Row
 
+_ADDED = "; rows added by + count from 1 among themselves, as in [Row('DIMX'), Row('OPLT', 1)]"
+
 
 def _row(line: Line, number: int, rows: Sequence[Row]) -> int:
     """The number of a row that has a value. Raises BadRow."""
     if not 1 <= number <= len(rows):
-        raise BadRow(line, f"takes the value of row {number}: there are rows 1 to {len(rows)}")
+        raise BadRow(line, f"takes the value of row {number}: there are rows 1 to {len(rows)}{_ADDED}")
     operand = rows[number - 1].operand
     if operand in SETTINGS:
         raise BadRow(line, f"takes the value of row {number}, which has none: {operand}, {SETTINGS[operand]}")
@@ -46,7 +48,7 @@ def _range(line: Line, rows: Sequence[Row]) -> list[int]:
     """All between two that have a value; the ends may be text."""
     first, last = sorted(line.row.integers)
     if first < 1 or last > len(rows):
-        raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}")
+        raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}{_ADDED}")
     numbers = [number for number in range(first, last + 1) if rows[number - 1].operand not in SETTINGS]
     if not numbers:
         raise BadRow(line, f"takes the values of rows {first} to {last}: none of them has one")
