@@ -94,9 +94,9 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
     lost = []
 
     def recorded(problem, x, **bounds):
-        there = opened(problem, x, **bounds).x
-        lost.append([problem.state(one, False).lost for one in (x, there)])
-        return there
+        found = opened(problem, x, **bounds)
+        lost.append([problem.state(one, False).lost for one in (x, found[0])])
+        return found
 
     monkeypatch.setattr("raytrace.optimization.search.opened", recorded)
     found = [rt.search(steep, hold="efl=50", starts=1, bounds=f"curvature:-{c}..{c}", **HOW).merit for c in (0.1, 0.06)]

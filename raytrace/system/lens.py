@@ -54,8 +54,18 @@ APERTURE_KINDS = {
 # Behind the axes that a number has by itself (the terms of an asphere, say) the axis of the lenses follows. `aligned`
 # puts axes of 1 behind it, against which fields, wavelengths and pupil points broadcast: rays (3, L, F, W, P).
 
-#: Axes that numbers have by themselves, by the name of their field; all others are single numbers.
-_OWN_AXES = {"coefficients": 1, "heights": 2, "first": 1, "second": 1, "rotation": 2, "shift": 1}
+#: The values whose numbers may differ between lenses, and the axes that some of these have by themselves.
+_OWN_AXES = {
+    **{name: {"coefficients": 1} for name in ("Surface", "Glass", "ZernikeSag", "FringeSag", "PolynomialSag")},
+    **{name: {"coefficients": 1} for name in ("PowerSag", "RadialPhase", "PolynomialPhase", "FringePhase")},
+    **{name: {"coefficients": 1} for name in ("PolynomialPath", "RadialPath")},
+    **{name: {"first": 1, "second": 1} for name in ("Hologram", "HologramPath")},
+    **{name: {} for name in ("Pose", "Environment", "SystemAperture", "IrregularSag", "TiltSag")},
+    **{name: {} for name in ("Grating", "IdealLens")},
+    "GridSag": {"heights": 2},
+    "SplineSag": {"coefficients": 2},
+    "Turn": {"rotation": 2, "shift": 1},
+}
 
 #: The parts of a lens whose numbers may differ between the lenses of a batch.
 _PARTS = ("surfaces", "aperture", "environment")
@@ -166,31 +176,24 @@ def _mapped(lens: "Lens", change: Callable[[Tensor, int, str], Tensor]) -> "Lens
     """
     made: dict[int, Tensor] = {}
 
-    def walk(part, name: str, place: str):
+    def walk(part, own: int, place: str):
         if isinstance(part, Tensor):
             if id(part) not in made:
-                made[id(part)] = change(part, _OWN_AXES.get(name, 0), place.replace("_", " "))
+                made[id(part)] = change(part, own, place.replace("_", " "))
             return made[id(part)]
-        if isinstance(part, tuple):
-            places = [f"surface {k}" if name == "surfaces" else place for k in range(len(part))]
-            found = tuple(walk(entry, name, where) for entry, where in zip(part, places, strict=True))
-            return part if all(a is b for a, b in zip(found, part, strict=True)) else found
-        if not dataclasses.is_dataclass(part):
+        axes = _OWN_AXES.get(type(part).__name__)
+        if axes is None:
             return part
-        changes = {}
-        for field in dataclasses.fields(part):
-            before = getattr(part, field.name)
-            after = walk(before, field.name, f"{place}: {field.name}")
-            if after is not before:
-                changes[field.name] = after
+        numbers = [(field.name, getattr(part, field.name)) for field in dataclasses.fields(part)]
+        found = {name: walk(number, axes.get(name, 0), f"{place}: {name}") for name, number in numbers}
+        changes = {name: found[name] for name, number in numbers if found[name] is not number}
         return dataclasses.replace(part, **changes) if changes else part
 
-    changes = {}
-    for name in _PARTS:
-        before = getattr(lens, name)
-        after = walk(before, name, name)
-        if after is not before:
-            changes[name] = after
+    found = {name: walk(getattr(lens, name), 0, name) for name in ("aperture", "environment")}
+    found["surfaces"] = tuple(walk(surface, 0, f"surface {k}") for k, surface in enumerate(lens.surfaces))
+    if all(a is b for a, b in zip(found["surfaces"], lens.surfaces, strict=True)):
+        del found["surfaces"]
+    changes = {name: part for name, part in found.items() if part is not getattr(lens, name)}
     return dataclasses.replace(lens, **changes) if changes else lens
 
 

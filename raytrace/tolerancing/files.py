@@ -11,7 +11,7 @@ from raytrace.system.lens import Lens
 from raytrace.tolerancing.tolerances import Tolerances
 
 
-def read_tolerances(path: str | PathLike, **options) -> Tolerances:
+def read_tolerances(path: str | PathLike, **options: object) -> Tolerances:
     """The tolerances of a .zmx file: TRAD, TTHI, TETX … as rows, COMP and CPAR as compensators, TWAV, STAT, SAVE.
 
     options: of `read_lens`. Operands that are not read are listed in `unread`, each with the reason; see [Tolerances](
