@@ -30,7 +30,7 @@ def drawn(monkeypatch):
 
     def run(*words: str):
         figures = []
-        monkeypatch.setattr(style, "save", lambda figure, path: figures.append(figure))
+        monkeypatch.setattr(style, "save", lambda figure, path, **how: figures.append(figure))
         assert main([*words, "--plot", "figure.png"]) == 0
         return figures[-1]
 

@@ -155,7 +155,7 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
 
 def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
     drawn = []
-    monkeypatch.setattr(style, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(style, "save", lambda figure, path, **how: drawn.append(figure))
     words = ["psf", "phone", "--model", "gaussian", "--plot", str(tmp_path / "a.png")]
     for more in ([], ["--pixel", "0.001"], ["--size", "31"], ["--per-wavelength"]):
         assert main([*words, *more]) == 0

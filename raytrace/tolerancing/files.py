@@ -2,6 +2,7 @@
 
 from os import PathLike, fspath
 from pathlib import Path
+from typing import Any
 
 from raytrace.io import read_lens
 from raytrace.io.source import LensFileError, Place, read_text
@@ -11,7 +12,7 @@ from raytrace.system.lens import Lens
 from raytrace.tolerancing.tolerances import Tolerances
 
 
-def read_tolerances(path: str | PathLike, **options: object) -> Tolerances:
+def read_tolerances(path: str | PathLike, **options: Any) -> Tolerances:
     """The tolerances of a .zmx file: TRAD, TTHI, TETX … as rows, COMP and CPAR as compensators, TWAV, STAT, SAVE.
 
     options: of `read_lens`. Operands that are not read are listed in `unread`, each with the reason; see [Tolerances](
