@@ -26,6 +26,12 @@ _FINITE = ("fields", "frequencies", "radii", "wavelengths")
 _SEVERAL = (*_FINITE, "depths", "object_distances", "distance_weights", "field_weights", "wavelength_weights")
 
 
+#: Functions that take a batch of lenses; the others take one.
+BATCHED = {
+    *("first_order", "rays", "trace", "spot", "wavefront", "psf", "mtf", "perturbed", "to"),
+    *("with_object_distance", "with_sensor_distance"),
+}
+
 #: Modules whose classes are looked for; a module, an optimizer or a generator of torch may be anything alike.
 _CHECKED = r"builtins|collections\.abc|os|pathlib|raytrace\..*|torch"
 _ITERABLE = {Sequence, Iterable, list, tuple}
@@ -139,7 +145,11 @@ def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) 
 
 
 def _lens(verb: str, name: str, value: object) -> Lens:
-    return value if isinstance(value, Lens) else as_lens(value, verb)
+    if not isinstance(value, Lens):
+        return as_lens(value, verb)
+    if verb not in BATCHED and value.count is not None:
+        raise ValueError(f"{verb} takes one lens, not a batch of {value.count}: call it for each, `for one in lenses`")
+    return value
 
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.system.sag_terms import GridSag
 
 LENSES = ("cooke_triplet", "double_gauss", "phone")
 
@@ -160,3 +161,37 @@ def test_table_and_document_have_the_lens():
     assert len(frame) == spots.rms_radius.numel()
     assert spots.document()["results"][-1]["lens"] == 1
     assert "lens" in str(spots)
+
+
+@pytest.mark.parametrize("verb", ["rms", "centroid", "spots of all wavelengths", "psf gaussian"])
+def test_a_clipped_batch_is_a_loop(verb):
+    """The pupil of every lens ends at its own rims."""
+    lens = rt.read_lens("double_gauss").at(fields=[0, 10], ray_aiming="off")
+    for k, radius in ((1, 20.0), (11, 16.0)):
+        lens = lens.replace(k, apertures=(rt.Aperture("circular", (0.0, radius)),))
+    gap = lens.surfaces[2].thickness + torch.tensor([0.0, 0.05, 0.1], dtype=torch.float64)
+    lenses = lens.replace(2, thickness=gap)
+    assert not bool(rt.spot(lens).arrivals.rays.valid.all())
+    each = torch.stack([VERBS[verb](lenses[k]) for k in range(3)])
+    torch.testing.assert_close(VERBS[verb](lenses), each, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        rt.relative_illumination, rt.seidel, rt.focus, rt.info, rt.mtf,
+        lambda lenses: rt.mtf(lenses, [30.0], geometric=True, through_focus=0.1),
+        lambda lenses: rt.spot(lenses, rays=1000),
+        lambda lenses: rt.psf(lenses, object_distances=[1e3, 2e3, 3e3]),
+    ],
+)  # fmt: skip
+def test_what_takes_one_lens_refuses_a_batch(verb):
+    lens = rt.read_lens("cooke_triplet")
+    with pytest.raises(ValueError, match="batch"):
+        verb(lens.replace(2, thickness=torch.tensor([12.9, 13.0], dtype=torch.float64)))
+
+
+def test_a_value_with_axes_of_its_own_is_no_batch():
+    heights = torch.zeros(5, 7, dtype=torch.float64)
+    grid = rt.read_lens("singlet").replace(1, sag_terms=GridSag(heights, torch.tensor(5.0, dtype=torch.float64)))
+    assert grid.count is None

@@ -173,6 +173,9 @@ def mtf(
     through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
     ValueError where too few rays arrive or the blur is too large.
     """
+    if lens.count is not None and not (geometric and through_focus is None and frequencies is not None):
+        message = "a batch of lenses has the geometric MTF alone: give `frequencies` and `geometric=True`"
+        raise ValueError(f"{message}, or call it for each lens")
     lens, fields = setting(aligned(lens, 3), fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
     choice = None if geometric is None else torch.full_like(fields[0], geometric, dtype=torch.bool)

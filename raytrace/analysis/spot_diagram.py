@@ -23,6 +23,7 @@ from raytrace.system.lens import (
     field_points,
     field_title,
     name_of_field,
+    one_lens,
     with_wavelengths,
 )
 from raytrace.tracing.clear_pupil import arms_of, is_clipped
@@ -219,6 +220,8 @@ def spot(
     fields = field_points(fields, like=lens)
     warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     if rays is not None:
+        if lens.count is not None:
+            raise ValueError("`rays` traces one lens, not a batch: leave it out, or choose a lens, as lens[0]")
         _refuse_of_many(sampling, rings, points, reference, weights)
         how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}
         return _of_many(lens, fields, rays, "random" if sampling == "random" else "sobol", progress, **how)
@@ -241,8 +244,30 @@ def spot(
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
     if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):
         aimed, size = with_ray_aiming(lens, ray_aiming), SAMPLINGS["gauss"][2] if rings is None else rings
-        spots, whole = _of_clear_pupils(aimed, fields, at[:, shares > 0], size, about, spots, whole)
+        how = fields, at[:, shares > 0], size
+        if lens.count is None:
+            spots, whole = _of_clear_pupils(aimed, *how, about, spots, whole)
+        else:
+            each = [
+                _of_clear_pupils(one_lens(aimed, k), *how, None if about is None else about[:, k], *parts)
+                for k, parts in enumerate(zip(_unbound(spots), _unbound(whole), strict=True))
+            ]
+            spots, whole = (_stacked(parts) for parts in zip(*each, strict=True))
     return Spots(lens, fields, spots, whole, found, reference, weights)
+
+
+def _unbound(spot: Spot) -> list[Spot]:
+    """The spots of each lens of a batch."""
+    vectors = ("centroid", "points")
+    parts = {f.name: getattr(spot, f.name).unbind(int(f.name in vectors)) for f in dataclasses.fields(spot)}
+    return [Spot(**dict(zip(parts, entries, strict=True))) for entries in zip(*parts.values(), strict=True)]
+
+
+def _stacked(spots: Sequence[Spot]) -> Spot:
+    """The spots of the lenses of a batch, whose axis comes first."""
+    vectors = ("centroid", "points")
+    names = [field.name for field in dataclasses.fields(Spot)]
+    return Spot(**{name: torch.stack([getattr(s, name) for s in spots], int(name in vectors)) for name in names})
 
 
 def _of_clear_pupils(

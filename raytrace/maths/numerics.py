@@ -378,7 +378,7 @@ def value(cls: type) -> type:
     shown = cls.__repr__ is object.__repr__
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
     fields = dataclasses.fields(cls)
-    numeric = {field.name for field in fields if _holds_numbers(field.type)}
+    numeric = {field.name for field in fields if holds_numbers(field.type)}
     mixed = [field.name for field in fields if _may_hold_tensors(field.type)]
 
     def flatten(instance):
@@ -400,12 +400,12 @@ def value(cls: type) -> type:
     return cls
 
 
-def _holds_numbers(annotation: object) -> bool:
+def holds_numbers(annotation: object) -> bool:
     """Whether a field of this type holds a tensor, a value or a tuple of values (or None in their place)."""
     if typing.get_origin(annotation) is tuple:
         return typing.get_args(annotation)[0] in _VALUE_TYPES
     if isinstance(annotation, types.UnionType):
-        return any(_holds_numbers(member) for member in typing.get_args(annotation))
+        return any(holds_numbers(member) for member in typing.get_args(annotation))
     return annotation is torch.Tensor or annotation in _VALUE_TYPES
 
 

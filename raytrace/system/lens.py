@@ -1,8 +1,9 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
+import functools
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
-from raytrace.maths.numerics import broadcast_shape, check_precision, value
+from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
@@ -77,32 +78,20 @@ def lens_count(lens: "Lens") -> int | None:
     Raises ValueError for numbers of different counts.
     """
     counts: dict[int, str] = {}
-
-    def note(number: Tensor, own: int, place: str) -> Tensor:
-        if number.dim() > own and number.shape[own] != 1:
-            counts.setdefault(number.shape[own], place)
-        elif number.dim() > own:
-            counts.setdefault(1, place)
-        return number
-
-    _mapped(lens, note)
-    several = {count: place for count, place in counts.items() if count != 1}
+    for number, own, name, surface in _numbers(lens):
+        if number.dim() > own and number.shape[own] not in counts:
+            counts[number.shape[own]] = f"{name}" if surface is None else f"surface {surface}: {name.replace('_', ' ')}"
+    several = [count for count in counts if count != 1]
     if len(several) > 1:
-        (one, here), (other, there), *_ = several.items()
+        one, other, *_ = several
+        here, there = counts[one], counts[other]
         raise ValueError(f"{here} has numbers of {one} lenses, {there} of {other}; expected as many, or one")
     return next(iter(several or counts), None)
 
 
 def batch_shape(lens: "Lens") -> torch.Size:
     """The shape (L, 1, …) that the numbers of an `aligned` batch broadcast to; () of a single lens."""
-    shapes: list[torch.Size] = [torch.Size()]
-
-    def note(number: Tensor, own: int, place: str) -> Tensor:
-        shapes.append(number.shape[own:])
-        return number
-
-    _mapped(lens, note)
-    return broadcast_shape(*{*shapes})
+    return broadcast_shape(*{number.shape[own:] for number, own, *_ in _numbers(lens)})
 
 
 def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
@@ -111,7 +100,7 @@ def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
     A number that is common to all lenses, or has the axes, stays the same tensor.
     """
 
-    def align(number: Tensor, own: int, place: str) -> Tensor:
+    def align(number: Tensor, own: int) -> Tensor:
         missing = own + 1 + axes - number.dim()
         if number.dim() <= own or missing == 0 or (missing < 0 and not exactly):
             return number
@@ -131,7 +120,7 @@ def one_lens(lens: "Lens", number: int | slice | Tensor) -> "Lens":
     if isinstance(number, int) and not -count <= number < count:
         raise IndexError(f"lens {number} of a batch of {count} lenses; expected 0 to {count - 1}")
 
-    def take(entries: Tensor, own: int, place: str) -> Tensor:
+    def take(entries: Tensor, own: int) -> Tensor:
         if entries.dim() <= own:
             return entries
         chosen = (slice(None),) * own
@@ -160,7 +149,7 @@ def batch(lenses: Sequence["Lens"]) -> "Lens":
             raise ValueError(f"lens {k} has other surfaces, glasses or apertures than lens 0; expected other numbers")
     rows = {id(column[0]): column for column in zip(*leaves, strict=True)}
 
-    def join(number: Tensor, own: int, place: str) -> Tensor:
+    def join(number: Tensor, own: int) -> Tensor:
         column = rows[id(number)]
         if all(entry is number or (not entry.requires_grad and torch.equal(entry, number)) for entry in column):
             return number
@@ -169,31 +158,57 @@ def batch(lenses: Sequence["Lens"]) -> "Lens":
     return _mapped(lenses[0], join)
 
 
-def _mapped(lens: "Lens", change: Callable[[Tensor, int, str], Tensor]) -> "Lens":
-    """The lens with changed numbers; change: number, how many axes it has by itself, its place in words -> number.
+@functools.cache
+def _fields_of(kind: type) -> tuple[tuple[str, int], ...]:
+    """The fields of a value that hold numbers of a batch, and the axes that these have by themselves."""
+    own = _OWN_AXES.get(kind.__name__)
+    fields = () if own is None else dataclasses.fields(kind)
+    return tuple((field.name, own.get(field.name, 0)) for field in fields if holds_numbers(field.type))
+
+
+def _numbers(lens: "Lens") -> Iterator[tuple[Tensor, int, str, int | None]]:
+    """Every number that may differ between lenses: its own axes, its name and its surface, None of the whole lens."""
+
+    def walk(part, surface: int | None):
+        for name, own in _fields_of(type(part)):
+            entry = getattr(part, name)
+            if isinstance(entry, Tensor):
+                yield entry, own, name, surface
+            elif entry is not None:
+                yield from walk(entry, surface)
+
+    yield from walk(lens.aperture, None)
+    yield from walk(lens.environment, None)
+    for k, surface in enumerate(lens.surfaces):
+        yield from walk(surface, k)
+
+
+def _mapped(lens: "Lens", change: Callable[[Tensor, int], Tensor]) -> "Lens":
+    """The lens with changed numbers; change: number, how many axes it has by itself -> number.
 
     A number that occurs in several places (the coefficients of air, say) stays one.
     """
     made: dict[int, Tensor] = {}
 
-    def walk(part, own: int, place: str):
-        if isinstance(part, Tensor):
-            if id(part) not in made:
-                made[id(part)] = change(part, own, place.replace("_", " "))
-            return made[id(part)]
-        axes = _OWN_AXES.get(type(part).__name__)
-        if axes is None:
-            return part
-        numbers = [(field.name, getattr(part, field.name)) for field in dataclasses.fields(part)]
-        found = {name: walk(number, axes.get(name, 0), f"{place}: {name}") for name, number in numbers}
-        changes = {name: found[name] for name, number in numbers if found[name] is not number}
+    def walk(part):
+        changes = {}
+        for name, own in _fields_of(type(part)):
+            before = getattr(part, name)
+            if isinstance(before, Tensor):
+                if id(before) not in made:
+                    made[id(before)] = change(before, own)
+                after = made[id(before)]
+            else:
+                after = before if before is None else walk(before)
+            if after is not before:
+                changes[name] = after
         return dataclasses.replace(part, **changes) if changes else part
 
-    found = {name: walk(getattr(lens, name), 0, name) for name in ("aperture", "environment")}
-    found["surfaces"] = tuple(walk(surface, 0, f"surface {k}") for k, surface in enumerate(lens.surfaces))
-    if all(a is b for a, b in zip(found["surfaces"], lens.surfaces, strict=True)):
-        del found["surfaces"]
-    changes = {name: part for name, part in found.items() if part is not getattr(lens, name)}
+    parts = {name: walk(getattr(lens, name)) for name in ("aperture", "environment")}
+    surfaces = tuple(map(walk, lens.surfaces))
+    if any(after is not before for after, before in zip(surfaces, lens.surfaces, strict=True)):
+        parts["surfaces"] = surfaces
+    changes = {name: part for name, part in parts.items() if part is not getattr(lens, name)}
     return dataclasses.replace(lens, **changes) if changes else lens
 
 

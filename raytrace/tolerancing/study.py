@@ -10,7 +10,7 @@ compensators eliminated,
     H = q_ee - q_ec q_cc⁻¹ q_ce,     E[q] = q₀ + g·m + ½ (tr(H Σ) + m·H m),
 
 m and Σ the means and variances of the errors. The distribution of f is that of the root of the same quadratic form.
-Source: Koch, Wimmer and others on wavefront differentials; Rimmer, Appl. Opt. 9, 533 (1970).
+Source of the expansion: Rimmer, Appl. Opt. 9, 533 (1970).
 """
 
 import dataclasses

@@ -119,10 +119,10 @@ class Traced(Rays, Result):
         """The rays of one lens of a batch."""
         parts = (self.position, self.direction, self.launched.position, self.launched.direction)
         position, direction, *start = (part[:, number] for part in parts)
-        path, begun = (
+        path, launched_path = (
             rays.opl if rays.opl is None else rays.opl.expand(rays.shape)[number] for rays in (self, self.launched)
         )
-        launched = Rays(*start, self.launched.valid[number], begun, self.launched.wavelength)
+        launched = Rays(*start, self.launched.valid[number], launched_path, self.launched.wavelength)
         labels = None if self.labels is None else self.labels[:, number]
         ends = position, direction, self.valid[number], path, self.wavelength
         return Traced(*ends, one_lens(self.lens, number), launched, labels)
