@@ -117,6 +117,9 @@ def test_compensators_stay_within_their_limits(triplet):
     found = rt.tolerance(triplet, held, trials=100)
     assert float(found.changes.min()) >= -0.02
     assert float(found.changes.max()) <= 0.03
+    assert found.at_limit(0) == int(((found.changes == -0.02) | (found.changes == 0.03)).sum()) > 0
+    assert f"at a limit in {found.at_limit(0)}" in str(found)
+    assert found.unsettled == 0
     none = rt.tolerance(triplet, dataclasses.replace(free, compensators=()), trials=100)
     assert none.changes.shape == (100, 0)
     assert float(none.trials.mean()) > float(found.trials.mean())

@@ -1,7 +1,7 @@
 """Tolerancing: sensitivities, the expectation of the lens as built, and its distribution by Monte Carlo.
 
-The criterion f of a lens with errors e and compensators c is √q, q its mean square, or q itself; the lens as built has
-the compensators that minimise the mean square q_c. Of one trial they come from Newton's method with the exact gradient
+The criterion f of a lens with errors e and compensators c is √q, the root of a mean square; the lens as built has the
+compensators that minimise it. Of one trial they come from Newton's method with the exact gradient
 and differences of gradients, all lenses of a batch at once.
 
 Second order: with g and H the derivatives of q by the errors, H those of differences of exact gradients and with the
@@ -43,7 +43,8 @@ from raytrace.tracing.spot import image_rays, spot_of_points
 from raytrace.tracing.wavefront import wavefront_of, without
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
-_NEWTON = 3  # steps of the compensators
+_NEWTON = 12  # steps of the compensators, at most
+_SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _CHUNK = 256  # lenses traced at once
 _MODEL = 2**15  # draws of the second-order model
 #: Percentages of the table of percentiles.
@@ -52,12 +53,11 @@ PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
-    """What is judged: its unit, its mean square q of a batch (L,), and the criterion itself of q."""
+    """A measure of image quality, the root of a mean square q; square: q (L,) of a batch of lenses."""
 
     name: str
     unit: str
     square: Callable[[Lens, "Sampling"], Tensor]
-    of_square: Callable[[Tensor], Tensor] = torch.sqrt
 
 
 @value
@@ -111,6 +111,7 @@ class Study:
         self.least = like.new_tensor([one.minimum for one in self.compensators])
         self.most = like.new_tensor([one.maximum for one in self.compensators])
         self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
+        self.unsettled = 0  # lenses whose compensators still gained 1e-6 of q in the last step
 
     def square(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
@@ -146,11 +147,14 @@ class Study:
         for _ in range(_NEWTON):
             slopes = self.slope_of_compensators(errors, changes)
             step = torch.linalg.solve(curvature, slopes[..., None])[..., 0]
-            changes = torch.clamp(changes - step, self.least, self.most)
-            if not bool((step.abs() > 1e-9 * (1 + changes.abs())).any()):
+            moved = torch.clamp(changes - step, self.least, self.most)
+            gain, changes = (0.5 * (slopes * (changes - moved)).sum(-1)).abs(), moved
+            with torch.no_grad():
+                q = self.square(errors, changes)
+            if not bool((gain > _SETTLED * q).any()):
                 break
-        with torch.no_grad():
-            return self.square(errors, changes), changes
+        self.unsettled += int((gain > 1e-6 * q).sum())
+        return q, changes
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -233,7 +237,7 @@ class Toleranced(Result):
     estimated: () nominal + √Σ ½(Δmin² + Δmax²), as OpticStudio. expected: () the mean of the criterion by second order;
     expected_square: () that of its square. predicted: (K,) draws of the second-order model. trials: (T,) the criterion
     of the perturbed and compensated lenses, nan where no ray arrives; changes: (T, C) of the compensators.
-    target: () the criterion that `yield_` of the lenses meet.
+    unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
     """
 
     lens: Lens
@@ -251,6 +255,7 @@ class Toleranced(Result):
     trials: Tensor
     changes: Tensor
     seed: int = 0
+    unsettled: int = 0
 
     COLUMNS = property(
         lambda self: (
@@ -275,6 +280,11 @@ class Toleranced(Result):
     def yield_at(self, most: float) -> float:
         """Share of the trials whose criterion is at most a number."""
         return float((self.trials <= most).double().mean())
+
+    def at_limit(self, number: int) -> int:
+        """How many trials have a compensator, by its number from 0, at one of its limits."""
+        one, moved = self.tolerances.compensators[number], self.changes[:, number]
+        return int(((moved <= one.minimum) | (moved >= one.maximum)).sum())
 
     def columns(self) -> dict[str, Tensor]:
         order = self.worst
@@ -326,7 +336,10 @@ class Toleranced(Result):
                 about.append(
                     f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
                     f"σ {float(c.std()):.4g}"
+                    + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
+        if self.unsettled:
+            about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
         return [Table(self.columns(), about)]
 
     def document(self) -> dict:
@@ -414,19 +427,20 @@ def tolerance(
         nominal_square, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_square.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
-        nominal = chosen.of_square(nominal_square[0])
+        nominal = nominal_square[0].sqrt()
         low, high = _at_limits(study)
-        changes = [chosen.of_square(q) - nominal for q in (low, high)]
+        changes = [q.sqrt() - nominal for q in (low, high)]
         q0, g, H = study.second_order()
         predicted, mean_square = _model(tolerances, q0, g, H, seed)
-        predicted = chosen.of_square(predicted.clamp_min(0))
+        predicted = predicted.clamp_min(0).sqrt()
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    slope = g * study.half / (2 * nominal) if chosen.of_square is torch.sqrt else g * study.half
+    slope = g * study.half / (2 * nominal)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
         minimum=changes[0], maximum=changes[1], slope=slope, estimated=nominal + rss, expected=predicted.mean(),
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
+        unsettled=study.unsettled,
     )  # fmt: skip
 
 
@@ -497,7 +511,7 @@ def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Sha
         if rows is None or len(rows) != len(part):
             errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
             q, changes = study.compensated(errors.reshape(len(part), count))
-            rows = torch.cat([study.criterion.of_square(q)[:, None], changes], -1)
+            rows = torch.cat([q.sqrt()[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
         found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
