@@ -32,15 +32,14 @@ from raytrace.shards import Share, total
 from raytrace.stores import Kind, Records, listed, number, record, whole
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, aligned, field_points
-from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, with_number
+from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
+from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
+from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
-from raytrace.tolerancing.perturbation import path_of, perturbed
+from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
-from raytrace.tracing.scene import scene
-from raytrace.tracing.spot import image_rays, spot_of_points
-from raytrace.tracing.wavefront import wavefront_of, without
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
@@ -51,51 +50,6 @@ _MODEL = 2**15  # draws of the second-order model
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 
 
-@dataclasses.dataclass(frozen=True)
-class Criterion:
-    """A measure of image quality, the root of a mean square q; square: q (L,) of a batch of lenses."""
-
-    name: str
-    unit: str
-    square: Callable[[Lens, "Sampling"], Tensor]
-
-
-@value
-class Sampling:
-    """Fields (2, F) with weights (F,), and pupil points (2, P) with weights (P,)."""
-
-    fields: Tensor
-    field_weights: Tensor
-    points: Tensor
-    weights: Tensor
-
-
-def _mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
-    """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field."""
-    rays = image_rays(lens, sampling.points, fields=sampling.fields)
-    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    hits, valid = rays.position[:2].flatten(-2), rays.valid.flatten(-2)
-    spots = spot_of_points(hits, valid, (shares[:, None] * sampling.weights).flatten())
-    return 1e6 * (sampling.field_weights * spots.mean_square_radius).sum(-1)
-
-
-def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
-    """Mean square (L,) of the OPD about its mean and tilt, waves²."""
-    distance = lens.surfaces[0].thickness.reshape(-1).expand(lens.count or 1)
-    front = wavefront_of(scene(lens, sampling.fields, distance, lens.wavelengths), sampling.points, sampling.weights)
-    flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
-    share = front.energy / front.energy.sum(-1, keepdim=True)
-    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    return (sampling.field_weights * ((share * flat * flat).sum(-1) * shares).sum(-1)).sum(-1)
-
-
-#: Criteria by name.
-CRITERIA = {
-    "rms": Criterion("RMS spot radius", "µm", _mean_square_radius),
-    "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
-}
-
-
 class Study:
     """A lens with its tolerances, as functions of errors (L, N) and changes (L, C) of compensators.
 
@@ -104,6 +58,7 @@ class Study:
 
     def __init__(self, lens: Lens, tolerances: Tolerances, criterion: Criterion, sampling: Sampling):
         self.lens, self.tolerances, self.criterion, self.sampling = lens, tolerances, criterion, sampling
+        self.perturbation = Perturbation(lens, tolerances)
         self.compensators = tolerances.compensators
         for one in self.compensators:
             _check(lens, one)
@@ -115,8 +70,18 @@ class Study:
 
     def square(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
-        lens = with_changes(perturbed(self.lens, self.tolerances, errors), self.compensators, changes)
+        lens = with_changes(self.perturbation(errors), self.compensators, changes)
         return self.criterion.square(aligned(lens, 3), self.sampling)
+
+    def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor] | None:
+        """q (L,) with the sensor at its least, and its shift (L, 1); None where no parabola has it."""
+        if self.criterion.parabola is None or not focuses(self.lens, self.compensators):
+            return None
+        lens = self.perturbation(errors)
+        if not is_plain_sensor(lens.surfaces[-1]):
+            return None
+        found = at_best_focus(self.criterion.parabola(aligned(lens, 3), self.sampling), self.least, self.most)
+        return found[0], found[1][:, None]
 
     def slope(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) and its derivatives by the errors (L, N) and the compensators (L, C)."""
@@ -143,6 +108,9 @@ class Study:
         if not self.compensators:
             with torch.no_grad():
                 return self.square(errors, changes), changes
+        with torch.no_grad():
+            if (found := self.refocused(errors)) is not None:
+                return found
         curvature = self.nominal_curvature()
         for _ in range(_NEWTON):
             slopes = self.slope_of_compensators(errors, changes)
@@ -195,6 +163,17 @@ class Study:
             mixed = whole[:count, count:]
             H = H - mixed @ torch.linalg.solve(whole[count:, count:], mixed.T)
         return float(q), slope[0], H
+
+
+def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
+    """Whether the distance of the sensor is all that is adjusted, and the beams do not depend on it."""
+    of_sensor = [(one.surface, one.parameter) for one in compensators] == [(sensor(lens), "thickness")]
+    return of_sensor and lens.fields.kind != "real_image_height"
+
+
+def is_plain_sensor(surface: Surface) -> bool:
+    """Whether the image surface is a plane across the axis that clips no ray."""
+    return surface.is_plane and surface.before is None and not surface.apertures
 
 
 def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tensor) -> Lens:
