@@ -74,40 +74,45 @@ def test_mtf_has_exact_derivatives(triplet):
 
 
 def test_changes_of_the_mtf_are_those_of_single_lenses(triplet):
-    rows = rt.tolerances(triplet, "radius:3=0.1% element_tilt:3=0.05", compensators=[])
+    rows = rt.tolerances(triplet, "radius:3=0.1%", compensators=[])
     found = rt.tolerance(triplet, rows, criterion="mtf@30", trials=0, fields=[0, 5])
     for n in range(len(rows)):
         for limit, change in ((rows.minimum[n], found.minimum[n]), (rows.maximum[n], found.maximum[n])):
             errors = torch.zeros(1, len(rows), dtype=torch.float64)
             errors[0, n] = limit
-            alone = rt.tolerance(rt.perturbed(triplet, rows, errors[0]), rows, criterion="mtf@30", trials=0, fields=[0, 5])
+            alone = rt.tolerance(
+                rt.perturbed(triplet, rows, errors[0]), rows, criterion="mtf@30", trials=0, fields=[0, 5]
+            )
             assert float(found.nominal + change) == pytest.approx(float(alone.nominal), abs=1e-5)
 
 
 def test_mtf_as_built_reads_the_right_way_round(triplet):
-    found = rt.tolerance(triplet, limits=LIMITS, criterion="mtf@20", trials=64)
+    found = rt.tolerance(triplet, limits=LIMITS, criterion="mtf@20", trials=24)
     assert found.better == "larger"
     assert float(found.estimated) < float(found.expected) < float(found.nominal)
     assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.02)
     assert float(found.percentile(98)) < float(found.percentile(50)) < float(found.percentile(2))
-    assert found.yield_at(float(found.percentile(80))) == pytest.approx(0.8, abs=0.02)
+    assert found.yield_at(float(found.percentile(80))) == pytest.approx(0.8, abs=0.05)
     assert found.yield_at(0.0) == 1
     assert found.yield_at(1.0) == 0
     worst = int(found.worst[0])
-    assert float(torch.minimum(found.minimum, found.maximum)[worst]) == float(torch.minimum(found.minimum, found.maximum).min())
+    assert float(torch.minimum(found.minimum, found.maximum)[worst]) == float(
+        torch.minimum(found.minimum, found.maximum).min()
+    )
     text = str(found)
     assert "larger is better" in text
     assert "98 % ≥" in text
     assert found.summary()["worst"] == float(found.trials.min())
 
 
+@pytest.mark.slow
 def test_compensated_mtf_is_the_best_over_the_sensor_distance(triplet):
     rows = rt.tolerances(triplet, "thickness:3=0.05")
     found = rt.tolerance(triplet, rows, criterion="mtf@30", trials=0, fields=[0, 5])
     lens = rt.perturbed(triplet, rows, rows.maximum)
     sampling = sampling_of(lens)
     criterion = criterion_of("mtf@30", triplet, sampling)
-    shifts = torch.linspace(-0.2, 0.2, 401, dtype=torch.float64)
+    shifts = torch.linspace(-0.2, 0.2, 201, dtype=torch.float64)
     moved = lens.at(sensor_distance=float(lens.surfaces[-2].thickness)).replace(
         len(lens.surfaces) - 2, thickness=lens.surfaces[-2].thickness + shifts
     )
@@ -131,7 +136,6 @@ def test_criteria_that_there_are_not(triplet, word, message):
 
 
 def test_mtf_of_a_clipped_beam_is_refused(triplet):
-    aperture = rt.read_lens("double_gauss").surfaces[1].apertures or ()
-    clipped = triplet.replace(4, apertures=aperture or (rt.Aperture.circle(3.0),))
+    clipped = triplet.replace(4, apertures=(rt.Aperture("circular", (0.0, 3.0)),))
     with pytest.raises(ValueError, match=r"rays of field .* are clipped or fail"):
         rt.tolerance(clipped, limits=LIMITS, criterion="mtf@20", trials=0)

@@ -120,26 +120,27 @@ class Study:
         with torch.no_grad():
             if (found := self.refocused(errors)) is not None:
                 return found
-        curvature, trial = self.nominal_curvature(), at
-        q, slopes = errors.new_full((len(errors),), torch.inf), torch.zeros_like(at)
-        scale, least = errors.new_ones(len(errors), 1), 1e-6 * self.criterion.scale
+        curvature, trial, count = self.nominal_curvature(), at, len(errors)
+        q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(at), torch.zeros(count).to(errors)
+        scale, least, moving = errors.new_ones(count, 1), 1e-6 * self.criterion.scale, torch.arange(count)
         for step in range(_NEWTON + 1):
-            q_trial, slopes_trial = self.slope_of_compensators(errors, trial)
-            better = ~(q_trial > q)
+            q_trial, slopes_trial = self.slope_of_compensators(errors[moving], trial)
+            better, start, before = ~(q_trial > q[moving]), at[moving], slopes[moving]
             if step:
-                moved = trial - at
+                moved = trial - start
                 expected = ((moved @ curvature) * moved).sum(-1)
-                ratio = ((slopes_trial - slopes) * moved).sum(-1) / expected
-                usable = (expected > 0) & ratio.isfinite() & (better | (ratio > 0))
-                secant = torch.where(usable, ratio, 1.0).clamp(0.2, 25.0)
-                scale = torch.where(better, secant, torch.maximum(secant, 4 * scale[:, 0]))[:, None]
-            q = torch.where(better, q_trial, q)
-            at, slopes = (torch.where(better[:, None], new, old) for new, old in ((trial, at), (slopes_trial, slopes)))
-            trial = torch.clamp(
-                at - torch.linalg.solve(curvature, slopes[..., None])[..., 0] / scale, self.least, self.most
-            )
-            gain = (0.5 * (slopes * (at - trial)).sum(-1)).abs()
-            if not bool((gain > _SETTLED * (q + least)).any()):
+                ratio = ((slopes_trial - before) * moved).sum(-1) / expected
+                secant = torch.where((expected > 0) & (ratio > 0), ratio, 1.0).clamp(0.2, 25.0)
+                scale[moving] = torch.where(better, secant, torch.maximum(secant, 4 * scale[moving, 0]))[:, None]
+            q[moving] = torch.where(better, q_trial, q[moving])
+            at[moving] = start = torch.where(better[:, None], trial, start)
+            slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
+            full = torch.linalg.solve(curvature, before[..., None])[..., 0]
+            trial = torch.clamp(start - full / scale[moving], self.least, self.most)
+            gain[moving] = (0.5 * (before * (start - trial)).sum(-1)).abs()
+            going = gain[moving] > _SETTLED * (q[moving] + least)
+            moving, trial = moving[going], trial[going]
+            if not len(moving):
                 break
         self.unsettled += int((gain > 1e-6 * (q + least)).sum())
         return q, at
