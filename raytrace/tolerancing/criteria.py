@@ -38,9 +38,9 @@ class Criterion:
     """A measure of image quality f(q) of a quantity q that the compensators minimise.
 
     quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
-    with the sensor s mm further along its normal; None: no closed form. value: f of q; sign: -1 where a larger f is
-    better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with derivatives.
-    settings: what q depends on beyond lens, fields and pupil.
+    with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
+    where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
+    derivatives. settings: what q depends on beyond lens, fields and pupil.
     """
 
     name: str
@@ -48,6 +48,7 @@ class Criterion:
     quantity: Callable[[Lens, Sampling], Tensor]
     parabola: Callable[[Lens, Sampling], tuple[Tensor, Tensor, Tensor]] | None = None
     value: Callable[[Tensor], Tensor] = torch.sqrt
+    quantity_of: Callable[[float], float] = lambda f: f * f
     sign: int = 1
     scale: float = 0.0
     together: int = 256
@@ -94,7 +95,11 @@ def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
         return 1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1)
 
     name = f"MTF at {frequency:g} cycles/mm"
-    return Criterion(name, "", quantity, value=lambda q: 1 - q, sign=-1, scale=1.0, together=32)
+
+    def missing(number):
+        return 1 - number
+
+    return Criterion(name, "", quantity, value=missing, quantity_of=missing, sign=-1, scale=1.0, together=32)
 
 
 #: Criteria of every lens by name, and those that are made of the nominal lens.

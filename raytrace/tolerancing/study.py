@@ -39,13 +39,14 @@ from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, cr
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_CHUNK = 256  # lenses traced at once
+_CHUNK = 512  # lenses traced at once
 _MODEL = 2**15  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -144,6 +145,13 @@ class Study:
                 break
         self.unsettled += int((gain > 1e-6 * (q + least)).sum())
         return q, at
+
+    def harm(self, errors: Tensor) -> Tensor:
+        """How much worse the criterion (L,) of compensated lenses is than that of the nominal one."""
+        zero = self.half.new_zeros(1, errors.shape[1])
+        found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(_CHUNK))]
+        nominal, *others = (self.criterion.value(q) for q in found)
+        return self.criterion.sign * (torch.cat(others) - nominal)
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -244,12 +252,15 @@ class Toleranced(Result):
 
     better: "smaller" or "larger", which values of the criterion are better.
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
-    of the criterion by each tolerance at its limits, compensated; slope: (N,) its derivative times the half width.
+    of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
+    second order; slope: (N,) its derivative times the half width.
     estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
     second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
     second-order model. trials: (T,) the criterion of the perturbed and compensated lenses, nan where no ray arrives;
     changes: (T, C) of the compensators.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
+    goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
+    before their limits were tightened, or None.
     """
 
     lens: Lens
@@ -259,6 +270,8 @@ class Toleranced(Result):
     nominal: Tensor
     minimum: Tensor
     maximum: Tensor
+    second_minimum: Tensor
+    second_maximum: Tensor
     slope: Tensor
     estimated: Tensor
     expected: Tensor
@@ -268,6 +281,9 @@ class Toleranced(Result):
     changes: Tensor
     seed: int = 0
     unsettled: int = 0
+    goal: float | None = None
+    share: float = 0.9
+    given: object = None
     better: str = "smaller"
 
     COLUMNS = property(
@@ -277,6 +293,8 @@ class Toleranced(Result):
             Column("maximum", form=".5g"),
             Column("change_minimum", self.unit, ".5f", "change\nat min."),
             Column("change_maximum", self.unit, ".5f", "change\nat max."),
+            Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
+            Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
         )
     )
@@ -305,6 +323,22 @@ class Toleranced(Result):
         """Share of the trials whose criterion is a number or better: at most it, or at least it of the MTF."""
         return float((self.sign * self.trials <= self.sign * limit).double().mean())
 
+    def table_of_shares(self) -> dict[str, Tensor]:
+        """The criterion that shares of the trials meet or surpass, the same by second order, and the difference."""
+        shares = sorted({*PERCENTILES, 100 * self.share})
+        traced = torch.stack([self.percentile(p) for p in shares])
+        predicted = self.sign * torch.quantile(self.sign * self.predicted, traced.new_tensor(shares) / 100)
+        off = 100 * (predicted / traced - 1)
+        return {"share": traced.new_tensor(shares), "trials": traced, "predicted": predicted, "difference": off}
+
+    def tightened(self) -> list[tuple[str, float]]:
+        """The tolerances whose limits were tightened, with the factor, the most tightened first."""
+        if self.given is None:
+            return []
+        pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
+        found = [(label, _factor(new, old)) for new, old, label in pairs]
+        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
+
     def at_limit(self, number: int) -> int:
         """How many trials have a compensator, by its number from 0, at one of its limits."""
         one, moved = self.tolerances.compensators[number], self.changes[:, number]
@@ -319,6 +353,8 @@ class Toleranced(Result):
             "unit": order,
             "change_minimum": self.minimum[order],
             "change_maximum": self.maximum[order],
+            "second_minimum": self.second_minimum[order],
+            "second_maximum": self.second_maximum[order],
             "slope": self.slope[order],
         }
 
@@ -340,10 +376,15 @@ class Toleranced(Result):
             found |= {"best": float((good * self.sign).min()) * self.sign}
             found |= {"worst": float((good * self.sign).max()) * self.sign, "failed": int(self.trials.isnan().sum())}
             found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+        if self.goal is not None:
+            reached = self.sign * self.predicted <= self.sign * self.goal
+            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
+            if len(self.trials):
+                found["yield"] = self.yield_at(self.goal)
         return found
 
     def tables(self) -> list[Table]:
-        found, relation = self.summary(), "≤" if self.sign > 0 else "≥"
+        found = self.summary()
         about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
         root = found.get("expected_root_mean_square")
         about.append(
@@ -358,7 +399,6 @@ class Toleranced(Result):
                 + f"; {found['failed']} without light"
                 * (found["failed"] > 0)
             )
-            about.append(", ".join(f"{p} % {relation} {found[f'percent_{p}']:.5g}" for p in PERCENTILES))
             for k, one in enumerate(self.tolerances.compensators):
                 c = self.changes[:, k]
                 about.append(
@@ -366,9 +406,26 @@ class Toleranced(Result):
                     f"σ {float(c.std()):.4g}"
                     + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
+        if self.goal is not None:
+            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
+            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
+            bound = "at most" if self.sign > 0 else "at least"
+            about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
+        if self.given is not None:
+            drawn = self.tightened()
+            listed = ", ".join(f"{label} × {factor:.3g}" for label, factor in drawn[:6])
+            about.append(
+                f"limits tightened of {len(drawn)} of {len(self.tolerances)} tolerances{': ' * bool(drawn)}{listed}"
+            )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        return [Table(self.columns(), about)]
+        found = [Table(self.columns(), about)]
+        if len(self.trials):
+            bound = "within" if self.sign > 0 else "above"
+            found.append(
+                Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
+            )
+        return found
 
     def document(self) -> dict:
         return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
@@ -405,6 +462,12 @@ class Toleranced(Result):
         return figure
 
 
+def _factor(new: Tolerance, old: Tolerance) -> float:
+    """How much narrower the limits of a row are."""
+    wide = old.maximum - old.minimum
+    return (new.maximum - new.minimum) / wide if wide else 1.0
+
+
 def tolerance(
     lens: Lens,
     tolerances: Tolerances | None = None,
@@ -414,6 +477,9 @@ def tolerance(
     criterion: str = "rms",
     trials: int = 1000,
     seed: int = 0,
+    increment: float | None = None,
+    goal: float | None = None,
+    yield_: float | None = None,
     fields: Tensor | Sequence | None = None,
     rings: int = 4,
     arms: int = 6,
@@ -433,6 +499,11 @@ def tolerance(
         diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields. The compensators of every lens
         bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
+    increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
+        more than this, in its unit. Tighter limits stay.
+    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
+    yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
+        least total tightness until this share reaches the goal, by second order.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
         symmetric, mirrored along y.
     rings: of the pupil, Gaussian quadrature, 4 by default.
@@ -450,7 +521,9 @@ def tolerance(
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
-    sampling = _sampling(lens, fields, rings, arms)
+    if yield_ is not None and not 0 < yield_ < 1:
+        raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
+    sampling, given = _sampling(lens, fields, rings, arms), tolerances
     chosen = criterion_of(criterion, lens, sampling)
     study = Study(lens, tolerances, chosen, sampling)
     with torch.no_grad():
@@ -458,29 +531,47 @@ def tolerance(
         if not bool(nominal_quantity.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
         nominal = chosen.value(nominal_quantity[0])
+        if increment is not None:
+            tolerances = limited_to_change(tolerances, study.harm, increment)
+            study = Study(lens, tolerances, chosen, sampling)
+        model = study.second_order()
+        if goal is not None and yield_ is not None:
+            tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
+            study = Study(lens, tolerances, chosen, sampling)
         low, high = _at_limits(study)
         changes = [chosen.value(q) - nominal for q in (low, high)]
-        q0, g, H = study.second_order()
-        predicted, mean_square = _model(tolerances, q0, g, H, seed)
+        seconds = [
+            _second_order_change(chosen, model, limits.to(study.half))
+            for limits in (tolerances.minimum, tolerances.maximum)
+        ]
+        predicted, mean_square = _model(tolerances, *model, seed)
         predicted = chosen.value(predicted.clamp_min(0))
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    slope = _slope(chosen, nominal_quantity, g, H) * study.half
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
-        minimum=changes[0], maximum=changes[1], slope=slope, estimated=nominal + chosen.sign * rss,
-        expected=predicted.mean(), expected_square=mean_square, predicted=predicted, trials=values, changes=moved,
-        seed=seed, unsettled=study.unsettled, better="smaller" if chosen.sign > 0 else "larger",
+        minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
+        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=predicted.mean(),
+        expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
+        unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
+        given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
     )  # fmt: skip
 
 
-def _slope(criterion: Criterion, q: Tensor, g: Tensor, H: Tensor) -> Tensor:
+def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
+    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
+    q0, g, H = model
+    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
+    return criterion.value(found) - criterion.value(found.new_tensor(q0))
+
+
+def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
     """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
-    if float(q) <= 1e-12 * criterion.scale:
+    if q0 <= 1e-12 * criterion.scale:
         return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
     with torch.enable_grad():
-        at = q.detach().requires_grad_()
-        return g * torch.autograd.grad(criterion.value(at).sum(), at)[0]
+        q = g.new_tensor(q0).requires_grad_()
+        return g * torch.autograd.grad(criterion.value(q), q)[0]
 
 
 def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:
