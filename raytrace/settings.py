@@ -25,6 +25,8 @@ def read(kind: type, document: Mapping):
 
 #: PSF models that a lens is trained with.
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
+#: Grades of tolerances, as of `tolerancing.grades`.
+GRADES = ("commercial", "precision", "high")
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"
 

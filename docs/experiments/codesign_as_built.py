@@ -31,7 +31,7 @@ from raytrace.tracing.compiled import prepare
 
 BASE = CodesignSettings(
     vary="curvature:1-3,5,7,9-11 sensor", hold="efl", noise=0.02, width=16, batch=16, patch=32,
-    rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=24,
+    rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=16,
 )  # fmt: skip
 #: What cameras are built with: (grade, refocus).
 BUILDS = {
@@ -108,7 +108,7 @@ def tested(lens: Lens, pictures: Pictures, settings: CodesignSettings, folder: P
     path = folder / f"{_file_name(build)}_{psf}.json"
     if not path.exists():
         built = restored(lens, settings, folder, build, psf)
-        of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=32)
+        of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=16)
         l1, ratio = errors_as_built(built, pictures, of_test)
         write_json(path, {"l1": l1.tolist(), "psnr": ratio.tolist()})
     found = {name: np.array(numbers) for name, numbers in read_json(path).items()}
@@ -178,8 +178,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the trainings")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
-    parser.add_argument("--start", type=int, default=10, help="epochs of the common start")
-    parser.add_argument("--seconds", type=float, default=40.0, help="processor time of a training from there")
+    parser.add_argument("--start", type=int, default=4, help="epochs of the common start")
+    parser.add_argument("--seconds", type=float, default=15.0, help="processor time of a training from there")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--builds", nargs="+", default=["precision", "commercial"], choices=[*BUILDS])
     parser.add_argument("--check", action="store_true", help="test with DRT PSFs as well")
