@@ -19,9 +19,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.Unfille
 FEW = "radius:1,3=0.2% thickness:3=0.05 element_decenter:3=0.05 element_tilt:1=0.1"
 
 
-@pytest.fixture(scope="module")
-def cooke():
-    return rt.read_lens("cooke_triplet")
+@pytest.fixture(scope="module", name="cooke")
+def cooke_in_colours():
+    lens = rt.read_lens("cooke_triplet")
+    assert len(lens.wavelengths) == 3
+    return lens
 
 
 def states(lens, vary):
@@ -141,15 +143,16 @@ def test_aimed_rays(cooke):
 
 
 def test_optimize_lowers_the_expectation(cooke):
-    """As `rt.tolerance` finds by other pupil points and second derivatives."""
-    limits = "element_decenter=0.2"
-    settings = {"merit": "spot", "vary": "curvature sensor", "hold": "efl=101.2", "cycles": 6}
-    usual = rt.optimize(cooke, **settings)
-    robust = rt.optimize(cooke, as_built=rt.AsBuilt(limits=limits, weight=20.0, rings=2), **settings)
-    expected = [
-        float(rt.tolerance(lens, limits=limits, trials=0).expected_square) for lens in (usual.lens, robust.lens)
-    ]
-    assert expected[1] < 0.97 * expected[0]
+    """Of random lenses of another sample."""
+    settings = {"merit": "spot", "vary": "curvature:1-4 thickness:2,5 sensor", "hold": "efl=101.2"}
+    as_built = rt.AsBuilt(limits="element_decenter=0.2", weight=20.0, rings=2)
+    usual = rt.optimize(cooke, cycles=25, **settings)
+    robust = rt.optimize(usual.lens, as_built=as_built, cycles=5, **settings)
+    expected = []
+    for lens in (usual.lens, robust.lens):
+        term = rt.AsBuilt(limits="element_decenter=0.2").of(lens)
+        expected.append(float(term.mean_squares(lens, rt.draw_errors(term.tolerances, 400, seed=8)).mean()))
+    assert expected[1] < 0.995 * expected[0]
     assert abs(float(rt.first_order(robust.lens).effective_focal_length) - 101.2) < 1e-6
     change = robust.as_built
     assert change.nominal[1] < change.expected[1] < change.expected[0]

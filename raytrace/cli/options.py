@@ -335,7 +335,7 @@ AS_BUILT = group(
         help="other limits, as radius=0.1%% thickness=0.02 element_tilt=0.05; index=0 leaves one out",
     ),
     option(
-        "--as-built-weight", metavar="W", type=positive_finite,
+        "--as-built-weight", dest="weight", metavar="W", type=positive_finite,
         help="weight relative to all rows of the merit function that are no boundaries (default 1: of --merit spot the "
         "lens without errors and the lens as built count alike)",
     ),

@@ -145,15 +145,15 @@ def result_of_lens(arguments: argparse.Namespace) -> Result:
 
 def _as_built(options: dict) -> dict:
     """The keyword `as_built`, of the options of --as-built, which are taken out; none without it."""
-    settings = {name: options.pop(name) for name in ("grade", "limits", "as_built_weight") if name in options}
+    settings = {name: options.pop(name) for name in ("grade", "limits", "weight") if name in options}
     if not options.pop("as_built", False):
         if settings:
-            raise CommandError(f"--{min(settings).replace('_', '-')} goes with --as-built")
+            spelled = {"weight": "as-built-weight"}
+            raise CommandError(f"--{spelled.get(min(settings), min(settings))} goes with --as-built")
         return {}
     from raytrace.tolerancing.as_built import AsBuilt  # loads the package of tolerances
 
-    weight = {"weight": settings.pop("as_built_weight")} if "as_built_weight" in settings else {}
-    return {"as_built": AsBuilt(**settings, **weight)}
+    return {"as_built": AsBuilt(**settings)}
 
 
 # -- the lens
