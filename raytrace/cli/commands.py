@@ -776,14 +776,15 @@ COMMANDS = (
     _command(
         "tolerance",
         "the lens as built: sensitivities, expectation and Monte Carlo",
-        "Change of the RMS spot radius or wavefront by every tolerance at its limits, the mean of the lens as built by "
-        "second derivatives, and its distribution over perturbed and compensated lenses. The tolerances are those of "
-        "the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the sensor distance unless the "
-        "file has others.",
+        "Change of a criterion (RMS spot radius or wavefront, MTF) by every tolerance at its limits, its mean of the "
+        "lens as built by second derivatives, and its distribution over perturbed and compensated lenses. The "
+        "tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the "
+        "sensor distance unless the file has others.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
-        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
+        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
+        cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
     ),
