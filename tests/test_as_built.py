@@ -1,244 +1,201 @@
-"""Cameras as built: PSFs of perturbed lenses, derivatives, errors drawn by sample, runs that resume, bad input."""
+"""The lens as built as a term of a merit function: its expectation, its derivatives and its place in `optimize`."""
 
-import dataclasses
-
+import numpy as np
 import pytest
+import scipy.optimize
 import torch
 
 import raytrace as rt
-from raytrace.imaging.codesign import TEST_EPOCH, Batches, absolute_error, batch, camera, errors_as_built, optimise
-from raytrace.imaging.pictures import dead_leaves
-from raytrace.imaging.training import Run
-from raytrace.settings import GRADES, CodesignSettings
-from raytrace.shards import Share
-from raytrace.system.tolerance_data import Compensator
-from raytrace.tolerancing import grades
+from raytrace.maths.numerics import Dual
+from raytrace.optimization.variables import Model, freedom
+from raytrace.system.lens import with_sensor_distance
+from raytrace.tolerancing.as_built import design, hadamard
+from raytrace.tolerancing.study import moments
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.spot import image_rays
 
-SMALL = CodesignSettings(depth=2, width=2, patch=8, size=7, epochs=2, batch=4, crops=2, cameras=2)
-BUILT = dataclasses.replace(SMALL, as_built=True, grade="commercial", vary="sensor curvature:1,10")
-DISTANCES = torch.tensor([12e3, 20e3, 45e3], dtype=torch.float64)
+pytestmark = pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
 
-
-@pytest.fixture(scope="module")
-def pictures():
-    return dead_leaves(6, size=24)
+FEW = "radius:1,3=0.2% thickness:3=0.05 element_decenter:3=0.05 element_tilt:1=0.1"
 
 
-def sensors(lens):
-    return lens.surfaces[-2].thickness.reshape(-1)
+@pytest.fixture(scope="module", name="cooke")
+def cooke_in_colours():
+    lens = rt.read_lens("cooke_triplet")
+    assert len(lens.wavelengths) == 3
+    return lens
 
 
-def mean_square_radius(lens, fields):
-    """(L,) mm², about the centroid of each field."""
-    return rt.spot(lens, fields=fields).mean_square_radius.mean((-2, -1))
+def states(lens, vary):
+    free = freedom(lens, vary)
+    model = Model(free.lens, free.variables, free.solves)
+    return model.start, lambda x: model.views[0].state(x)
 
 
-@pytest.mark.parametrize("center", ["chief", "centroid"])
-@pytest.mark.parametrize("model", ["gaussian", "drt"])
-def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, center):
-    settings = dataclasses.replace(BUILT, model=model, refocus="none", fields=(0.0, 7.0), center=center)
-    built = camera(lens, settings)
-    built._order = 2
-    errors, distances = rt.draw_errors(built.tolerances, 2, seed=5), DISTANCES[:2]
-    parameters = rt.Gaussian(order=2) if model == "gaussian" else rt.DRT(order=2)
-    with torch.no_grad():
-        kernels = built.kernels(distances, 1, errors)
-        for number, distance in enumerate(distances):
-            alone = rt.perturbed(built.variables(), built.tolerances, errors[number])
-            conditions = {"fields": built.fields[:, [1]], "object_distances": distance[None], "center": center}
-            found = rt.psf(alone, parameters, size=7, normalise="window", **conditions).kernel[0, 0]
-            # Kernels of one call with "drt" share the number of cells, that of the widest.
-            assert float((kernels[number] - found).abs().max()) < (1e-9 if model == "gaussian" else 1e-3)
-            one = built.kernels(distance[None], 1, errors[number])[0]
-            assert float((one - found).abs().max()) < 1e-9
+def lens_weights(lens):
+    return lens.wavelength_weights / lens.wavelength_weights.sum()
 
 
-def test_without_errors_the_camera_as_built_is_the_nominal_one(lens):
-    built = camera(lens, dataclasses.replace(BUILT, center="chief", fields=(0.0, 7.0)))
-    nominal = camera(lens, dataclasses.replace(SMALL, vary=BUILT.vary, fields=(0.0, 7.0)))
-    nominal._order = built._order = 3
-    none = torch.zeros(len(built.tolerances), dtype=torch.float64)
-    with torch.no_grad():
-        for field in range(2):
-            expected = nominal.kernels(DISTANCES, field)
-            assert torch.equal(built.kernels(DISTANCES, field), expected)
-            assert float((built.kernels(DISTANCES, field, none) - expected).abs().max()) < 1e-9
+@pytest.mark.parametrize(("least", "order"), [(1, 1), (2, 2), (3, 4), (13, 16), (20, 20), (48, 48), (80, 80), (86, 88)])
+def test_hadamard_matrices(least, order):
+    matrix = hadamard(least)
+    assert len(matrix) == order
+    assert (matrix[:, 0] == 1).all()
+    assert (np.abs(matrix) == 1).all()
+    assert (matrix.T @ matrix == order * np.eye(order)).all()
 
 
-def test_the_sensor_follows_the_best_focus(lens):
-    """The sensor stays as far from the least spot of the perturbed lens as it is from that of the nominal one."""
-    settings = dataclasses.replace(BUILT, start="rms", fields=(0.0, 7.0))
-    built = camera(lens, settings)
-    with torch.no_grad():
-        errors = rt.draw_errors(built.tolerances, 2, seed=3)
-        nominal = built.variables()
-        least = rt.perturbed(nominal, built.tolerances, errors)
-        moved = built.as_built(errors)
-        shift = sensors(moved) - sensors(least)
-        assert float(shift.abs().min()) > 0.01  # mm
-        at = {}
-        for step in (-1e-3, 0.0, 1e-3):  # the vertices of both parabolas
-            for name, one in (("nominal", rt.batch([nominal])), ("built", moved)):
-                shifted = one.replace(11, thickness=sensors(one) + step)
-                at[name, step] = mean_square_radius(shifted, built.fields)
-        vertex = {
-            name: 0.5e-3 * (at[name, -1e-3] - at[name, 1e-3]) / (at[name, -1e-3] + at[name, 1e-3] - 2 * at[name, 0.0])
-            for name in ("nominal", "built")
-        }
-    assert torch.allclose(vertex["built"], vertex["nominal"].expand(2), atol=2e-5)  # mm
+def test_the_sample_has_the_means_and_variances_of_the_tolerances(cooke):
+    tolerances = rt.tolerances(cooke, "radius=-0.1..0.3 thickness=0.05 irregularity=0.5", distribution="uniform")
+    errors = design(tolerances).numpy()
+    mean, variance = (np.array(part) for part in zip(*map(moments, tolerances), strict=True))
+    angle = np.array([row.kind == "irregularity_angle" for row in tolerances])
+    assert np.abs(errors.mean(0) - mean)[~angle].max() < 1e-15
+    spread = np.cov(errors.T, bias=True)
+    assert np.abs(spread - np.diag(variance))[~angle][:, ~angle].max() < 1e-15
+    twice = np.deg2rad(2 * errors[:, angle])
+    for number, expected in ((np.cos(twice), 0), (np.cos(twice) ** 2, 0.5), (np.cos(twice) * np.sin(twice), 0)):
+        assert np.abs(number.mean(0) - expected).max() < 1e-14
 
 
-def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
-    built = camera(lens, BUILT)
-    errors = rt.draw_errors(built.tolerances, 4)
-    with torch.no_grad():
-        still = sensors(rt.perturbed(built.variables(), built.tolerances, errors))  # its gap has errors as well
-        free = sensors(built.as_built(errors)) - still
-        assert float(free.abs().min()) > 0.05
-        for limit in (0.0, 0.05):
-            limited = Compensator(11, minimum=-limit, maximum=limit)
-            built.tolerances = dataclasses.replace(built.tolerances, compensators=(limited,))
-            assert torch.allclose(sensors(built.as_built(errors)) - still, free.clamp(-limit, limit), atol=1e-12)
-        fixed = camera(lens, dataclasses.replace(BUILT, refocus="none"))
-        assert torch.equal(sensors(fixed.as_built(errors)), still)
+def test_a_lens_of_the_sample_is_refocused(cooke):
+    """Against the spots of its rays on sensors among which a search finds the best."""
+    term = rt.AsBuilt(limits="radius:1=0.3%", fields=[0, 8.4]).of(cooke)
+    bent = rt.perturbed(cooke, term.tolerances, [0.3])
+    points, weights = rt.gauss_rings(3, 6)
+    weights = (lens_weights(cooke)[:, None] * weights).flatten().numpy()
+
+    def square(distance):
+        lens = with_sensor_distance(bent, torch.tensor(distance, dtype=torch.float64))
+        hits = image_rays(lens, points, fields=torch.tensor([[0.0, 0.0], [0.0, 8.4]], dtype=torch.float64)).position[:2]
+        spots = hits.flatten(-2).numpy()
+        return 0.5 * sum(np.cov(spot, aweights=weights, bias=True).trace() for spot in spots.swapaxes(0, 1))
+
+    best = scipy.optimize.minimize_scalar(square, bracket=(77.0, 78.0), tol=1e-9)
+    q = term.mean_squares(cooke, torch.tensor([[0.3]], dtype=torch.float64))
+    assert abs(float(q) / best.fun - 1) < 1e-9
 
 
-@pytest.mark.parametrize("refocus", ["sensor", "none"])
-def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, refocus):
-    built = camera(lens, dataclasses.replace(BUILT, refocus=refocus, size=21, fields=(7.0,)))
-    built._order = 2
-    errors = rt.draw_errors(built.tolerances, 3, seed=2)
-    weights = torch.linspace(0, 1, 21, dtype=torch.float64)
-
-    def merit():
-        return (built.kernels(DISTANCES, 0, errors) * weights * weights[:, None]).sum()
-
-    found = torch.autograd.grad(merit(), [built.variables.get_parameter(name) for name in built.variables.names])
-    for name, slope in zip(built.variables.names, found, strict=True):
-        parameter, step = built.variables.get_parameter(name), 1e-5
-        with torch.no_grad():
-            values = []
-            for sign in (1, -1):
-                parameter.fill_(sign * step)
-                values.append(float(merit()))
-            parameter.fill_(0.0)
-        assert float(slope) == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-5, abs=1e-6), name
+def test_expectation_against_random_lenses(cooke):
+    settings = rt.AsBuilt(limits=FEW)
+    term = settings.of(cooke)
+    errors = rt.draw_errors(term.tolerances, 1500, seed=3)
+    q = term.mean_squares(cooke, torch.cat([errors, -errors])).reshape(2, -1).mean(0)
+    uncertainty = float(q.std()) / len(q) ** 0.5
+    assert uncertainty < 0.002 * float(q.mean())
+    assert abs(float(term.expected(cooke) - q.mean())) < 3.5 * uncertainty
+    assert float(term.nominal(cooke)) < 0.99 * float(term.expected(cooke))
 
 
-def test_errors_are_drawn_by_the_number_of_the_sample(lens, pictures):
-    built = camera(lens, BUILT)
-    every = [batch(pictures, BUILT, list(range(12)), epoch, built.tolerances).errors for epoch in range(2)]
-    trials = rt.draw_errors(built.tolerances, 24, BUILT.seed)
-    assert torch.equal(torch.cat(every), trials)
-    some = batch(pictures, BUILT, [7, 3], 1, built.tolerances)
-    assert torch.equal(some.errors, trials[[19, 15]])
-    batches = Batches(pictures, BUILT, built.tolerances)
-    whole = batches(1, Share()).errors
-    halves = [batches(1, Share(rank, 2)).errors for rank in range(2)]
-    assert torch.equal(torch.stack(halves, 1).flatten(0, 1), whole)
-    assert torch.equal(whole, trials[4:8])
-    other = batch(pictures, dataclasses.replace(BUILT, seed=1), [0], 0, built.tolerances)
-    assert not torch.equal(other.errors[0], trials[0])
-    assert batch(pictures, SMALL, [0], 0).errors is None
+def test_expectation_against_second_derivatives(cooke):
+    """`rt.tolerance` has the same expectation from differences of gradients."""
+    few = "element_decenter:3=0.05 radius:3=0.2%"
+    second = rt.tolerance(cooke, limits=few, trials=0, rings=3)
+    term = rt.AsBuilt(limits=few).of(cooke)
+    increase = 1e-6 * float(second.expected_square) - float(term.nominal(cooke))
+    assert abs(float(term.expected(cooke) - term.nominal(cooke)) / increase - 1) < 0.01
 
 
-def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
-    settings = dataclasses.replace(BUILT, fields=(0.0, 7.0))
-    built = camera(lens, settings)
-    built._order = 2
-    with torch.no_grad():
-        samples = batch(pictures, settings, list(range(4)), 0, built.tolerances)
-        together = absolute_error(built, samples)
-        each = torch.cat(
-            [
-                absolute_error(
-                    built,
-                    dataclasses.replace(
-                        samples,
-                        picture=samples.picture[[k]],
-                        distance=samples.distance[[k]],
-                        noise=samples.noise[[k]],
-                        field=[samples.field[k]],
-                        errors=samples.errors[[k]],
-                    ),
-                )
-                for k in range(4)
-            ]
-        )
-    torch.testing.assert_close(together, each, rtol=1e-5, atol=1e-5)
+def test_residuals_and_their_derivatives(cooke):
+    """The Jacobian by forward derivatives against the gradient of E[q] by the adjoint, and against differences."""
+    start, state = states(cooke, "curvature:1,3,6 thickness:2,5 sensor")
+    term = rt.AsBuilt(limits="element_decenter:3=0.05 element_tilt:1=0.1", weight=2.0).of(cooke)
+    residuals, jacobian, lost = term.residuals(state(Dual(start, np.eye(len(start)))), 0.5)
+    assert lost == 0
+    assert abs(residuals @ residuals / (8 * float(term.expected(cooke))) - 1) < 1e-12
+    numbers = {
+        (k, name): torch.tensor(float(getattr(cooke.surfaces[k], name)), dtype=torch.float64, requires_grad=True)
+        for k, name in [(1, "curvature"), (3, "curvature"), (6, "curvature"), (2, "thickness"), (5, "thickness")]
+    }
+    lens = cooke
+    for (k, name), number in numbers.items():
+        lens = lens.replace(k, **{name: number})
+    gradient = torch.autograd.grad(8 * term.expected(lens), list(numbers.values()))
+    slopes = 2 * jacobian.T @ residuals
+    assert np.allclose(slopes[:5], [float(g) for g in gradient], rtol=1e-9, atol=1e-14)
+    assert abs(slopes[5]) < 1e-15  # the sensor is refocused
+    for k, step in ((1, 1e-6), (4, 1e-3)):
+        ends = [term.residuals(state(start + sign * step * np.eye(len(start))[k]), 0.5)[0] for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        assert np.abs(difference - jacobian[:, k]).max() < 1e-5 * np.abs(jacobian[:, k]).max()
 
 
-def test_an_interrupted_training_as_built_resumes_bit_by_bit(lens, pictures, tmp_path):
-    def trained(folder, stop=None):
-        own = camera(lens, BUILT)
-        own._order = 2
-        run = Run(tmp_path / folder, dataclasses.asdict(BUILT))
-        for step, _ in optimise(own, pictures, BUILT, run, every=2):
-            if step == stop:
-                return None
-        return own
-
-    whole = trained("whole")
-    assert trained("parts", stop=2) is None  # one step after a checkpoint
-    parts = trained("parts")
-    for name, value in whole.state_dict().items():
-        assert torch.equal(value, parts.state_dict()[name]), name
-    assert (tmp_path / "whole/log.csv").read_bytes() == (tmp_path / "parts/log.csv").read_bytes()
-    assert any(float(parts.variables.get_parameter(name).detach()) for name in parts.variables.names)
+def test_without_the_compiled_trace(cooke):
+    start, state = states(cooke, "curvature:3 thickness:2")
+    term = rt.AsBuilt(limits="element_decenter:3=0.05").of(cooke)
+    at = state(Dual(start, np.eye(2)))
+    compiled = term.residuals(at, 1.0)
+    with trace_engine("eager"):
+        eager = term.residuals(at, 1.0)
+        assert np.allclose(term.residuals(state(start), 1.0)[0], compiled[0], rtol=1e-10, atol=1e-14)
+    for one, other in zip(compiled[:2], eager[:2], strict=True):
+        assert np.allclose(one, other, rtol=1e-8, atol=1e-12)
 
 
-def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pictures):
-    settings = dataclasses.replace(BUILT, crops=1)
-    built, count = camera(lens, settings), 2
-    built._order = 2
-    found = errors_as_built(built, pictures, settings)
-    assert [len(part) for part in found] == [count, count]
-    samples = batch(pictures, settings, list(range(4)), TEST_EPOCH)
-    drawn = rt.draw_errors(built.tolerances, count, first=2**62)
-    assert len({tuple(row) for row in drawn.tolist()}) == count
-    with torch.no_grad():
-        for number in range(count):
-            restored = built(samples.picture, samples.distance, noise=samples.noise, errors=drawn[number])
-            difference = restored - built.target(samples.picture)
-            assert float(difference.abs().mean()) == pytest.approx(float(found[0][number]), rel=1e-5)
-            psnr = -10 * torch.log10(difference.square().mean())
-            assert float(psnr) == pytest.approx(float(found[1][number]), abs=1e-4)
-    nominal = dataclasses.replace(settings, as_built=False)
-    other = camera(lens, nominal)
-    other._order = 2
-    again = errors_as_built(other, pictures, nominal)
-    assert torch.equal(torch.stack(again), torch.stack(found))  # of the same, untrained camera
-    assert float(found[0].std()) > 0
+@pytest.mark.slow
+def test_aimed_rays(cooke):
+    lens = cooke.at(ray_aiming="real")
+    start, state = states(lens, "curvature:3")
+    term = rt.AsBuilt(limits="element_decenter:3=0.05", rings=2).of(lens)
+    jacobian = term.residuals(state(Dual(start, np.eye(1))), 1.0)[1]
+    ends = [term.residuals(state(start + step), 1.0)[0] for step in (1e-6, -1e-6)]
+    assert np.abs((ends[0] - ends[1]) / 2e-6 - jacobian[:, 0]).max() < 1e-5 * np.abs(jacobian[:, 0]).max()
 
 
-def test_grades_of_the_settings_are_those_of_tolerancing():
-    assert set(GRADES) == set(grades.GRADES)
+def test_optimize_lowers_the_expectation(cooke):
+    """Of random lenses of another sample."""
+    settings = {"merit": "spot", "vary": "curvature:1-4 thickness:2,5 sensor", "hold": "efl=101.2"}
+    as_built = rt.AsBuilt(limits="element_decenter=0.2", weight=20.0, rings=2)
+    usual = rt.optimize(cooke, cycles=25, **settings)
+    robust = rt.optimize(usual.lens, as_built=as_built, cycles=5, **settings)
+    expected = []
+    for lens in (usual.lens, robust.lens):
+        term = rt.AsBuilt(limits="element_decenter=0.2").of(lens)
+        expected.append(float(term.mean_squares(lens, rt.draw_errors(term.tolerances, 400, seed=8)).mean()))
+    assert expected[1] < 0.995 * expected[0]
+    assert abs(float(rt.first_order(robust.lens).effective_focal_length) - 101.2) < 1e-6
+    change = robust.as_built
+    assert change.nominal[1] < change.expected[1] < change.expected[0]
+    assert robust.merit_after < robust.merit_before
+    assert abs(robust.merit_after / float(robust.history[-1, 0]) - 1) < 1e-12
+    assert "as built (of `limits`, 6 tolerances, weight 20): expected" in str(robust)
+    assert robust.document()["as_built"]["expected"] == list(change.expected)
+    assert usual.as_built is None
 
 
-def test_wrong_cameras_as_built_are_refused(lens):
-    variables, tolerances = rt.Variables(lens, "sensor"), rt.tolerances(lens, grade="precision")
-    gap = dataclasses.replace(tolerances, compensators=(Compensator(5),))
-    absent = dataclasses.replace(tolerances, rows=(rt.Tolerance("thickness", (40,), -1, 1),))
-    for change, error, words in (
-        ({"center": "middle"}, ValueError, "center 'middle': expected chief or centroid"),
-        ({"tolerances": gap}, rt.BadTolerance, "adjusted by its sensor distance alone, the thickness of surface 11"),
-        ({"tolerances": absent}, rt.BadTolerance, "thickness of surface 40: this lens has surfaces 0 to 11"),
-        ({"tolerances": tolerances, "model": "paraxial"}, ValueError, "'paraxial' traces no rays of a lens as built"),
-        (
-            {"center": "centroid", "pupil_points": torch.zeros(2, 3)},
-            ValueError,
-            "pupil_points are about the chief ray",
-        ),
-    ):
-        with pytest.raises(error, match=words):
-            rt.Camera(variables, rt.RedNet(), **change)
-    errors = torch.zeros(3, len(tolerances), dtype=torch.float64)
-    with pytest.raises(ValueError, match="errors, but no tolerances: give Camera"):
-        rt.Camera(variables, rt.RedNet()).kernels(DISTANCES, 0, errors)
-    built = rt.Camera(variables, rt.RedNet(), tolerances=tolerances)
-    with pytest.raises(rt.BadTolerance, match=r"expected \(79,\), an error for each row"):
-        built.kernels(DISTANCES, 0, errors[:, :5])
-    with pytest.raises(ValueError, match="2 object_distances for a batch of 3 lenses"):
-        built.kernels(DISTANCES[:2], 0, errors)
-    with pytest.raises(ValueError, match="refocus 'gap': expected sensor or none"):
-        camera(lens, dataclasses.replace(BUILT, refocus="gap"))
+def test_weight_is_relative_to_all_rows_but_boundaries(cooke):
+    """Of a merit function of spots M² is the mean square spot of the nominal lens, and E[q] counts alike."""
+    lens = rt.focus(cooke, fields=[0, 8.4, 11.9]).lens
+    expected, ratios = float(rt.AsBuilt(limits=FEW).of(lens).expected(lens)), []
+    for merit in (rt.DefaultMerit("spot"), rt.DefaultMerit("spot", glass_thickness=(1, 20), edge=0.5)):
+        nominal = float(rt.evaluate(lens, merit=merit).merit) ** 2
+        for weight in (1.0, 3.0):
+            settings = rt.AsBuilt(limits=FEW, weight=weight)
+            end = rt.optimize(lens, merit=merit, vary="sensor", cycles=0, as_built=settings)
+            ratios.append((end.merit_before**2 - nominal) / (weight * nominal))
+    assert np.allclose(ratios, ratios[0], rtol=1e-9)
+    assert abs(ratios[0] * float(rt.evaluate(lens, merit="spot").merit) ** 2 / expected - 1) < 1e-9
+    assert 1.05 < ratios[0] < 1.3
+
+
+def test_errors(cooke):
+    spots = {"merit": "spot", "vary": "curvature:1", "cycles": 1}
+    for weight in (0.0, -1.0, float("inf")):
+        with pytest.raises(ValueError, match="above 0"):
+            rt.AsBuilt("precision", weight=weight)
+    with pytest.raises(ValueError, match="leave `grade` and `limits` out"):
+        rt.AsBuilt("precision", tolerances=rt.tolerances(cooke, "radius=0.1"))
+    with pytest.raises(rt.BadTolerance, match="no tolerances of its own"):
+        rt.optimize(cooke, as_built=rt.AsBuilt(), **spots)
+    with pytest.raises(rt.BadTolerance, match="precision"):
+        rt.optimize(cooke, as_built=rt.AsBuilt("precise"), **spots)
+    tolerances = rt.tolerances(cooke, "radius=0.1", compensators=[rt.Compensator(2)])
+    with pytest.raises(rt.BadTolerance, match="the distance of a plane sensor"):
+        rt.optimize(cooke, as_built=rt.AsBuilt(tolerances=tolerances), **spots)
+    with pytest.raises(rt.BadTolerance, match="no ray of a field"):
+        rt.optimize(cooke, as_built=rt.AsBuilt("precision", fields=[80]), **spots)
+    merit = lambda lens: lens.surfaces[1].curvature.reshape(())  # noqa: E731
+    with pytest.raises(rt.NoProblem, match="goes with a merit of rows"):
+        rt.optimize(cooke, merit=merit, vary="curvature:1", as_built=rt.AsBuilt("precision"))
+    with pytest.raises(TypeError, match="as_built"):
+        rt.optimize(cooke, as_built="precision", **spots)

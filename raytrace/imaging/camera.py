@@ -21,7 +21,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor, nn
 
-from raytrace.imaging.as_built import lens_as_built, sensor_compensator
+from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.variables import Variables, converted
 from raytrace.maths.numerics import safe_divide

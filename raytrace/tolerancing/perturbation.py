@@ -30,6 +30,8 @@ from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
+from raytrace.tracing.launch import with_ray_aiming
+from raytrace.tracing.trace import aiming_of
 from raytrace.words import did_you_mean
 
 #: Parameters of an Irregular surface by the names of a lens.
@@ -44,30 +46,46 @@ def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: 
     Differentiable in the errors and in the lens. Numbers that no error touches stay the same tensors.
     A lens of several configurations is perturbed in all of them, and loses the others where an element moves whose
     thicknesses or poses differ between them: perturb each `lens.configuration(k)` then. Pickups and position solves
-    follow; other solves keep the nominal number.
+    follow; other solves keep the nominal number. Rays find the stop as in the lens: its ray aiming "auto" becomes what
+    it resolves to.
     Raises BadTolerance for a tolerance that the lens does not have, and for errors that are not one for each row.
     """
-    rows = rows_of(tolerances)
-    wavelength = 1e-3 * (tolerances if isinstance(tolerances, Tolerances) else Tolerances(rows)).test_wavelength
-    check_tolerances(lens, rows)
-    errors = torch.as_tensor(errors, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-    if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
-        shape, count = tuple(errors.shape), len(rows)
-        raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")
-    values = [_per_lens(error) for error in errors.unbind(-1)]
-    pairs = list(zip(rows, values, strict=True))
-    gauges = _gauges(lens, pairs, wavelength)
-    start = _with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
-    surfaces = list(start.surfaces)
-    for row, value in pairs:
-        _change(lens, surfaces, row, value, gauges)
-    _follow(start, surfaces)
-    numbers = tuple(surfaces)
-    spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
-    _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
-    moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
-    operands = _operands(start, numbers, moved)
-    return dataclasses.replace(start, surfaces=tuple(surfaces), operands=operands)
+    return Perturbation(lens, tolerances)(errors)
+
+
+class Perturbation:
+    """A lens with its tolerances, checked once and applied to any errors: `perturbed` for many batches of one lens."""
+
+    def __init__(self, lens: Lens, tolerances: Tolerances | Iterable[Tolerance]):
+        # The perturbed lens, whose axis bends, finds its stop as the nominal one does.
+        self.lens, self.rows = with_ray_aiming(lens, aiming_of(lens)), rows_of(tolerances)
+        fringes = tolerances if isinstance(tolerances, Tolerances) else Tolerances(self.rows)
+        self.wavelength = 1e-3 * fringes.test_wavelength
+        check_tolerances(lens, self.rows)
+        needed = any(KINDS[row.kind].needs_semi_diameter for row in self.rows)
+        self.radii = semi_diameters(lens) if needed else None
+
+    def __call__(self, errors: Tensor | Sequence[float]) -> Lens:
+        """The lens with errors (N,), or (L, N) for L lenses. Raises BadTolerance for another number of them."""
+        lens, rows = self.lens, self.rows
+        errors = torch.as_tensor(errors, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+        if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
+            shape, count = tuple(errors.shape), len(rows)
+            raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")
+        values = [_per_lens(error) for error in errors.unbind(-1)]
+        pairs = list(zip(rows, values, strict=True))
+        gauges = _gauges(lens, pairs, self.wavelength, self.radii)
+        start = _with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
+        surfaces = list(start.surfaces)
+        for row, value in pairs:
+            _change(lens, surfaces, row, value, gauges)
+        _follow(start, surfaces)
+        numbers = tuple(surfaces)
+        spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
+        _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
+        moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
+        operands = _operands(start, numbers, moved)
+        return dataclasses.replace(start, surfaces=tuple(surfaces), operands=operands)
 
 
 def _per_lens(number: Tensor) -> Tensor:
@@ -78,15 +96,16 @@ def _per_lens(number: Tensor) -> Tensor:
 # -- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def _gauges(lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]], wavelength: float) -> dict[int, Gauge]:
-    """What the errors of each surface are measured by."""
+def _gauges(
+    lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]], wavelength: float, radii: Sequence[float] | None
+) -> dict[int, Gauge]:
+    """What the errors of each surface are measured by; radii: the semi-diameters, where they are needed."""
     angles: dict[int, Tensor] = {}
     for row, value in pairs:
         if row.kind == "irregularity_angle":
             k = row.surfaces[0]
             angles[k] = angles[k] + value if k in angles else value
     used = {row.surfaces[0] for row, _ in pairs if KINDS[row.kind].sag or KINDS[row.kind].needs_semi_diameter}
-    radii = semi_diameters(lens) if any(KINDS[row.kind].needs_semi_diameter for row, _ in pairs) else None
     gauges = {}
     for k in used:
         radius = radii[k] if radii else lens.surfaces[k].semi_diameter or 0.0
