@@ -16,6 +16,7 @@ from types import ModuleType
 from raytrace import PUBLIC
 from raytrace.cli import codesign, wave_design, wave_restore
 from raytrace.cli.options import (
+    AS_BUILT,
     FREEDOM,
     LENS_SUFFIXES,
     MERIT,
@@ -395,16 +396,19 @@ COMMANDS = (
         "optimize",
         "minimise the merit function of a lens",
         "Optimise a lens by damped least squares on exact derivatives of its merit function: the file's, or the one of "
-        "--merit. Solves and pickups hold at every step. -o writes the lens with its variables and merit function. "
+        "--merit. Solves and pickups hold at every step. --as-built adds the expected spot of the manufactured lens, "
+        "which makes the lens less sensitive to its tolerances. -o writes the lens with its variables and merit "
+        "function. "
         "Ctrl-C stops and writes the best lens so far.",
         """
         lens.zmx -o better.zmx --plot better.png
         double_gauss --merit spot --vary curvature thickness --seconds 10 -o better.zmx
         tessar --merit spot --vary curvature sensor thickness:2,4 --bounds thickness:1.. --hold efl=100
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
+        double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
         group("stopping", parameters(
             "optimize", "cycles", "seconds", "paths",
             cycles={"help": "maximum, including those before --resume (default 500)"},
