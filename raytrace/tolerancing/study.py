@@ -1,15 +1,15 @@
 """Tolerancing: sensitivities, the expectation of the lens as built, and its distribution by Monte Carlo.
 
-The criterion f of a lens with errors e and compensators c is √q, the root of a mean square; the lens as built has the
-compensators that minimise it. Of one trial they come from Newton's method with the exact gradient
-and differences of gradients, all lenses of a batch at once.
+The criterion of a lens with errors e and compensators c is a function f(q), the root of a mean square q or what is
+missing of the MTF; the lens as built has the compensators that minimise q. Of one trial they come from Newton's method
+with the exact gradient and differences of gradients, all lenses of a batch at once.
 
 Second order: with g and H the derivatives of q by the errors, H those of differences of exact gradients and with the
 compensators eliminated,
 
     H = q_ee - q_ec q_cc⁻¹ q_ce,     E[q] = q₀ + g·m + ½ (tr(H Σ) + m·H m),
 
-m and Σ the means and variances of the errors. The distribution of f is that of the root of the same quadratic form.
+m and Σ the means and variances of the errors. The distribution of f is that of f of the same quadratic form.
 Source of the expansion: Rimmer, Appl. Opt. 9, 533 (1970).
 """
 
@@ -35,16 +35,18 @@ from raytrace.system.lens import Lens, aligned, field_points
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus
+from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, criterion_of
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
-_CHUNK = 256  # lenses traced at once
+_REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
+_CHUNK = 1024  # lenses traced at once
 _MODEL = 2**15  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -68,10 +70,10 @@ class Study:
         self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
         self.unsettled = 0  # lenses whose compensators still gained 1e-6 of q in the last step
 
-    def square(self, errors: Tensor, changes: Tensor) -> Tensor:
+    def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
         lens = with_changes(self.perturbation(errors), self.compensators, changes)
-        return self.criterion.square(aligned(lens, 3), self.sampling)
+        return self.criterion.quantity(aligned(lens, 3), self.sampling)
 
     def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor] | None:
         """q (L,) with the sensor at its least, and its shift (L, 1); None where no parabola has it."""
@@ -85,44 +87,71 @@ class Study:
 
     def slope(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) and its derivatives by the errors (L, N) and the compensators (L, C)."""
-        with torch.enable_grad():
-            errors, changes = (x.detach().requires_grad_() for x in (errors, changes))
-            q = self.square(errors, changes)
-            found = torch.autograd.grad(q.sum(), (errors, changes), allow_unused=True)
-        by_errors, by_changes = (
-            torch.zeros_like(x) if g is None else g for g, x in zip(found, (errors, changes), strict=True)
-        )
-        return q.detach(), by_errors, by_changes
+        return self._slopes(errors, changes, by_errors=True)
 
-    def slope_of_compensators(self, errors: Tensor, changes: Tensor) -> Tensor:
-        """Derivatives (L, C) of q by the compensators."""
-        with torch.enable_grad():
-            changes = changes.detach().requires_grad_()
-            q = self.square(errors, changes)
-            found = torch.autograd.grad(q.sum(), changes, allow_unused=True)[0] if q.requires_grad else None
-            return torch.zeros_like(changes) if found is None else found
+    def slope_of_compensators(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor]:
+        """q (L,) and its derivatives (L, C) by the compensators."""
+        q, _, by_changes = self._slopes(errors, changes, by_errors=False)
+        return q, by_changes
+
+    def _slopes(self, errors: Tensor, changes: Tensor, *, by_errors: bool) -> tuple[Tensor, Tensor, Tensor]:
+        rows = []
+        for e, c in zip(*(x.detach().split(self.criterion.together) for x in (errors, changes)), strict=True):
+            with torch.enable_grad():
+                e, c = e.requires_grad_(by_errors), c.requires_grad_()
+                q = self.quantity(e, c)
+                asked = [x for x in (e, c) if x.requires_grad]
+                unused = [None] * len(asked)
+                found = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
+            slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(found, asked, strict=True)]
+            rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1]))
+        return tuple(torch.cat(part) for part in zip(*rows, strict=True))
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
-        """q (L,) with the compensators that minimise it, and their changes (L, C)."""
-        changes = errors.new_zeros(len(errors), len(self.compensators))
+        """q (L,) with the compensators that minimise it, and their changes (L, C).
+
+        Newton's method with the curvature of the nominal lens, scaled for each lens by the last two slopes. A step that
+        does not improve q is shortened.
+        """
+        at = errors.new_zeros(len(errors), len(self.compensators))
         if not self.compensators:
             with torch.no_grad():
-                return self.square(errors, changes), changes
+                parts = errors.split(self.criterion.together)
+                return torch.cat([self.quantity(part, at[: len(part)]) for part in parts]), at
         with torch.no_grad():
             if (found := self.refocused(errors)) is not None:
                 return found
-        curvature = self.nominal_curvature()
-        for _ in range(_NEWTON):
-            slopes = self.slope_of_compensators(errors, changes)
-            step = torch.linalg.solve(curvature, slopes[..., None])[..., 0]
-            moved = torch.clamp(changes - step, self.least, self.most)
-            gain, changes = (0.5 * (slopes * (changes - moved)).sum(-1)).abs(), moved
-            with torch.no_grad():
-                q = self.square(errors, changes)
-            if not bool((gain > _SETTLED * q).any()):
+        curvature, trial, count = self.nominal_curvature(), at, len(errors)
+        q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(at), torch.zeros(count).to(errors)
+        scale, least, moving = errors.new_ones(count, 1), 1e-6 * self.criterion.scale, torch.arange(count)
+        for step in range(_NEWTON + 1):
+            q_trial, slopes_trial = self.slope_of_compensators(errors[moving], trial)
+            better, start, before = ~(q_trial > q[moving]), at[moving], slopes[moving]
+            if step:
+                moved = trial - start
+                expected = ((moved @ curvature) * moved).sum(-1)
+                ratio = ((slopes_trial - before) * moved).sum(-1) / expected
+                secant = torch.where((expected > 0) & (ratio > 0), ratio, 1.0).clamp(0.2, 25.0)
+                scale[moving] = torch.where(better, secant, torch.maximum(secant, 4 * scale[moving, 0]))[:, None]
+            q[moving] = torch.where(better, q_trial, q[moving])
+            at[moving] = start = torch.where(better[:, None], trial, start)
+            slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
+            full = torch.linalg.solve(curvature, before[..., None])[..., 0]
+            trial = torch.clamp(start - full / scale[moving], self.least, self.most)
+            gain[moving] = (0.5 * (before * (start - trial)).sum(-1)).abs()
+            going = gain[moving] > _SETTLED * (q[moving] + least)
+            moving, trial = moving[going], trial[going]
+            if not len(moving):
                 break
-        self.unsettled += int((gain > 1e-6 * q).sum())
-        return q, changes
+        self.unsettled += int((gain > 1e-6 * (q + least)).sum())
+        return q, at
+
+    def harm(self, errors: Tensor) -> Tensor:
+        """How much worse the criterion (L,) of compensated lenses is than that of the nominal one."""
+        zero = self.half.new_zeros(1, errors.shape[1])
+        found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(_CHUNK))]
+        nominal, *others = (self.criterion.value(q) for q in found)
+        return self.criterion.sign * (torch.cat(others) - nominal)
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -131,14 +160,25 @@ class Study:
             zero = self.half.new_zeros(2 * count, len(self.half))
             steps = self.scale_of_compensators()
             moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
-            slopes = self.slope_of_compensators(zero, moved)
+            q, slopes = self.slope_of_compensators(zero, moved)
             found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
             self._curvature = 0.5 * (found + found.T)
-            dead = torch.diagonal(self._curvature) <= 0
-            if bool(dead.any()):
-                one = self.compensators[int(dead.int().argmax())]
-                raise BadTolerance(f"compensator {one}: it does not improve the criterion; leave it out")
+            self._refuse_idle(torch.diagonal(self._curvature), q)
         return self._curvature
+
+    def _refuse_idle(self, curvatures: Tensor, q: Tensor) -> None:
+        """Refuse compensators without effect on q, and those that the nominal lens is no minimum of."""
+        effect = 0.5 * curvatures * (_REACH * self.scale_of_compensators()) ** 2
+        least = _NO_EFFECT * (float(q.min()) + self.criterion.scale)
+        for one, gain in zip(self.compensators, effect.tolist(), strict=True):
+            if abs(gain) <= least:
+                what = f"it has no effect on the {self.criterion.name}"
+                raise BadTolerance(f"compensator {one}: it does not improve the criterion: {what}; leave it out")
+            if not gain > 0:
+                message = (
+                    f"the {self.criterion.name} has no optimum near the nominal lens; focus the lens first (rt.focus)"
+                )
+                raise BadTolerance(f"compensator {one}: {message}, or optimise it")
 
     def scale_of_compensators(self) -> Tensor:
         """Steps (C,) of the differences by the compensators."""
@@ -153,8 +193,7 @@ class Study:
         places = torch.diag(steps)
         moved = torch.cat([places, -places])
         moved[:, count:] += best
-        slopes = [self.slope(part[:, :count], part[:, count:]) for part in moved.split(_CHUNK)]
-        both = torch.cat([torch.cat(found[1:], -1) for found in slopes])
+        both = torch.cat(self.slope(moved[:, :count], moved[:, count:])[1:], -1)
         whole = (both[: count + others] - both[count + others :]) / (2 * steps[:, None])
         whole = 0.5 * (whole + whole.T)
         q, slope, _ = self.slope(self.half.new_zeros(1, count), best)
@@ -211,12 +250,17 @@ def moments(row: Tolerance) -> tuple[float, float]:
 class Toleranced(Result):
     """The lens as built.
 
+    better: "smaller" or "larger", which values of the criterion are better.
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
-    of the criterion by each tolerance at its limits, compensated; slope: (N,) its derivative times the half width.
-    estimated: () nominal + √Σ ½(Δmin² + Δmax²), as OpticStudio. expected: () the mean of the criterion by second order;
-    expected_square: () that of its square. predicted: (K,) draws of the second-order model. trials: (T,) the criterion
-    of the perturbed and compensated lenses, nan where no ray arrives; changes: (T, C) of the compensators.
+    of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
+    second order; slope: (N,) its derivative times the half width.
+    estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
+    second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
+    second-order model. trials: (T,) the criterion of the perturbed and compensated lenses, nan where no ray arrives;
+    changes: (T, C) of the compensators.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
+    goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
+    before their limits were tightened, or None.
     """
 
     lens: Lens
@@ -226,6 +270,8 @@ class Toleranced(Result):
     nominal: Tensor
     minimum: Tensor
     maximum: Tensor
+    second_minimum: Tensor
+    second_maximum: Tensor
     slope: Tensor
     estimated: Tensor
     expected: Tensor
@@ -235,6 +281,10 @@ class Toleranced(Result):
     changes: Tensor
     seed: int = 0
     unsettled: int = 0
+    goal: float | None = None
+    share: float = 0.9
+    given: object = None
+    better: str = "smaller"
 
     COLUMNS = property(
         lambda self: (
@@ -243,22 +293,51 @@ class Toleranced(Result):
             Column("maximum", form=".5g"),
             Column("change_minimum", self.unit, ".5f", "change\nat min."),
             Column("change_maximum", self.unit, ".5f", "change\nat max."),
+            Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
+            Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
         )
     )
 
     @property
+    def title(self) -> str:
+        """The criterion and its unit."""
+        return f"{self.criterion}, {self.unit}" if self.unit else self.criterion
+
+    @property
+    def sign(self) -> int:
+        """1 where smaller values of the criterion are better, else -1."""
+        return -1 if self.better == "larger" else 1
+
+    @property
     def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change first."""
-        return torch.argsort(torch.maximum(self.minimum, self.maximum), descending=True)
+        """(N,) places of the tolerances, the largest change to the worse first."""
+        return torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
 
     def percentile(self, percent: float) -> Tensor:
-        """The criterion that so many percent of the trials are below; failed trials are above all."""
-        return torch.quantile(torch.nan_to_num(self.trials, nan=torch.inf), percent / 100, interpolation="higher")
+        """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
+        ordered = torch.nan_to_num(self.sign * self.trials, nan=torch.inf)
+        return self.sign * torch.quantile(ordered, percent / 100, interpolation="higher")
 
-    def yield_at(self, most: float) -> float:
-        """Share of the trials whose criterion is at most a number."""
-        return float((self.trials <= most).double().mean())
+    def yield_at(self, limit: float) -> float:
+        """Share of the trials whose criterion is a number or better: at most it, or at least it of the MTF."""
+        return float((self.sign * self.trials <= self.sign * limit).double().mean())
+
+    def table_of_shares(self) -> dict[str, Tensor]:
+        """The criterion that shares of the trials meet or surpass, the same by second order, and the difference."""
+        shares = sorted({*PERCENTILES, 100 * self.share})
+        traced = torch.stack([self.percentile(p) for p in shares])
+        predicted = self.sign * torch.quantile(self.sign * self.predicted, traced.new_tensor(shares) / 100)
+        off = 100 * (predicted / traced - 1)
+        return {"share": traced.new_tensor(shares), "trials": traced, "predicted": predicted, "difference": off}
+
+    def tightened(self) -> list[tuple[str, float]]:
+        """The tolerances whose limits were tightened, with the factor, the most tightened first."""
+        if self.given is None:
+            return []
+        pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
+        found = [(label, _factor(new, old)) for new, old, label in pairs]
+        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
 
     def at_limit(self, number: int) -> int:
         """How many trials have a compensator, by its number from 0, at one of its limits."""
@@ -274,6 +353,8 @@ class Toleranced(Result):
             "unit": order,
             "change_minimum": self.minimum[order],
             "change_maximum": self.maximum[order],
+            "second_minimum": self.second_minimum[order],
+            "second_maximum": self.second_maximum[order],
             "slope": self.slope[order],
         }
 
@@ -286,21 +367,30 @@ class Toleranced(Result):
             "nominal": float(self.nominal),
             "estimated": float(self.estimated),
             "expected": float(self.expected),
-            "expected_root_mean_square": math.sqrt(float(self.expected_square)),
         }
+        if self.better == "smaller":
+            found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
         if len(self.trials):
             good = self.trials[~self.trials.isnan()]
-            found |= {"mean": float(good.mean()), "sigma": float(good.std()), "best": float(good.min())}
-            found |= {"worst": float(good.max()), "failed": int(self.trials.isnan().sum())}
+            found |= {"mean": float(good.mean()), "sigma": float(good.std())}
+            found |= {"best": float((good * self.sign).min()) * self.sign}
+            found |= {"worst": float((good * self.sign).max()) * self.sign, "failed": int(self.trials.isnan().sum())}
             found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+        if self.goal is not None:
+            reached = self.sign * self.predicted <= self.sign * self.goal
+            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
+            if len(self.trials):
+                found["yield"] = self.yield_at(self.goal)
         return found
 
     def tables(self) -> list[Table]:
         found = self.summary()
-        about = [f"{self.criterion}, {self.unit}: nominal {found['nominal']:.6g}"]
+        about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
+        root = found.get("expected_root_mean_square")
         about.append(
-            f"as built, expected by second order: mean {found['expected']:.6g}, root mean square "
-            f"{found['expected_root_mean_square']:.6g}; estimated by RSS {found['estimated']:.6g}"
+            f"as built, expected by second order: mean {found['expected']:.6g}"
+            + (f", root mean square {root:.6g}" if root is not None else "")
+            + f"; estimated by RSS {found['estimated']:.6g}"
         )
         if len(self.trials):
             about.append(
@@ -309,7 +399,6 @@ class Toleranced(Result):
                 + f"; {found['failed']} without light"
                 * (found["failed"] > 0)
             )
-            about.append(", ".join(f"{p} % ≤ {found[f'percent_{p}']:.5g}" for p in PERCENTILES))
             for k, one in enumerate(self.tolerances.compensators):
                 c = self.changes[:, k]
                 about.append(
@@ -317,9 +406,26 @@ class Toleranced(Result):
                     f"σ {float(c.std()):.4g}"
                     + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
+        if self.goal is not None:
+            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
+            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
+            bound = "at most" if self.sign > 0 else "at least"
+            about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
+        if self.given is not None:
+            drawn = self.tightened()
+            listed = ", ".join(f"{label} × {factor:.3g}" for label, factor in drawn[:6])
+            about.append(
+                f"limits tightened of {len(drawn)} of {len(self.tolerances)} tolerances{': ' * bool(drawn)}{listed}"
+            )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        return [Table(self.columns(), about)]
+        found = [Table(self.columns(), about)]
+        if len(self.trials):
+            bound = "within" if self.sign > 0 else "above"
+            found.append(
+                Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
+            )
+        return found
 
     def document(self) -> dict:
         return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
@@ -330,7 +436,9 @@ class Toleranced(Result):
         figure = new_figure(9.0, 4.2)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
         shown = self.trials[~self.trials.isnan()] if len(self.trials) else self.predicted
-        span = (float(min(shown.min(), self.nominal)), float(torch.quantile(shown, 0.998)))
+        tail = torch.quantile(self.sign * shown, 0.998) * self.sign
+        ends = ((self.sign * shown).min() * self.sign, self.nominal, tail)
+        span = (float(min(ends)), float(max(ends)))
         bins = np.linspace(*span, 41)
         if len(self.trials):
             left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(self.trials):,} trials")
@@ -338,10 +446,10 @@ class Toleranced(Result):
         left.stairs(density, bins, color=INK, linewidth=1.2, label="second order")
         left.axvline(float(self.nominal), color=GREY, linestyle=":", label="nominal")
         left.axvline(float(self.expected), color="#d62728", label="expected")
-        left.set(xlabel=f"{self.criterion}, {self.unit}", ylabel="density", xlim=span)
+        left.set(xlabel=self.title, ylabel="density", xlim=span)
         curve = left.twinx()
         ordered = torch.sort(shown).values
-        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered)), color="#2ca02c", linewidth=1.2)
+        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
         curve.set(ylabel="yield, %", ylim=(0, 100))
         left.legend(fontsize=8, loc="center right")
         order = self.worst[:12].flip(0)
@@ -349,9 +457,15 @@ class Toleranced(Result):
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
-        right.set(xlabel=f"change of the criterion, {self.unit}")
+        right.set(xlabel=", ".join(filter(None, ("change of the criterion", self.unit))))
         right.legend(fontsize=8, loc="lower right")
         return figure
+
+
+def _factor(new: Tolerance, old: Tolerance) -> float:
+    """How much narrower the limits of a row are."""
+    wide = old.maximum - old.minimum
+    return (new.maximum - new.minimum) / wide if wide else 1.0
 
 
 def tolerance(
@@ -360,9 +474,12 @@ def tolerance(
     *,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
-    criterion: Literal["rms", "wavefront"] = "rms",
+    criterion: str = "rms",
     trials: int = 1000,
     seed: int = 0,
+    increment: float | None = None,
+    goal: float | None = None,
+    yield_: float | None = None,
     fields: Tensor | Sequence | None = None,
     rings: int = 4,
     arms: int = 6,
@@ -378,9 +495,15 @@ def tolerance(
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
-        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt. The compensators of every
-        lens minimise its square.
+        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
+        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields. The compensators of every lens
+        bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
+    increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
+        more than this, in its unit. Tighter limits stay.
+    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
+    yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
+        least total tightness until this share reaches the goal, by second order.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
         symmetric, mirrored along y.
     rings: of the pupil, Gaussian quadrature, 4 by default.
@@ -390,8 +513,6 @@ def tolerance(
     progress: (count, unit) -> a progress bar.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
     """
-    if criterion not in CRITERIA:
-        raise ValueError(f"criterion {criterion!r}: expected one of {', '.join(CRITERIA)}")
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
@@ -400,27 +521,57 @@ def tolerance(
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
-    chosen = CRITERIA[criterion]
-    study = Study(lens, tolerances, chosen, _sampling(lens, fields, rings, arms))
+    if yield_ is not None and not 0 < yield_ < 1:
+        raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
+    sampling, given = _sampling(lens, fields, rings, arms), tolerances
+    chosen = criterion_of(criterion, lens, sampling)
+    study = Study(lens, tolerances, chosen, sampling)
     with torch.no_grad():
-        nominal_square, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
-        if not bool(nominal_square.isfinite().all()):
+        nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
+        if not bool(nominal_quantity.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
-        nominal = nominal_square[0].sqrt()
+        nominal = chosen.value(nominal_quantity[0])
+        if increment is not None:
+            tolerances = limited_to_change(tolerances, study.harm, increment)
+            study = Study(lens, tolerances, chosen, sampling)
+        model = study.second_order()
+        if goal is not None and yield_ is not None:
+            tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
+            study = Study(lens, tolerances, chosen, sampling)
         low, high = _at_limits(study)
-        changes = [q.sqrt() - nominal for q in (low, high)]
-        q0, g, H = study.second_order()
-        predicted, mean_square = _model(tolerances, q0, g, H, seed)
-        predicted = predicted.clamp_min(0).sqrt()
+        changes = [chosen.value(q) - nominal for q in (low, high)]
+        seconds = [
+            _second_order_change(chosen, model, limits.to(study.half))
+            for limits in (tolerances.minimum, tolerances.maximum)
+        ]
+        predicted, mean_square = _model(tolerances, *model, seed)
+        predicted = chosen.value(predicted.clamp_min(0))
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    slope = g * study.half / (2 * nominal)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
-        minimum=changes[0], maximum=changes[1], slope=slope, estimated=nominal + rss, expected=predicted.mean(),
+        minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
+        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=predicted.mean(),
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
-        unsettled=study.unsettled,
+        unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
+        given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
     )  # fmt: skip
+
+
+def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
+    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
+    q0, g, H = model
+    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
+    return criterion.value(found) - criterion.value(found.new_tensor(q0))
+
+
+def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
+    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
+    if q0 <= 1e-12 * criterion.scale:
+        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
+    with torch.enable_grad():
+        q = g.new_tensor(q0).requires_grad_()
+        return g * torch.autograd.grad(criterion.value(q), q)[0]
 
 
 def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:
@@ -468,6 +619,7 @@ class _Trials:
         about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
         about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
         about |= {"fields and pupil": digest(study.sampling)}
+        about |= {"settings": digest(repr(study.criterion.settings))} if study.criterion.settings else {}
         self.store = Records(path, about, _JOURNAL, _TRIALS)
         self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
 
@@ -490,7 +642,7 @@ def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Sha
         if rows is None or len(rows) != len(part):
             errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
             q, changes = study.compensated(errors.reshape(len(part), count))
-            rows = torch.cat([q.sqrt()[:, None], changes], -1)
+            rows = torch.cat([study.criterion.value(q)[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
         found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
