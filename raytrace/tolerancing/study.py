@@ -528,6 +528,8 @@ def tolerance(
     sampling, given = sampling_of(lens, fields, rings, arms), tolerances
     chosen = criterion_of(criterion, lens, sampling)
     study = Study(lens, tolerances, chosen, sampling)
+    if study.compensators:
+        study.nominal_curvature()  # refuses those without effect
     with torch.no_grad():
         nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_quantity.isfinite().all()):
