@@ -298,6 +298,10 @@ class Toleranced(Result):
             Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
             Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
+            Column("share", "%", ".4g"),
+            Column("trials", self.unit, ".5f"),
+            Column("predicted", self.unit, ".5f", "2nd order"),
+            Column("difference", "%", "+.2f"),
         )
     )
 
