@@ -7,6 +7,8 @@ import raytrace as rt
 from raytrace.system.lens import aligned
 from raytrace.tolerancing.criteria import Sampling, criterion_of
 
+SMALL = "radius=0.02% thickness=0.005 element_decenter=0.005 element_tilt=0.01"
+
 pytestmark = pytest.mark.filterwarnings("ignore::raytrace.UnfilledStop")
 
 LIMITS = "radius=0.1% thickness=0.02 element_decenter=0.02 element_tilt=0.03"
@@ -132,3 +134,68 @@ def test_mtf_of_a_clipped_beam_is_refused(triplet):
     clipped = triplet.replace(4, apertures=(rt.Aperture("circular", (0.0, 3.0)),))
     with pytest.raises(ValueError, match=r"rays of field .* are clipped or fail"):
         rt.tolerance(clipped, limits=LIMITS, criterion="mtf@20", trials=0)
+
+
+# -- PSF ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["gaussian", "drt"])
+def test_change_of_the_psf_is_that_of_single_lenses(triplet, model):
+    rows, sampling = rt.tolerances(triplet, LIMITS), sampling_of(triplet)
+    errors = rt.draw_errors(rows, 2)
+    criterion = criterion_of("psf", triplet, sampling, model=model, pixel=0.004, size=33)
+    values = criterion.value(criterion.quantity(aligned(rt.perturbed(triplet, rows, errors), 3), sampling))
+    numbers = {"gaussian": rt.Gaussian, "drt": rt.DRT}[model](order=criterion.settings[1])
+    h0 = rt.psf(triplet, numbers, pixel=0.004, size=33).kernel
+    for k in range(2):
+        h = rt.psf(rt.perturbed(triplet, rows, errors[k]), numbers, pixel=0.004, size=33).kernel
+        change = ((h - h0).square().sum((-2, -1)) / h0.square().sum((-2, -1))).mean().sqrt()
+        assert float(values[k]) == pytest.approx(float(change), rel=1e-9 if model == "gaussian" else 5e-3)
+
+
+def test_change_of_the_psf_has_exact_derivatives(triplet):
+    check_gradient(triplet, "psf", pixel=0.004, size=33)
+
+
+@pytest.mark.slow
+def test_change_of_the_psf_as_built(triplet):
+    found = rt.tolerance(triplet, limits=SMALL, criterion="psf", trials=24, pixel=0.01, size=15)
+    assert float(found.nominal) < 1e-9
+    spread = float(found.trials.std()) / len(found.trials) ** 0.5
+    assert float(found.expected) == pytest.approx(float(found.trials.mean()), abs=4 * spread)
+    torch.testing.assert_close(found.slope.max(), found.maximum.max(), rtol=0.1, atol=0)
+    with pytest.raises(ValueError, match="belong to the criterion psf"):
+        rt.tolerance(triplet, limits=SMALL, pixel=0.01)
+    with pytest.raises(ValueError, match="did you mean gaussian"):
+        rt.tolerance(triplet, limits=SMALL, criterion="psf", model="gausian")
+
+
+# -- boresight ---------------------------------------------------------------------------------------------------------
+
+
+def test_boresight_is_that_of_the_chief_ray(triplet):
+    found = rt.tolerance(triplet, limits=LIMITS, criterion="boresight", trials=200)
+    assert float(found.nominal) == 0
+    assert not bool(found.changes.any())
+    for n in (int(found.worst[0]), int(found.worst[-1])):
+        errors = torch.zeros(len(found.tolerances), dtype=torch.float64)
+        errors[n] = found.tolerances.maximum[n]
+        chief = rt.trace(rt.perturbed(triplet, found.tolerances, errors), fields=0.0).position[:2].flatten(1)[:, 0]
+        assert 1e3 * float(torch.linalg.vector_norm(chief)) == pytest.approx(float(found.maximum[n]), abs=1e-9)
+    spread = float(found.trials.std()) / len(found.trials) ** 0.5
+    assert abs(float(found.expected - found.trials.mean())) < 4 * spread
+    text = str(found)
+    assert "compensator thickness of surface 7: it stays, as it has no effect" in text
+    assert "as an angle, divided by the focal length, mrad: expected" in text
+    assert found.angle == pytest.approx(1e-3 / float(rt.first_order(triplet).effective_focal_length))
+
+
+def test_boresight_has_exact_derivatives(triplet):
+    check_gradient(triplet, "boresight")
+
+
+def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
+    whole = rt.Tolerances((rt.Tolerance("element_decenter_y", (1, 7), -0.03, 0.03),))
+    found = rt.tolerance(triplet, whole, criterion="boresight", trials=0)
+    assert float(found.maximum[0]) == pytest.approx(30.0, abs=0.1)
+    assert float(found.slope[0]) == pytest.approx(float(found.maximum[0]), abs=1e-6)
