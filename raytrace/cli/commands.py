@@ -774,8 +774,8 @@ COMMANDS = (
         "the lens as built: sensitivities, expectation and Monte Carlo",
         "Change of a criterion (RMS spot radius or wavefront, MTF, PSF, boresight) by every tolerance at its limits, "
         "its mean of the lens as built by second derivatives, and its distribution over perturbed and compensated "
-        "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the "
-        "sensor distance unless the file has others.",
+        "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the "
+        "compensator is the sensor distance unless the file has others.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
