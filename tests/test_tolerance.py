@@ -100,15 +100,15 @@ def test_a_trial_is_the_same_in_any_study(triplet, built):
 
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
     file = tmp_path / "trials.jsonl"
-    first = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    first = rt.tolerance(triplet, limits=LIMITS, trials=1100, checkpoint=file)
     lines = file.read_text().splitlines(keepends=True)
     assert len(lines) == 3  # the study, and two pieces
     file.write_text("".join(lines[:2]) + lines[2][:40])  # as a killed process leaves it
-    again = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    again = rt.tolerance(triplet, limits=LIMITS, trials=1100, checkpoint=file)
     assert torch.equal(first.trials, again.trials)
     assert torch.equal(first.changes, again.changes)
     with pytest.raises(rt.BadTolerance, match="trials of another study"):
-        rt.tolerance(triplet, limits="radius=0.2%", trials=600, checkpoint=file)
+        rt.tolerance(triplet, limits="radius=0.2%", trials=1100, checkpoint=file)
 
 
 def test_compensators_stay_within_their_limits(triplet):

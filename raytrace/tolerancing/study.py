@@ -46,7 +46,7 @@ _STEP = 0.05  # of the half width of a tolerance: step of the differences of gra
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_CHUNK = 512  # lenses traced at once
+_CHUNK = 1024  # lenses traced at once
 _MODEL = 2**15  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
