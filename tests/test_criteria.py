@@ -136,6 +136,37 @@ def test_mtf_of_a_clipped_beam_is_refused(triplet):
         rt.tolerance(clipped, limits=LIMITS, criterion="mtf@20", trials=0)
 
 
+# -- merit functions ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["spot", "wavefront"])
+def test_merit_is_that_of_single_lenses(triplet, kind):
+    rows, sampling = rt.tolerances(triplet, LIMITS + " irregularity=0.5 index=0.0005"), sampling_of(triplet)
+    errors = rt.draw_errors(rows, 2)
+    criterion = criterion_of("merit", triplet, sampling, merit=kind)
+    values = criterion.value(criterion.quantity(aligned(rt.perturbed(triplet, rows, errors), 3), sampling))
+    for k in range(2):
+        alone = rt.evaluate(rt.perturbed(triplet, rows, errors[k]), merit=kind)
+        assert float(values[k]) == pytest.approx(float(alone.merit), rel=1e-9)
+
+
+def test_merit_has_exact_derivatives(triplet):
+    merit = rt.Merit.default(triplet, "spot") + rt.Merit((rt.Row("EFFL", (0, 2), target=100.0, weight=0.1),))
+    check_gradient(triplet, "merit", merit=merit)
+
+
+def test_merit_as_built(triplet):
+    rows = rt.tolerances(triplet, "radius=0.1% element_decenter=0.02")
+    found = rt.tolerance(triplet, rows, criterion="merit", merit="spot", trials=16)
+    spread = float(found.trials.std()) / len(found.trials) ** 0.5
+    assert abs(float(found.expected - found.trials.mean())) < 5 * spread
+    assert float(found.nominal) < float(found.expected)
+    with pytest.raises(rt.BadMerit, match="no merit function of its own"):
+        rt.tolerance(triplet, rows, criterion="merit")
+    with pytest.raises(ValueError, match="`merit` belongs to the criterion merit"):
+        rt.tolerance(triplet, rows, merit="spot")
+
+
 # -- PSF ---------------------------------------------------------------------------------------------------------------
 
 

@@ -777,7 +777,7 @@ COMMANDS = (
     _command(
         "tolerance",
         "the lens as built: sensitivities, expectation and Monte Carlo",
-        "Change of a criterion (RMS spot radius or wavefront, MTF, PSF, boresight) by every tolerance at its limits, "
+        "Change of a criterion (RMS spot radius or wavefront, MTF, merit, …) by every tolerance at its limits, "
         "its mean of the lens as built by second derivatives, and its distribution over perturbed and compensated "
         "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the "
         "compensator is the sensor distance unless the file has others.",

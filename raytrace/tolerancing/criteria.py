@@ -7,15 +7,18 @@ trace.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.analysis.sheared_batch import ShearedPupils
 from raytrace.maths.numerics import safe_divide, value
+from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
+from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, aligned
+from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.paraxial import first_order
@@ -148,12 +151,24 @@ def _boresight(lens: Lens, sampling: Sampling) -> Criterion:
     return Criterion("boresight error", "µm", quantity, scale=1.0, angle=angle, allows_idle=True)
 
 
+def _merit(lens: Lens, merit) -> Criterion:
+    """A merit function, of the file or as `optimize` takes it; q is its square."""
+    function = merit_for(lens, merit) if merit is None or isinstance(merit, Merit) else None
+
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        # a default merit function has the rays of the symmetry that the lens with errors has
+        return MeritOfBatch(lenses, function or merit_for(aligned(lenses, 0, exactly=True)[0], merit)).square()
+
+    rows = merit_for(lens, merit)
+    return Criterion("merit function", "", quantity, settings=(repr(rows.rows), rows.unit))
+
+
 #: Criteria of every lens by name, and those that are made of the nominal lens.
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
 }
-NAMES = (*CRITERIA, "mtf@F", "psf", "boresight")
+NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
 
 
 def criterion_of(
@@ -164,15 +179,21 @@ def criterion_of(
     model: str = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
 ) -> Criterion:
     """The criterion of a word, "rms" or "mtf@30", for lenses near a nominal one.
 
-    model, pixel, size: of "psf". Raises ValueError for other words and options.
+    model, pixel, size: of "psf"; merit: of "merit". Raises ValueError for other words and options, BadMerit for a lens
+    without a merit function.
     """
+    if word != "merit" and merit is not None:
+        raise ValueError(f"criterion {word!r}: `merit` belongs to the criterion merit; leave it out")
     if word != "psf" and (model, pixel, size) != ("gaussian", None, None):
         raise ValueError(f"criterion {word!r}: `model`, `pixel` and `size` belong to the criterion psf; leave them out")
     if word in CRITERIA:
         return CRITERIA[word]
+    if word == "merit":
+        return _merit(lens, merit)
     if word == "psf":
         return _psf_change(lens, sampling, model, pixel, size)
     if word == "boresight":

@@ -27,11 +27,13 @@ from torch import Tensor
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.sampling import gauss_rings
+from raytrace.optimization.merit import DefaultMerit, Merit
 from raytrace.plotting.style import GREY, INK, new_figure, styled
 from raytrace.shards import Share, total
 from raytrace.stores import Kind, Records, listed, number, record, whole
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, aligned, field_points
+from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
@@ -202,6 +204,8 @@ class Study:
         whole = 0.5 * (whole + whole.T)
         q, slope, _ = self.slope(self.half.new_zeros(1, count), best)
         H = whole[:count, :count]
+        if others:
+            self.nominal_curvature()
         if others and bool(self.acting.any()):
             acting = whole[:, count:][:, self.acting]
             mixed = acting[:count]
@@ -500,6 +504,7 @@ def tolerance(
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
     checkpoint: str | PathLike | None = None,
     share: Share | None = None,
     progress: Callable | None = None,
@@ -516,7 +521,7 @@ def tolerance(
         diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; "psf", the change of the
         PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the chief
         ray; "boresight", the distance in µm by which the chief ray of the axial field misses its nominal place on the
-        sensor. The compensators of every lens bring it to its best.
+        sensor; "merit", a merit function. The compensators of every lens bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
@@ -529,6 +534,7 @@ def tolerance(
     arms: of the pupil, 6 by default.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
+    merit: of "merit", as `optimize` takes it; by default that of the file.
     checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
@@ -545,7 +551,7 @@ def tolerance(
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     sampling, given = _sampling(lens, fields, rings, arms), tolerances
-    chosen = criterion_of(criterion, lens, sampling, model=model, pixel=pixel, size=size)
+    chosen = criterion_of(criterion, lens, sampling, model=model, pixel=pixel, size=size, merit=merit)
     study = Study(lens, tolerances, chosen, sampling)
     with torch.no_grad():
         nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
