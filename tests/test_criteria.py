@@ -155,6 +155,20 @@ def test_merit_has_exact_derivatives(triplet):
     check_gradient(triplet, "merit", merit=merit)
 
 
+def test_evaluate_takes_a_batch(triplet):
+    distance = torch.tensor([77.0, 77.4, 77.8], dtype=torch.float64, requires_grad=True)
+    lenses = triplet.replace(7, thickness=distance)
+    found = rt.evaluate(lenses, merit="spot")
+    alone = [rt.evaluate(triplet.at(sensor_distance=float(d)), merit="spot") for d in distance]
+    torch.testing.assert_close(found.merit.detach(), torch.stack([one.merit for one in alone]), rtol=1e-12, atol=0)
+    torch.testing.assert_close(found.values, torch.stack([one.values for one in alone]), rtol=1e-10, atol=1e-13)
+    (slope,) = torch.autograd.grad(found.merit.sum(), distance)
+    ends = rt.evaluate(triplet.replace(7, thickness=distance.detach() + 1e-5), merit="spot").merit
+    starts = rt.evaluate(triplet.replace(7, thickness=distance.detach() - 1e-5), merit="spot").merit
+    torch.testing.assert_close(slope, (ends - starts) / 2e-5, rtol=1e-6, atol=0)
+    assert "lost" in str(found)
+
+
 def test_merit_as_built(triplet):
     rows = rt.tolerances(triplet, "radius=0.1% element_decenter=0.02")
     found = rt.tolerance(triplet, rows, criterion="merit", merit="spot", trials=16)
@@ -230,3 +244,22 @@ def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
     found = rt.tolerance(triplet, whole, criterion="boresight", trials=0)
     assert float(found.maximum[0]) == pytest.approx(30.0, abs=0.1)
     assert float(found.slope[0]) == pytest.approx(float(found.maximum[0]), rel=1e-5)
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("criterion", ["rms", "wavefront", "boresight"])
+def test_surfaces_that_cross_are_traced_as_they_stand(triplet, criterion):
+    """A gap of 2 mm with an error of -3 mm: rays go back by 1 mm, as in OpticStudio."""
+    rows = rt.Tolerances((rt.Tolerance("thickness", (4,), -3.0, 3.0, adjust=6),))
+    found = rt.tolerance(triplet, rows, criterion=criterion, trials=0)
+    crossed = triplet.replace(4, thickness=-1.0).replace(6, thickness=float(triplet.surfaces[6].thickness) + 3.0)
+    alone = rt.tolerance(crossed, rows, criterion=criterion, trials=0)
+    assert float(found.nominal + found.minimum) == pytest.approx(float(alone.nominal), rel=1e-9, abs=1e-12)
+
+
+def test_compensator_that_moves_nothing_is_refused(triplet):
+    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(5, "tilt_z")])
+    with pytest.raises(rt.BadTolerance, match="it has no effect on the RMS spot radius; leave it out"):
+        rt.tolerance(triplet, rows, trials=0)
