@@ -471,14 +471,15 @@ class Toleranced(Result):
         ordered = torch.sort(shown).values
         curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
         curve.set(ylabel="yield, %", ylim=(0, 100))
-        left.legend(fontsize=8, loc="center right")
+        side = "right" if self.sign > 0 else "left"
+        left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)
         labels = [self.tolerances.labels[k] for k in order.tolist()]
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
         right.set(xlabel=", ".join(filter(None, ("change of the criterion", self.unit))))
-        right.legend(fontsize=8, loc="lower right")
+        right.legend(fontsize=8, loc=f"lower {side}")
         return figure
 
 
