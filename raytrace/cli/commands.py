@@ -787,6 +787,7 @@ COMMANDS = (
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
