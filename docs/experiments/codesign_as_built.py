@@ -171,8 +171,7 @@ def figure(rows: list[dict]):
     return drawn
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lens")
     parser.add_argument("--data", required=True, help="folder of pictures")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
@@ -183,6 +182,11 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--builds", nargs="+", default=["precision", "commercial"], choices=[*BUILDS])
     parser.add_argument("--check", action="store_true", help="test with DRT PSFs as well")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     prepare()
