@@ -371,6 +371,7 @@ def test_a_study_that_was_not_started_is_refused(compare):
         compare("double_gauss", *SMALL, "--limit", 5, "-o", "out", "--models", study.AFTER_PARAXIAL)
 
 
+@pytest.mark.slow
 def test_compare_writes_the_table_and_the_page(compare, pictures):
     """Paraxial, and Gaussian DRT begun where that ended; then the page again with a seed that is missing."""
     after = study.AFTER_PARAXIAL
