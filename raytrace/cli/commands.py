@@ -790,6 +790,7 @@ COMMANDS = (
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
         model={"choices": ("gaussian", "drt"), "help": "PSFs of psf: gaussian (default), smooth in the errors, or drt"},
         pixel="pixel pitch of psf (default 0.005)", size="pixels across the windows of psf (default 21)",
+        limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
