@@ -128,11 +128,15 @@ def table_of_samples(store: Store, name: str, reference: int = 6000) -> list[str
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="figures computed so far")
     parser.add_argument("--plot", type=Path, help="figure to write")
     parser.add_argument("--only", choices=[*CASES, "samples"], help="one part")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     store = Store(arguments.folder, {"grade": GRADE, "seed": SEED, "trials": TRIALS})
