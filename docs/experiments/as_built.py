@@ -44,8 +44,8 @@ def numbers_of(lens) -> np.ndarray:
 
 def lens_of(lens, numbers: np.ndarray):
     for k, (curvature, thickness) in enumerate(numbers, 1):
-        change = {"thickness": thickness} if lens.surfaces[k].curvature is None else {}
-        lens = lens.replace(k, **(change or {"curvature": curvature, "thickness": thickness}))
+        bent = {"curvature": curvature} if curvature else {}
+        lens = lens.replace(k, thickness=thickness, **bent)
     return lens
 
 
