@@ -87,6 +87,7 @@ def test_starts_are_spread_evenly_and_are_the_same_in_any_order(plate):
     assert np.array_equal(counts, np.full_like(counts, 8))  # a net: as many in each eighth
 
 
+@pytest.mark.slow
 def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeypatch):
     steep = plates(1.8, diameter=36.0, fields=(0.0, 25.0))
     for k, c in ((1, -0.05), (2, -0.06)):
@@ -146,6 +147,7 @@ def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
     assert found.lens is found.lenses[0]
 
 
+@pytest.mark.slow
 def test_each_minimum_is_reported_once_and_is_one():
     how = {
         **HOW,
@@ -256,6 +258,7 @@ def test_along_both_lines_of_a_null_meniscus_the_merit_stays(best_triplet):
         assert one.whole.evaluated(x).residuals == pytest.approx(before, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_from_a_singlet_to_better_lenses_of_two_elements(found, tmp_path):
     how = {**HOW, "hold": "efl=50"}
     two = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
@@ -316,6 +319,7 @@ def test_tasks_that_are_known_are_not_done_again_and_a_torn_line_is(tmp_path):
         Journal(tmp_path, about, 0.0).each([task("d")], 2)
 
 
+@pytest.mark.slow
 def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
     class Bar:
         """Interrupts at the fifth start."""

@@ -585,14 +585,15 @@ COMMANDS = (
         "measure speed against error",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
         "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
-        "with gradients, aspheres and the step of the sensor distance (minutes). With the extra [bench] Optiland and "
-        "ray-optics are measured, too.",
+        "with gradients, aspheres and the step of the sensor distance (minutes); or Cooke triplets perturbed and "
+        "refocused. With the extra [bench] Optiland and ray-optics are measured, too.",
         """
         trace
         psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
         trace --rays 1000 100000 -o bench.md --plot bench.png
-        speed --quick --repeats 1""",
-        option("what", choices=("trace", "psf", "speed"), help="subject of the measurement"),
+        speed --quick --repeats 1
+        tolerance --json""",
+        option("what", choices=("trace", "psf", "speed", "tolerance"), help="subject of the measurement"),
         option(
             "lenses",
             metavar="LENS",
@@ -789,6 +790,7 @@ COMMANDS = (
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(

@@ -27,7 +27,7 @@ from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
 from raytrace.tolerancing.grades import tolerances as tolerances_of
 from raytrace.tolerancing.perturbation import perturbed
-from raytrace.tolerancing.study import _sampling, focuses, moments
+from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 from raytrace.tracing.compiled import Task, forward, is_expressible, prepare, push, task_of
 from raytrace.tracing.focus import focus_moments
@@ -96,7 +96,7 @@ class AsBuiltTerm:
         self.limits = _focus_limits(lens, self.tolerances)
         self.radii = semi_diameters(lens)
         self.errors = design(self.tolerances).to(lens.wavelengths)
-        self.sampling = _sampling(lens, settings.fields, settings.rings, settings.arms)
+        self.sampling = sampling_of(lens, settings.fields, settings.rings, settings.arms)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         self.weights = (shares[:, None] * self.sampling.weights).flatten()
         if not bool(torch.isfinite(self.expected(lens))):

@@ -24,7 +24,7 @@ import torch
 from scipy.special import ndtr
 from torch import Tensor
 
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, styled
@@ -46,8 +46,8 @@ _STEP = 0.05  # of the half width of a tolerance: step of the differences of gra
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_CHUNK = 512  # lenses traced at once
-_MODEL = 2**15  # draws of the second-order model
+_CHUNK = 1024  # lenses traced at once
+_MODEL = 2**13  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 
@@ -191,17 +191,17 @@ class Study:
         _, best = self.compensated(self.half.new_zeros(1, count))
         steps = torch.cat([_STEP * self.half, self.scale_of_compensators()])
         places = torch.diag(steps)
-        moved = torch.cat([places, -places])
+        moved = torch.cat([places, -places, torch.zeros_like(places[:1])])
         moved[:, count:] += best
-        both = torch.cat(self.slope(moved[:, :count], moved[:, count:])[1:], -1)
-        whole = (both[: count + others] - both[count + others :]) / (2 * steps[:, None])
+        q, *both = self.slope(moved[:, :count], moved[:, count:])
+        ahead, behind, (slope,) = torch.cat(both, -1).split((len(steps), len(steps), 1))
+        whole = (ahead - behind) / (2 * steps[:, None])
         whole = 0.5 * (whole + whole.T)
-        q, slope, _ = self.slope(self.half.new_zeros(1, count), best)
         H = whole[:count, :count]
         if others:
             mixed = whole[:count, count:]
             H = H - mixed @ torch.linalg.solve(whole[count:, count:], mixed.T)
-        return float(q), slope[0], H
+        return float(q[-1]), slope[:count], H
 
 
 def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
@@ -237,7 +237,9 @@ def _check(lens: Lens, one: Compensator) -> None:
 
 
 def moments(row: Tolerance) -> tuple[float, float]:
-    """Mean and variance of the error of a row."""
+    """Mean and variance of the error of a row. Rows of a group have errors on a sphere, alike in all directions."""
+    if row.group:
+        return 0.0, row.maximum**2
     middle, half = 0.5 * (row.minimum + row.maximum), 0.5 * (row.maximum - row.minimum)
     if row.distribution == "normal":
         s = row.sigmas
@@ -523,9 +525,11 @@ def tolerance(
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
-    sampling, given = _sampling(lens, fields, rings, arms), tolerances
+    sampling, given = sampling_of(lens, fields, rings, arms), tolerances
     chosen = criterion_of(criterion, lens, sampling)
     study = Study(lens, tolerances, chosen, sampling)
+    if study.compensators:
+        study.nominal_curvature()  # refuses those without effect
     with torch.no_grad():
         nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_quantity.isfinite().all()):
@@ -544,14 +548,13 @@ def tolerance(
             _second_order_change(chosen, model, limits.to(study.half))
             for limits in (tolerances.minimum, tolerances.maximum)
         ]
-        predicted, mean_square = _model(tolerances, *model, seed)
-        predicted = chosen.value(predicted.clamp_min(0))
+        predicted, expected, mean_square = second_order_draws(tolerances, chosen, *model, seed)
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
         minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
-        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=predicted.mean(),
+        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=expected,
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
         unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
         given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
@@ -574,7 +577,7 @@ def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
         return g * torch.autograd.grad(criterion.value(q), q)[0]
 
 
-def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:
+def sampling_of(lens: Lens, fields, rings: int, arms: int) -> Sampling:
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
     weights = lens.fields.weight if fields is None else torch.ones_like(points[0])
@@ -593,13 +596,20 @@ def _at_limits(study: Study) -> tuple[Tensor, Tensor]:
     return found[: len(low)], found[len(low) :]
 
 
-def _model(tolerances: Tolerances, q0: float, g: Tensor, H: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws (K,) of the quadratic form, and its exact mean ()."""
+def second_order_draws(
+    tolerances: Tolerances, criterion: Criterion, q0: float, g: Tensor, H: Tensor, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draws (K,) of the criterion by second order, its mean (), and the exact mean of q ().
+
+    The mean of q, which is known, is a control variate of that of the criterion.
+    """
     mean, variance = (g.new_tensor(part) for part in zip(*map(moments, tolerances), strict=True))
     errors = draw_errors(tolerances, _MODEL, seed + 1).to(g)
     drawn = q0 + errors @ g + 0.5 * ((errors @ H) * errors).sum(-1)
     exact = q0 + g @ mean + 0.5 * (torch.diagonal(H) @ variance + mean @ H @ mean)
-    return drawn, exact
+    found = criterion.value(drawn.clamp_min(0))
+    off = drawn - drawn.mean()
+    return found, found.mean() - safe_divide((off * found).sum(), (off * off).sum()) * (drawn.mean() - exact), exact
 
 
 _JOURNAL = Kind(
