@@ -170,6 +170,16 @@ def pose_of(rows: Rows) -> Pose:
     )
 
 
+def decentred_first(pose: Pose) -> Pose:
+    """The same passage, decentred before it is tilted; tilts as those of `pose_of`."""
+    return pose_of(rows_along([pose])) if pose.tilts_first else pose
+
+
+def tilted_first(pose: Pose) -> Pose:
+    """The same passage, tilted before it is decentred: old = Rz Ry Rx (new + d); tilts as those of `pose_of`."""
+    return pose if pose.tilts_first else undone(pose_of(rows_along([undone(pose)])))
+
+
 def _angle(sine: Number, cosine: Number) -> Tensor | None:
     """The angle in degrees; None where it is 0 for all."""
     if isinstance(sine, float) and sine == 0.0:

@@ -17,6 +17,7 @@ PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linea
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -446,6 +447,36 @@ def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor
     entries = itertools.zip_longest(given.coefficients.unbind(0), terms, fillvalue=zero)
     sums = [a if b is zero else b if a is zero else a + b for a, b in entries]
     return dataclasses.replace(given, coefficients=torch.stack(torch.broadcast_tensors(*sums)))
+
+
+def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
+    """The same as a sum of powers about the vertex, and the height () mm to be added to it.
+
+    Raises ValueError for a grid of heights, which is no such sum.
+    """
+    row = SAG_TERMS[type(sag_terms).__name__]
+    if row.powers is None:
+        raise ValueError("a grid of heights is no sum of powers")
+    given = row.powers(sag_terms)
+    if not bool(given.centre_x.any() | given.centre_y.any()):
+        return PolynomialSag(given.coefficients, given.radius), given.height
+    centre = -given.centre_x / given.radius, -given.centre_y / given.radius
+    height, terms = shifted(given.coefficients.unbind(0), *centre)
+    return PolynomialSag(torch.stack(torch.broadcast_tensors(*terms)), given.radius), given.height + height
+
+
+def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> PolynomialSag:
+    """A sum of powers with Σ_n a_n (x² + y²)^n added; coefficients: (m,) a_1, a_2, … in mm^(1-2n)."""
+    radius, highest = sag_terms.radius, 2 * len(coefficients)
+    even = {
+        (2 * (n - j), 2 * j): a * radius ** (2 * n) * math.comb(n, j)
+        for n, a in enumerate(coefficients.unbind(0), 1)
+        for j in range(n + 1)
+    }
+    order = powers(max(len(sag_terms.coefficients), highest * (highest + 3) // 2))
+    zero = torch.zeros_like(radius)
+    pairs = itertools.zip_longest(sag_terms.coefficients.unbind(0), order, fillvalue=zero)
+    return PolynomialSag(torch.stack([a + even[power] if power in even else a for a, power in pairs]), radius)
 
 
 def _scaled(coefficients: Tensor, factor: Tensor) -> list[Tensor]:
