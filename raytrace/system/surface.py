@@ -8,7 +8,7 @@ intersection with rays.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from raytrace.materials.glass import AIR, Glass
 from raytrace.maths.numerics import is_any, value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
-from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first
+from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first, without_z
 from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
 from raytrace.system.shapes import EVEN, KINDS, conic_terms
 
@@ -87,32 +87,29 @@ def gap_behind(surface: Surface) -> Tensor | Gap:
     return surface.thickness if surface.after is None else Gap(surface.after, surface.thickness)
 
 
-def with_z_in_thicknesses(surfaces: Sequence[Surface]) -> list[Surface]:
+def with_z_in_thicknesses(surfaces: Sequence[Surface], numbers: Collection[int] | None = None) -> list[Surface]:
     """The same surfaces in space, with every decentre along z in the thickness before or behind its surface.
 
-    A pose before a surface is decentred first, one behind it tilted first. An object at infinity stays there.
+    A pose before a surface is decentred first, one behind it tilted first. Behind an object at infinity surface 1 keeps
+    its decentre. numbers: of the surfaces whose decentres are moved, by default all.
     """
     result = list(surfaces)
-    for k, surface in enumerate(surfaces):
-        if k and isinstance(surface.before, Pose) and surface.before.z is not None:
-            pose = decentred_first(surface.before)
-            result[k - 1] = _thicker(result[k - 1], pose.z)
-            result[k] = dataclasses.replace(result[k], before=_without_z(pose))
-        if surface.after is not None and surface.after.z is not None:
-            pose = tilted_first(surface.after)
-            result[k] = _thicker(dataclasses.replace(result[k], after=_without_z(pose)), pose.z)
+    for k in range(len(surfaces)) if numbers is None else sorted(numbers):
+        before, after = surfaces[k].before, surfaces[k].after
+        if k and isinstance(before, Pose) and before.z is not None:
+            pose = decentred_first(before)
+            if is_any(result[k - 1].thickness.detach() < torch.inf):
+                result[k - 1] = _thicker(result[k - 1], pose.z)
+                pose = without_z(pose)
+            result[k] = dataclasses.replace(result[k], before=pose)
+        if after is not None and after.z is not None:
+            pose = tilted_first(after)
+            result[k] = _thicker(dataclasses.replace(result[k], after=without_z(pose)), pose.z)
     return result
 
 
-def _without_z(pose: Pose) -> Pose | None:
-    numbers = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
-    return None if all(number is None for number in numbers) else dataclasses.replace(pose, z=None)
-
-
 def _thicker(surface: Surface, z: Tensor | None) -> Surface:
-    if z is None or not is_any(surface.thickness.detach() < torch.inf):
-        return surface
-    return dataclasses.replace(surface, thickness=surface.thickness + z)
+    return surface if z is None else dataclasses.replace(surface, thickness=surface.thickness + z)
 
 
 def medium_surfaces(surfaces: Sequence[Surface]) -> list[int]:
