@@ -100,15 +100,15 @@ def test_a_trial_is_the_same_in_any_study(triplet, built):
 
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
     file = tmp_path / "trials.jsonl"
-    first = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
+    first = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
     lines = file.read_text().splitlines(keepends=True)
     assert len(lines) == 3  # the study, and two pieces
     file.write_text("".join(lines[:2]) + lines[2][:40])  # as a killed process leaves it
-    again = rt.tolerance(triplet, limits=LIMITS, trials=300, checkpoint=file)
+    again = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
     assert torch.equal(first.trials, again.trials)
     assert torch.equal(first.changes, again.changes)
     with pytest.raises(rt.BadTolerance, match="trials of another study"):
-        rt.tolerance(triplet, limits="radius=0.2%", trials=300, checkpoint=file)
+        rt.tolerance(triplet, limits="radius=0.2%", trials=600, checkpoint=file)
 
 
 def test_compensators_stay_within_their_limits(triplet):
@@ -177,3 +177,67 @@ def test_tolerances_of_a_file(file):
     assert len(found.tolerances) == len(rt.read_tolerances(file))
     assert bool(found.trials.isfinite().all())
     assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.15)
+
+
+def test_no_error_alone_does_more_than_the_increment(triplet):
+    free = rt.tolerance(triplet, limits=LIMITS, trials=0)
+    held = rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.1)
+    before, after = (torch.cat([found.minimum, found.maximum]) for found in (free, held))
+    assert int((before > 0.1).sum()) > 5
+    assert torch.allclose(after, before.clamp(max=0.1), atol=1e-6)
+    narrower = held.tolerances.maximum < free.tolerances.maximum
+    assert torch.equal(narrower, free.maximum > 0.1)
+    assert len(held.tightened()) == int(((free.maximum > 0.1) | (free.minimum > 0.1)).sum())
+    assert f"limits tightened of {len(held.tightened())} of" in str(held)
+
+
+def test_limits_of_a_yield_have_it_at_less_tightness_than_a_common_factor(triplet, built):
+    goal, free = float(built.percentile(60)), built
+    found = rt.tolerance(triplet, limits=LIMITS, trials=1500, goal=goal, yield_=0.9)
+    assert found.summary()["yield_by_second_order"] == pytest.approx(0.9, abs=0.01)
+    assert found.yield_at(goal) == pytest.approx(0.9, abs=0.03)  # 4 σ of the binomial distribution
+    factors = found.tolerances.maximum / free.tolerances.maximum
+    assert bool((factors <= 1).all())
+    low, high = 0.01, 1.0  # the common factor of the same yield, by halving
+    for _ in range(8):
+        factor = 0.5 * (low + high)
+        rows = [
+            dataclasses.replace(row, minimum=factor * row.minimum, maximum=factor * row.maximum)
+            for row in free.tolerances
+        ]
+        again = rt.tolerance(triplet, dataclasses.replace(free.tolerances, rows=tuple(rows)), trials=0, goal=goal)
+        good = again.summary()["yield_by_second_order"] >= 0.9
+        low, high = (factor, high) if good else (low, factor)
+    assert float((1 / factors).mean()) < 0.95 / low
+
+
+def test_a_yield_that_is_met_leaves_the_limits(triplet):
+    found = rt.tolerance(triplet, limits="radius=0.001%", trials=0, goal=40.0, yield_=0.9)
+    assert found.given is None
+    assert found.summary()["yield_by_second_order"] == 1.0
+
+
+def test_impossible_goals_are_refused(triplet):
+    with pytest.raises(rt.BadTolerance, match="nominal lens itself does not reach the goal"):
+        rt.tolerance(triplet, limits=LIMITS, trials=0, goal=1.0, yield_=0.9)
+    with pytest.raises(ValueError, match="a share of the lenses between 0 and 1"):
+        rt.tolerance(triplet, limits=LIMITS, trials=0, yield_=90.0)
+    with pytest.raises(ValueError, match="expected a change of the criterion above 0"):
+        rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.0)
+
+
+def test_second_order_of_each_limit(built):
+    close = built.second_maximum - built.maximum
+    assert float(close.abs().max()) < 0.01 * float(built.maximum.abs().max())
+    table = built.table_of_shares()
+    assert torch.allclose(table["predicted"], table["trials"], rtol=0.02)
+
+
+def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
+    lens = rt.read_lens("cooke_triplet")  # auto: off, whose elements are tilted then
+    rows = rt.tolerances(lens, grade="precision", compensators=[])
+    assert rt.perturbed(lens, rows, [0.0] * len(rows)).ray_aiming == "off"
+    nominal = rt.tolerance(
+        lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, arms=rt.gauss_rings(4)[0].shape[1] // 4
+    ).nominal
+    assert float(nominal) == pytest.approx(rms(lens.at(fields=[0, 8.4, -8.4])), abs=1e-9)

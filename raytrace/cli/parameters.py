@@ -88,6 +88,7 @@ def entries(docstring: str, names: list[str]) -> dict[str, str]:
 SPELLED = {
     **{"fields": "field", "wavelengths": "wavelength", "frequencies": "frequency", "radii": "radius"},
     **{"object_distances": "object-distance", "depths": "depth", "catalogs": "catalog", "conventions": "reading"},
+    "yield_": "yield",
 }
 
 

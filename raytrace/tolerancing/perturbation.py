@@ -31,6 +31,8 @@ from raytrace.system.surface import Surface, with_z_in_thicknesses
 from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
+from raytrace.tracing.launch import with_ray_aiming
+from raytrace.tracing.trace import aiming_of
 from raytrace.words import did_you_mean
 
 #: Parameters of an Irregular surface by the names of a lens.
@@ -45,7 +47,8 @@ def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: 
     Differentiable in the errors and in the lens. Numbers that no error touches stay the same tensors.
     A lens of several configurations is perturbed in all of them, and loses the others where an element moves whose
     thicknesses or poses differ between them: perturb each `lens.configuration(k)` then. Pickups and position solves
-    follow; other solves keep the nominal number.
+    follow; other solves keep the nominal number. Rays find the stop as in the lens: its ray aiming "auto" becomes what
+    it resolves to.
     Raises BadTolerance for a tolerance that the lens does not have, and for errors that are not one for each row.
     """
     return Perturbation(lens, tolerances)(errors)
@@ -55,7 +58,8 @@ class Perturbation:
     """A lens with its tolerances, checked once and applied to any errors: `perturbed` for many batches of one lens."""
 
     def __init__(self, lens: Lens, tolerances: Tolerances | Iterable[Tolerance]):
-        self.lens, self.rows = lens, rows_of(tolerances)
+        # The perturbed lens, whose axis bends, finds its stop as the nominal one does.
+        self.lens, self.rows = with_ray_aiming(lens, aiming_of(lens)), rows_of(tolerances)
         fringes = tolerances if isinstance(tolerances, Tolerances) else Tolerances(self.rows)
         self.wavelength = 1e-3 * fringes.test_wavelength
         check_tolerances(lens, self.rows)

@@ -39,12 +39,13 @@ from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
-_CHUNK = 256  # lenses traced at once
+_CHUNK = 512  # lenses traced at once
 _MODEL = 2**15  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -123,6 +124,13 @@ class Study:
                 break
         self.unsettled += int((gain > 1e-6 * q).sum())
         return q, changes
+
+    def harm(self, errors: Tensor) -> Tensor:
+        """How much worse the criterion (L,) of compensated lenses is than that of the nominal one."""
+        zero = self.half.new_zeros(1, errors.shape[1])
+        found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(_CHUNK))]
+        nominal, *others = (q.sqrt() for q in found)
+        return torch.cat(others) - nominal
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -212,11 +220,14 @@ class Toleranced(Result):
     """The lens as built.
 
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
-    of the criterion by each tolerance at its limits, compensated; slope: (N,) its derivative times the half width.
+    of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
+    second order; slope: (N,) its derivative times the half width.
     estimated: () nominal + √Σ ½(Δmin² + Δmax²), as OpticStudio. expected: () the mean of the criterion by second order;
     expected_square: () that of its square. predicted: (K,) draws of the second-order model. trials: (T,) the criterion
     of the perturbed and compensated lenses, nan where no ray arrives; changes: (T, C) of the compensators.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
+    goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
+    before their limits were tightened, or None.
     """
 
     lens: Lens
@@ -226,6 +237,8 @@ class Toleranced(Result):
     nominal: Tensor
     minimum: Tensor
     maximum: Tensor
+    second_minimum: Tensor
+    second_maximum: Tensor
     slope: Tensor
     estimated: Tensor
     expected: Tensor
@@ -235,6 +248,9 @@ class Toleranced(Result):
     changes: Tensor
     seed: int = 0
     unsettled: int = 0
+    goal: float | None = None
+    share: float = 0.9
+    given: object = None
 
     COLUMNS = property(
         lambda self: (
@@ -243,6 +259,8 @@ class Toleranced(Result):
             Column("maximum", form=".5g"),
             Column("change_minimum", self.unit, ".5f", "change\nat min."),
             Column("change_maximum", self.unit, ".5f", "change\nat max."),
+            Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
+            Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
         )
     )
@@ -260,6 +278,22 @@ class Toleranced(Result):
         """Share of the trials whose criterion is at most a number."""
         return float((self.trials <= most).double().mean())
 
+    def table_of_shares(self) -> dict[str, Tensor]:
+        """The criterion that shares of the trials are below, the same by second order, and the difference."""
+        shares = sorted({*PERCENTILES, 100 * self.share})
+        traced = torch.stack([self.percentile(p) for p in shares])
+        predicted = torch.quantile(self.predicted, traced.new_tensor(shares) / 100)
+        off = 100 * (predicted / traced - 1)
+        return {"share": traced.new_tensor(shares), "trials": traced, "predicted": predicted, "difference": off}
+
+    def tightened(self) -> list[tuple[str, float]]:
+        """The tolerances whose limits were tightened, with the factor, the most tightened first."""
+        if self.given is None:
+            return []
+        pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
+        found = [(label, _factor(new, old)) for new, old, label in pairs]
+        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
+
     def at_limit(self, number: int) -> int:
         """How many trials have a compensator, by its number from 0, at one of its limits."""
         one, moved = self.tolerances.compensators[number], self.changes[:, number]
@@ -274,6 +308,8 @@ class Toleranced(Result):
             "unit": order,
             "change_minimum": self.minimum[order],
             "change_maximum": self.maximum[order],
+            "second_minimum": self.second_minimum[order],
+            "second_maximum": self.second_maximum[order],
             "slope": self.slope[order],
         }
 
@@ -293,6 +329,10 @@ class Toleranced(Result):
             found |= {"mean": float(good.mean()), "sigma": float(good.std()), "best": float(good.min())}
             found |= {"worst": float(good.max()), "failed": int(self.trials.isnan().sum())}
             found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+        if self.goal is not None:
+            found |= {"goal": self.goal, "yield_by_second_order": float((self.predicted <= self.goal).double().mean())}
+            if len(self.trials):
+                found["yield"] = self.yield_at(self.goal)
         return found
 
     def tables(self) -> list[Table]:
@@ -309,7 +349,6 @@ class Toleranced(Result):
                 + f"; {found['failed']} without light"
                 * (found["failed"] > 0)
             )
-            about.append(", ".join(f"{p} % ≤ {found[f'percent_{p}']:.5g}" for p in PERCENTILES))
             for k, one in enumerate(self.tolerances.compensators):
                 c = self.changes[:, k]
                 about.append(
@@ -317,9 +356,24 @@ class Toleranced(Result):
                     f"σ {float(c.std()):.4g}"
                     + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
+        if self.goal is not None:
+            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
+            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
+            about.append(f"within {self.goal:g} {self.unit}: {share}{traced}")
+        if self.given is not None:
+            drawn = self.tightened()
+            listed = ", ".join(f"{label} × {factor:.3g}" for label, factor in drawn[:6])
+            about.append(
+                f"limits tightened of {len(drawn)} of {len(self.tolerances)} tolerances{': ' * bool(drawn)}{listed}"
+            )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        return [Table(self.columns(), about)]
+        found = [Table(self.columns(), about)]
+        if len(self.trials):
+            found.append(
+                Table(self.table_of_shares(), ["share of the trials within a limit, and the same by second order"])
+            )
+        return found
 
     def document(self) -> dict:
         return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
@@ -354,6 +408,12 @@ class Toleranced(Result):
         return figure
 
 
+def _factor(new: Tolerance, old: Tolerance) -> float:
+    """How much narrower the limits of a row are."""
+    wide = old.maximum - old.minimum
+    return (new.maximum - new.minimum) / wide if wide else 1.0
+
+
 def tolerance(
     lens: Lens,
     tolerances: Tolerances | None = None,
@@ -363,6 +423,9 @@ def tolerance(
     criterion: Literal["rms", "wavefront"] = "rms",
     trials: int = 1000,
     seed: int = 0,
+    increment: float | None = None,
+    goal: float | None = None,
+    yield_: float | None = None,
     fields: Tensor | Sequence | None = None,
     rings: int = 4,
     arms: int = 6,
@@ -381,6 +444,11 @@ def tolerance(
         centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt. The compensators of every
         lens minimise its square.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
+    increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
+        more than this, in its unit. Tighter limits stay.
+    goal: what the criterion of a good lens is at most; the share of such lenses is reported.
+    yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
+        least total tightness until this share reaches the goal, by second order.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
         symmetric, mirrored along y.
     rings: of the pupil, Gaussian quadrature, 4 by default.
@@ -400,27 +468,46 @@ def tolerance(
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
-    chosen = CRITERIA[criterion]
-    study = Study(lens, tolerances, chosen, _sampling(lens, fields, rings, arms))
+    if yield_ is not None and not 0 < yield_ < 1:
+        raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
+    chosen, sampling, given = CRITERIA[criterion], _sampling(lens, fields, rings, arms), tolerances
+    study = Study(lens, tolerances, chosen, sampling)
     with torch.no_grad():
         nominal_square, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_square.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
         nominal = nominal_square[0].sqrt()
+        if increment is not None:
+            tolerances = limited_to_change(tolerances, study.harm, increment)
+            study = Study(lens, tolerances, chosen, sampling)
+        model = study.second_order()
+        if goal is not None and yield_ is not None:
+            tolerances = limited_to_yield(tolerances, model, goal**2, yield_, seed + 1)
+            study = Study(lens, tolerances, chosen, sampling)
         low, high = _at_limits(study)
         changes = [q.sqrt() - nominal for q in (low, high)]
-        q0, g, H = study.second_order()
-        predicted, mean_square = _model(tolerances, q0, g, H, seed)
+        seconds = [
+            _second_order_change(model, limits.to(study.half)) for limits in (tolerances.minimum, tolerances.maximum)
+        ]
+        predicted, mean_square = _model(tolerances, *model, seed)
         predicted = predicted.clamp_min(0).sqrt()
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    slope = g * study.half / (2 * nominal)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
-        minimum=changes[0], maximum=changes[1], slope=slope, estimated=nominal + rss, expected=predicted.mean(),
+        minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
+        slope=model[1] * study.half / (2 * nominal), estimated=nominal + rss, expected=predicted.mean(),
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
-        unsettled=study.unsettled,
+        unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
+        given=None if tolerances is given else given,
     )  # fmt: skip
+
+
+def _second_order_change(model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
+    """√(q₀ + g e + ½ H_ee e²) - √q₀ (N,) of errors (N,), each alone."""
+    q0, g, H = model
+    found = q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2
+    return found.clamp_min(0).sqrt() - math.sqrt(q0)
 
 
 def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:

@@ -1,0 +1,121 @@
+"""Limits that are tightened: no error alone does more than a given harm, or a given share of the lenses is good.
+
+Inverse sensitivity: every limit t of a row is drawn in until the change of the criterion there, compensated and traced
+exactly, is the one given.
+
+Yield: the limits are scaled, row by row, by factors s between 0 and 1. With half widths t of the limits as they are
+given, those of least total tightness
+
+    Σ 1/s   subject to   P(q(s) ≤ q_goal) = yield
+
+are found on a fixed sample of the second-order model: the cost of an error is taken as inverse to its tolerance. In
+place of the step q ≤ q_goal, whose derivative vanishes almost everywhere, a narrow logistic curve has a derivative; the
+share is then met by the step itself.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+
+_HALVINGS = 30  # of a limit, to 1e-9 of it
+_DRAWS = 4096  # of the second-order model
+_SOFT = 0.05  # width of the logistic curve, in standard deviations of q
+_LEAST = 1e-3  # scale of a limit
+
+
+def scaled(tolerances: Tolerances, low: Tensor, high: Tensor) -> Tolerances:
+    """Tolerances whose limits are those times factors (N,)."""
+    pairs = zip(tolerances.rows, low.tolist(), high.tolist(), strict=True)
+    rows = [dataclasses.replace(row, minimum=a * row.minimum, maximum=b * row.maximum) for row, a, b in pairs]
+    return dataclasses.replace(tolerances, rows=tuple(rows))
+
+
+def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor], increment: float) -> Tolerances:
+    """Tolerances whose errors, each alone at a limit, change the criterion by `increment` at most.
+
+    change: errors (L, N) -> how much worse the criterion is (L,). Limits that do less harm stay. Where the change is no
+    monotonic function of the error, one place is found at which it passes the increment.
+    """
+    if not increment > 0:
+        raise ValueError(f"increment {increment:g}: expected a change of the criterion above 0")
+    limits = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
+    found = change(limits)
+    reaches = (found > increment) | ~found.isfinite()  # where no light arrives the limit is too wide
+    few = limits[reaches]
+    low, high = few.new_zeros(len(few)), few.new_ones(len(few))
+    for _ in range(_HALVINGS if len(few) else 0):
+        middle = 0.5 * (low + high)
+        found = change(few * middle[:, None])
+        good = found <= increment
+        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
+    factors = torch.ones_like(reaches, dtype=few.dtype).masked_scatter(reaches, low)
+    return scaled(tolerances, *factors.chunk(2))
+
+
+def limited_to_yield(
+    tolerances: Tolerances, model: tuple[float, Tensor, Tensor], goal: float, share: float, seed: int
+) -> Tolerances:
+    """Tolerances of least total tightness by which a share of the lenses has q ≤ goal in the second-order model.
+
+    model: q₀, g (N,) and H (N, N). Limits that already give the share stay as they are. Raises BadTolerance where the
+    lens without errors does not reach the goal.
+    """
+    q0, g, H = model
+    if q0 > goal:
+        raise BadTolerance("the nominal lens itself does not reach the goal; choose a goal that it reaches")
+    errors = draw_errors(tolerances, _DRAWS, seed).to(g)
+
+    def quantity(s: Tensor) -> tuple[Tensor, Tensor]:
+        """q (K,) of the draws, and its derivatives by the errors (K, N)."""
+        drawn = s * errors
+        bent = drawn @ H
+        return q0 + drawn @ g + 0.5 * (bent * drawn).sum(-1), g + bent
+
+    def met(s: Tensor) -> float:
+        return float((quantity(s)[0] <= goal).double().mean())
+
+    ones = torch.ones_like(g)
+    if met(ones) >= share:
+        return tolerances
+    start = torch.full_like(g, _largest(lambda factor: met(factor * ones) >= share))
+
+    def tightness(u: np.ndarray) -> tuple[float, np.ndarray]:
+        return float(np.exp(-u).mean()), -np.exp(-u) / len(u)
+
+    @functools.lru_cache(maxsize=4)
+    def excess(u: tuple[float, ...]) -> tuple[float, np.ndarray]:
+        s = torch.exp(g.new_tensor(u))
+        q, by_errors = quantity(s)
+        width = _SOFT * q.std()
+        y = torch.sigmoid((goal - q) / width)
+        slope = ((y * (y - 1) / width) @ (by_errors * errors)) * s / len(q)
+        return float(y.mean()) - share, slope.double().numpy()
+
+    found = minimize(
+        tightness, np.log(start.double().numpy()), jac=True, method="SLSQP", bounds=[(np.log(_LEAST), 0.0)] * len(g),
+        constraints={"type": "ineq", "fun": lambda u: excess(tuple(u))[0], "jac": lambda u: excess(tuple(u))[1]},
+        options={"maxiter": 100, "ftol": 1e-7},
+    )  # fmt: skip
+    best = torch.exp(torch.from_numpy(found.x)).to(g)
+    # The step itself in place of the logistic curve: all factors times one number.
+    best = (best * _largest(lambda factor: met((factor * best).clamp(max=1.0)) >= share, 2.0)).clamp(max=1.0)
+    if met(best) < share or float((1 / best).sum()) > float((1 / start).sum()):
+        best = start
+    return scaled(tolerances, best, best)
+
+
+def _largest(holds: Callable[[float], bool], most: float = 1.0) -> float:
+    """The largest factor up to `most` for which a condition holds that holds at 0, by halving."""
+    low, high = 0.0, most
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
