@@ -7,7 +7,6 @@ is named after the file of the lens, which lists it; readers find it in the fold
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -50,7 +49,9 @@ def with_melts(lens: Lens, path: Path) -> tuple[Lens, Catalog | None]:
         if is_model(found):
             return found
         figures = repr((glass.formula, glass.coefficients.tolist(), waves.tolist(), glass.records))
-        called = f"{'-'.join(glass.name.split()) or 'GLASS'}_M{hashlib.sha256(figures.encode()).hexdigest()[:5].upper()}"
+        called = (
+            f"{'-'.join(glass.name.split()) or 'GLASS'}_M{hashlib.sha256(figures.encode()).hexdigest()[:5].upper()}"
+        )
         found = dataclasses.replace(found, name=called, listed_name=called, catalog=name, comment=_comment(glass))
         return glasses.setdefault(called, found)
 

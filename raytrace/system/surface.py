@@ -90,8 +90,9 @@ def gap_behind(surface: Surface) -> Tensor | Gap:
 def with_z_in_thicknesses(surfaces: Sequence[Surface], numbers: Collection[int] | None = None) -> list[Surface]:
     """The same surfaces in space, with every decentre along z in the thickness before or behind its surface.
 
-    A pose before a surface is decentred first, one behind it tilted first. Behind an object at infinity surface 1 keeps
-    its decentre. numbers: of the surfaces whose decentres are moved, by default all.
+    A pose before a surface is decentred first, one behind it tilted first. An object at infinity stays there: rays then
+    start from axes that have followed the vertex of surface 1. numbers: of the surfaces whose decentres are moved, by
+    default all.
     """
     result = list(surfaces)
     for k in range(len(surfaces)) if numbers is None else sorted(numbers):
@@ -100,8 +101,7 @@ def with_z_in_thicknesses(surfaces: Sequence[Surface], numbers: Collection[int] 
             pose = decentred_first(before)
             if is_any(result[k - 1].thickness.detach() < torch.inf):
                 result[k - 1] = _thicker(result[k - 1], pose.z)
-                pose = without_z(pose)
-            result[k] = dataclasses.replace(result[k], before=pose)
+            result[k] = dataclasses.replace(result[k], before=without_z(pose))
         if after is not None and after.z is not None:
             pose = tilted_first(after)
             result[k] = _thicker(dataclasses.replace(result[k], after=without_z(pose)), pose.z)

@@ -9,7 +9,8 @@ thicknesses and other numbers, with the pickups and position solves that follow 
 An element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what follows
 keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that surfaces
 keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses before and
-behind: first-order data count them, and lens files hold them.
+behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such thickness:
+the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses

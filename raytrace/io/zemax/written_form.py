@@ -3,8 +3,7 @@
     sag terms       powers about a centre, Noll's polynomials, and powers on an even asphere become an extended
                     polynomial: r^2n is a sum of powers of x and y, exactly
     decentres z     of a pose before a surface belong to the thickness before, of one behind it to that behind; old =
-                    d + R new is there R (new + Rᵀd). An object at infinity stays where it is: of rays without aiming
-                    the entrance pupil follows the vertex of surface 1
+                    d + R new is there R (new + Rᵀd). An object at infinity stays where it is
     poses behind    a coordinate break become one pose with that of the break
 
 Numbers of configurations follow. Solves of numbers that change, and variables that the new terms do not have, are left
@@ -19,9 +18,16 @@ from raytrace.io.source import LensFileError, Place
 from raytrace.system.configurations import Operand
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
-from raytrace.system.poses import Pose, pose_of, rows_along, without_z
-from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
-from raytrace.system.sag_terms import about_vertex, with_even_terms
+from raytrace.system.poses import Pose, pose_of, rows_along
+from raytrace.system.sag_terms import (
+    IrregularSag,
+    PolynomialSag,
+    PowerSag,
+    TiltSag,
+    ZernikeSag,
+    about_vertex,
+    with_even_terms,
+)
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, with_z_in_thicknesses
 
@@ -45,8 +51,6 @@ def in_file_terms(lens: Lens, place: Place) -> Lens:
     surfaces = [_with_polynomial(surface, place._replace(surface=k)) for k, surface in enumerate(lens.surfaces)]
     surfaces = [_joined(surface) for surface in surfaces]
     posed = with_z_in_thicknesses(surfaces)
-    if posed[1].before is not None:  # behind an object at infinity
-        posed[1] = dataclasses.replace(posed[1], before=without_z(posed[1].before))
     for k, pair in enumerate(zip(surfaces, posed, strict=True)):
         _check_poses(*pair, place._replace(surface=k))
     if all(a is b for a, b in zip(posed, lens.surfaces, strict=True)):
