@@ -803,7 +803,8 @@ COMMANDS = (
             "--save-trials", metavar="FOLDER", type=folder_name,
             help="write the lenses of the typical, the worst and the best trial there, as .zmx files",
         ),
-        run=_tolerance, rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        run=_tolerance,
+        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
