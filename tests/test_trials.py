@@ -10,7 +10,7 @@ from problems import number
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.io import LensFileError, LensFileWarning
+from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.materials.catalogs import find_glass, load
 from raytrace.materials.environment import index_in
 from raytrace.materials.glass import (
@@ -28,7 +28,16 @@ from raytrace.system.configurations import Operand, ScaledPath
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.phases import Grating
 from raytrace.system.poses import Pose, decentred_first, rows_along, tilted_first
-from raytrace.system.sag_terms import FringeSag, PowerSag, ZernikeSag, about_vertex, relief, with_even_terms
+from raytrace.system.sag_terms import (
+    FringeSag,
+    PolynomialSag,
+    PowerSag,
+    ZernikeSag,
+    about_vertex,
+    as_fringe,
+    relief,
+    with_even_terms,
+)
 from raytrace.system.surface import sag_at
 
 PM = 1e-9  # mm
@@ -119,7 +128,7 @@ def test_decentres_along_z_are_written_as_thicknesses(name, tilts_first, tmp_pat
 
 
 def test_a_right_angle_about_y_with_a_decentre_along_z_is_refused(tmp_path):
-    pose = Pose(z=number(0.4), tilt_x=number(10.0), tilt_y=number(90.0), tilt_z=number(20.0))
+    pose = decentred_first(Pose(z=number(0.4), tilt_y=number(90.0), tilt_z=number(30.0), tilts_first=True))
     with pytest.raises(LensFileError, match=r"surface 2: .*90° about y.*coordinate break"):
         again(rt.read_lens("singlet").replace(2, after=pose), tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -147,6 +156,7 @@ def vector(*numbers):
 SAGS = {
     "powers": PowerSag(*map(number, (0.4, -0.3, 5.0, 0.01)), vector(1e-3, 2e-3, 0.0, -1e-3, 5e-4, 2e-4)),
     "zernike": ZernikeSag(vector(1e-3, 0, 2e-3, 1e-3, 0, 5e-4, 0, 2e-4, 0, 0, 1e-4), number(5.0)),
+    "high": ZernikeSag(vector(*[0.0] * 21, 1e-4), number(5.0)),
     "fringe": FringeSag(vector(1e-3, 0, 2e-3, 1e-3, 0, 5e-4, 0, 2e-4), *map(number, (5.0, 0.4, -0.3))),
 }
 
@@ -158,16 +168,24 @@ def test_sag_terms_are_powers_about_the_vertex(name):
     torch.testing.assert_close(one, other + height, rtol=0, atol=1e-17)
     even = vector(2e-3, 0.0, -3e-6, 1e-7)
     expected = sum(a * (X * X + Y * Y) ** n for n, a in enumerate(even, 1))
-    added = relief(with_even_terms(polynomial, even)).sag(X, Y, highest=0).z - other + height
+    added = relief(with_even_terms(polynomial, even)).sag(X, Y, highest=0).z - other
     torch.testing.assert_close(added, expected, rtol=1e-13, atol=1e-16)
 
 
-@pytest.mark.parametrize("name", ["powers", "zernike"])
-def test_sag_terms_on_an_asphere_are_written_as_an_extended_polynomial(name, tmp_path):
+def test_powers_to_the_fifth_are_fringe_terms():
+    for count in (1, 2, 4, 14, 20):
+        terms = PolynomialSag(1e-3 * torch.cos(torch.arange(count, dtype=torch.float64)), number(4.0))
+        one, other = (relief(part).sag(X, Y, highest=0).z for part in (terms, as_fringe(terms)))
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-17)
+    assert as_fringe(dataclasses.replace(terms, coefficients=torch.ones(21, dtype=torch.float64))) is None
+
+
+@pytest.mark.parametrize(("name", "kind"), [("powers", "FZERNSAG"), ("zernike", "FZERNSAG"), ("high", "XPOLYNOM")])
+def test_sag_terms_on_an_asphere(name, kind, tmp_path):
     lens = rt.read_lens("singlet").at(ray_aiming="real")
     lens = lens.replace(2, sag_terms=SAGS[name], coefficients=[1e-4, 2e-6, 1e-9, 1e-12, 1e-14, 1e-16, 1e-18, 1e-20])
     found = again(lens, tmp_path)
-    assert "TYPE XPOLYNOM" in (tmp_path / "lens.zmx").read_text()
+    assert f"TYPE {kind}" in (tmp_path / "lens.zmx").read_text()
     check_rays(lens, found)
     one, other = (sag_at(part.surfaces[2], X, Y) for part in (lens, found))
     torch.testing.assert_close(one - one[0], other - other[0], rtol=0, atol=1e-15)
@@ -196,7 +214,7 @@ def test_a_batch_of_lenses_is_refused(tmp_path):
     for limits in ("index=0.001", "irregularity=1", "radius=1%"):
         rows = rt.tolerances(lens, limits)
         with pytest.raises(LensFileError, match="a file holds one lens"):
-            rt.write_lens(rt.perturbed(lens, rows, rt.draw_errors(rows, 2)), tmp_path / "lens.zmx")
+            write_lens(rt.perturbed(lens, rows, rt.draw_errors(rows, 2)), tmp_path / "lens.zmx")
 
 
 # -- glasses ----------------------------------------------------------------------------------------------------------
@@ -209,8 +227,8 @@ def test_a_melt_has_the_indices_of_the_glass_with_errors(name, waves):
     found = melt(glass, waves)
     torch.testing.assert_close(index(found, waves), index(glass, waves), rtol=0, atol=1e-14)
     between = torch.linspace(float(waves.min()), float(waves.max()), 50, dtype=torch.float64)
-    torch.testing.assert_close(index(found, between), index(glass, between), rtol=0, atol=1e-9)
-    assert float(nd(found)) == pytest.approx(float(nd(glass)), abs=1e-9)
+    torch.testing.assert_close(index(found, between), index(glass, between), rtol=0, atol=1e-8)
+    assert float(nd(found)) == pytest.approx(float(nd(glass)), abs=1e-8)
     assert float(abbe_number(found)) == pytest.approx(float(abbe_number(glass)), abs=1e-4)
     assert (found.status, found.nd_listed) == ("melt", float(nd(found)))
 
@@ -233,7 +251,7 @@ def test_a_medium_of_few_numbers_keeps_its_formula(formula):
     found = melt(glass, VISIBLE)
     waves = torch.linspace(0.4, 1.0, 30, dtype=torch.float64)
     assert found.formula == formula
-    torch.testing.assert_close(index(found, waves), index(glass, waves), rtol=0, atol=2e-15)
+    torch.testing.assert_close(index(found, waves), index(glass, waves), rtol=0, atol=5e-15)
     assert melt(found, VISIBLE) is found
 
 

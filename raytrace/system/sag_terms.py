@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import Sag, polynomial_xy, powers, shifted, zernike_to_powers
+from raytrace.maths.bivariate import Sag, degree, polynomial_xy, powers, shifted, zernike_to_powers
 from raytrace.maths.numerics import broadcast_shape, polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
@@ -32,6 +32,7 @@ from raytrace.system.poses import cos_sin
 _LEAST = 4  # points along a side of a grid: a cubic
 _FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
 _BLOCK = 128  # coefficients that are found together
+_FRINGE_DEGREE = 5  # of powers that fringe terms hold
 
 
 @value
@@ -293,8 +294,8 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     c, unit = numbers
     degrees = [sum(power) for power in powers(len(c))]
     sums = [torch.zeros_like(c[0])] * (max(degrees, default=0) + 1) if len(c) else [c.new_zeros(())]
-    for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
-        sums[degree] = sums[degree] + a
+    for power, a in zip(degrees, c.abs().unbind(0), strict=True):
+        sums[power] = sums[power] + a
     return polynomial(torch.stack(sums), radius / unit.abs())
 
 
@@ -463,6 +464,26 @@ def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
     centre = -given.centre_x / given.radius, -given.centre_y / given.radius
     height, terms = shifted(given.coefficients.unbind(0), *centre)
     return PolynomialSag(torch.stack(torch.broadcast_tensors(*terms)), given.radius), given.height + height
+
+
+def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
+    """The same as a sum of fringe terms over a disc of twice the radius; None for powers of a degree above 5.
+
+    The 36 terms with n + |m| ≤ 10 hold every power to x⁵ … y⁵. Piston makes the sag at the vertex 0.
+    """
+    count = int(torch.nonzero(sag_terms.coefficients).max()) + 1 if bool(sag_terms.coefficients.any()) else 1
+    highest = degree(count)
+    if highest > _FRINGE_DEGREE:
+        return None
+    radius, size = 2 * sag_terms.radius, highest * (highest + 3) // 2
+    terms = torch.stack(_scaled(sag_terms.coefficients[:size], radius / sag_terms.radius))
+    terms = torch.cat([terms, terms.new_zeros(size - len(terms))])
+    numbers = [j for j in range(2, 37) if fringe(j)[0] <= highest]
+    matrix, constants = (terms.new_tensor(part) for part in zernike_to_powers(tuple(map(fringe, numbers))))
+    found = torch.linalg.solve(matrix, terms)
+    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers) - 1,), found)
+    zero = torch.zeros_like(radius)
+    return FringeSag(torch.cat([-(constants @ found)[None], coefficients[1:]]), radius, zero, zero)
 
 
 def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> PolynomialSag:

@@ -1,7 +1,7 @@
 """The lens in the terms of a .zmx file: the same surfaces in space, where the lens holds them by other numbers.
 
-    sag terms       powers about a centre, Noll's polynomials, and powers on an even asphere become an extended
-                    polynomial: r^2n is a sum of powers of x and y, exactly
+    sag terms       powers about a centre and Noll's polynomials become an extended polynomial. On an even asphere
+                    powers to the fifth become fringe terms; of higher ones the terms of the asphere become powers, too
     decentres z     of a pose before a surface belong to the thickness before, of one behind it to that behind; old =
                     d + R new is there R (new + Rᵀd). An object at infinity stays where it is
     poses behind    a coordinate break become one pose with that of the break
@@ -13,6 +13,7 @@ out.
 import dataclasses
 
 import torch
+from torch import Tensor
 
 from raytrace.io.source import LensFileError, Place
 from raytrace.system.configurations import Operand
@@ -26,6 +27,7 @@ from raytrace.system.sag_terms import (
     TiltSag,
     ZernikeSag,
     about_vertex,
+    as_fringe,
     with_even_terms,
 )
 from raytrace.system.shapes import EVEN, KINDS
@@ -64,7 +66,7 @@ def in_file_terms(lens: Lens, place: Place) -> Lens:
 
 
 def _with_polynomial(surface: Surface, place: Place) -> Surface:
-    """A surface whose sag terms are an extended polynomial, where no type of surface holds them otherwise."""
+    """A surface whose sag terms are fringe terms or an extended polynomial, where no type holds them otherwise."""
     sag = surface.sag_terms
     on_terms = surface.coefficients is not None and isinstance(sag, PolynomialSag | IrregularSag | TiltSag)
     if not (isinstance(sag, PowerSag | ZernikeSag) or on_terms):
@@ -74,6 +76,9 @@ def _with_polynomial(surface: Surface, place: Place) -> Surface:
         message = f"errors of the sag of a surface that is {KINDS[surface.kind].name}, expected an even asphere at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
     polynomial, height = about_vertex(sag)
+    few = surface.coefficients is not None and len(surface.coefficients) <= KINDS[EVEN].parameters
+    if few and (sum_of_fringes := as_fringe(polynomial)) is not None:
+        return _raised(dataclasses.replace(surface, sag_terms=sum_of_fringes), height)
     if surface.coefficients is not None:
         polynomial = with_even_terms(polynomial, surface.coefficients)
     count = int(torch.nonzero(polynomial.coefficients).max()) + 1 if bool(polynomial.coefficients.any()) else 1
@@ -81,7 +86,11 @@ def _with_polynomial(surface: Surface, place: Place) -> Surface:
         message = f"{count} powers of x and y in the sag, an extended polynomial has {MOST_TERMS}"
         raise LensFileError(f"{message} (to x²⁰ … y²⁰); leave out the higher terms", place)
     polynomial = dataclasses.replace(polynomial, coefficients=polynomial.coefficients[:count])
-    surface = dataclasses.replace(surface, sag_terms=polynomial, coefficients=None, kind=EVEN)
+    return _raised(dataclasses.replace(surface, sag_terms=polynomial, coefficients=None, kind=EVEN), height)
+
+
+def _raised(surface: Surface, height: Tensor) -> Surface:
+    """A surface shifted along z by a height () mm."""
     if not bool(height):
         return surface
     before, after = [surface.before, Pose(z=height)], [Pose(z=-height), surface.after]
