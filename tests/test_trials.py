@@ -39,6 +39,8 @@ from raytrace.system.sag_terms import (
     with_even_terms,
 )
 from raytrace.system.surface import sag_at
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import trace_lens
 
 PM = 1e-9  # mm
 VISIBLE = torch.tensor([0.4861327, 0.5875618, 0.6562725], dtype=torch.float64)
@@ -49,12 +51,15 @@ def again(lens, folder, name="lens.zmx"):
     return rt.read_lens(folder / name)
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
 def check_rays(lens, other, tolerance=PM):
-    """The spots of both lenses are the same, ray by ray, mm."""
-    one, two = rt.spot(lens, rings=3), rt.spot(other, rings=3)
-    for name in ("rms_radius", "centroid"):
-        torch.testing.assert_close(getattr(one, name), getattr(two, name), rtol=0, atol=tolerance)
+    """Rays of both lenses, launched by each, meet the sensor at the same places, mm."""
+    ends = []
+    for one in (lens, other):
+        rays = launch(one, rt.gauss_rings(2, 5)[0], fields=None)
+        end = trace_lens(one, rays, one.wavelengths[:, None])
+        ends.append(torch.cat([end.position, end.direction, end.valid[None].double()]))
+    assert ends[0][-1].any()
+    torch.testing.assert_close(*ends, rtol=0, atol=tolerance)
 
 
 def built(name, grade="commercial", trial=0, **conditions):
@@ -66,18 +71,21 @@ def built(name, grade="commercial", trial=0, **conditions):
 # -- lenses -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
-@pytest.mark.parametrize("aiming", ["off", "real"])
-@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss", "cemented_achromat", "phone", "folded_relay"])
+@pytest.mark.parametrize(
+    ("name", "aiming"),
+    [
+        *((name, aiming) for name in ("cooke_triplet", "double_gauss") for aiming in ("off", "real")),
+        *((name, "off") for name in ("cemented_achromat", "phone", "folded_relay")),
+    ],
+)
 def test_a_perturbed_lens_is_read_back_with_the_same_rays(name, aiming, tmp_path):
-    lens = built(name, ray_aiming=aiming)
+    lens = built(name, "precision", ray_aiming=aiming)
     found = again(lens, tmp_path)
     check_rays(lens, found)
     assert found.ray_aiming == aiming
     check_rays(lens, again(found, tmp_path, "again.zmx"))
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
 def test_a_group_inside_which_an_element_and_a_surface_move(tmp_path):
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="real")
     T = rt.Tolerance
@@ -268,7 +276,6 @@ def test_a_dispersion_that_no_formula_comes_near_is_refused(tmp_path):
 INDEX = "index=0.0008 abbe=0.6%"
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
 @pytest.mark.parametrize("name", ["worst one_3.zmx", "worst.csv"])
 def test_melts_lie_in_a_catalog_beside_the_file(name, tmp_path):
     lens = rt.read_lens("double_gauss")
@@ -362,9 +369,9 @@ def test_rules_of_numbers_that_change_are_left_out_with_a_warning(tmp_path):
 @pytest.fixture(scope="module")
 def study():
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0, 8.4, -8.4, 11.9, -11.9])
-    data = OptimizationData(variables=(Vary(1, "curvature"),), solves=(Solve(2, "thickness", "pickup", source=5),))
+    data = OptimizationData(variables=(Vary(1, "curvature"),), solves=(Solve(7, "curvature", "f_number", (3.5,)),))
     lens = dataclasses.replace(lens, optimization_data=data)
-    return rt.tolerance(lens, grade="commercial", trials=40)
+    return rt.tolerance(lens, grade="commercial", trials=40, arms=rt.gauss_rings(4)[0].shape[1] // 4)
 
 
 def rms(lens):

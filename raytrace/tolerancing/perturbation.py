@@ -274,8 +274,8 @@ def _move(
             rows = rows_of_both(rows, element)
         surfaces[k] = dataclasses.replace(
             surfaces[k],
-            before=_single(front) or _pose(rows_along(front), k),
-            after=(None if behind[k] else _single(rear)) or undone(_pose(rows_back(rows), k)),
+            before=_single(front) or (_pose(rows_along(front), k) if front else None),
+            after=_single(rear) if not behind[k] and len(rear) < 2 else undone(_pose(rows_back(rows), k)),
         )
     surfaces[:] = with_z_in_thicknesses(surfaces, {*before, *behind, *of_surfaces})
     return [(first, last) for first, last, _ in ranges] + [(k, k) for k in of_surfaces]
