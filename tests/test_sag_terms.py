@@ -17,7 +17,7 @@ from raytrace.psf_models import model_of, psf
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.lens import media
 from raytrace.system.rays import start
-from raytrace.system.sag_terms import GridSag, Relief, ZernikeSag, relief, spline
+from raytrace.system.sag_terms import GridSag, Relief, ZernikeSag, about_vertex, relief, spline
 from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
