@@ -94,6 +94,7 @@ PUBLIC = {
     "optimize": "optimization.optimize",
     "search": "optimization.search",
     # errors of manufacture
+    "AsBuilt": "tolerancing.as_built",
     "BadTolerance": "tolerancing.tolerances",
     "Compensator": "system.tolerance_data",
     "Tolerance": "system.tolerance_data",

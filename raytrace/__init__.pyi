@@ -108,6 +108,7 @@ from raytrace.system.rays import Rays as Rays
 from raytrace.system.surface import Surface as Surface
 from raytrace.system.tolerance_data import Compensator as Compensator
 from raytrace.system.tolerance_data import Tolerance as Tolerance
+from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements
 from raytrace.tolerancing.files import read_tolerances as read_tolerances

@@ -25,6 +25,8 @@ def read(kind: type, document: Mapping):
 
 #: PSF models that a lens is trained with.
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
+#: Grades of tolerances, as of `tolerancing.grades`.
+GRADES = ("commercial", "precision", "high")
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"
 
@@ -37,6 +39,9 @@ class CodesignSettings(Settings):
     air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far, spread: range and
     distribution of object distances; fields: points in y, one after the other for successive samples; pixel, size:
     window of the PSF; depth, width: of the network; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
+    as_built: training draws a perturbed lens for each sample; grade, limits: its tolerances, by default those of the
+    file; refocus: "sensor", or "none"; cameras: perturbed ones of the test; center: of the PSF window, "" for the
+    centroid of the light with tolerances and the chief ray without.
     A stored run without one of the fields has its default.
     """
 
@@ -77,6 +82,17 @@ class CodesignSettings(Settings):
     vignetting: str = "none"
     ray_aiming: str | None = None
     decay: str = "none"
+    as_built: bool = False
+    grade: str = ""
+    limits: str = ""
+    refocus: str = "sensor"
+    cameras: int = 32
+    center: str = ""
+
+    @property
+    def is_toleranced(self) -> bool:
+        """Whether cameras as built are trained or tested."""
+        return self.as_built or bool(self.grade or self.limits)
 
 
 @dataclasses.dataclass(frozen=True)

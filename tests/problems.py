@@ -4,13 +4,14 @@ Every problem states the law that makes it exact, so that a test needs no second
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
 
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
@@ -24,6 +25,12 @@ from raytrace.tracing.scene import Scene, scene
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
 both_engines = pytest.mark.parametrize("engine", ["eager", "compiled"], indirect=True)
+
+
+def for_examples(count: int, test: Callable, **strategies) -> None:
+    """Runs a function on so many examples of hypothesis: few of them in the default suite, many in the slow one."""
+    settings(max_examples=count, deadline=None)(given(**strategies)(test))()
+
 
 #: Lengths in mm, for tolerances that carry a unit.
 MICROMETRE = 1e-3

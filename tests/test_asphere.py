@@ -109,7 +109,9 @@ def test_root_of_a_batch_equals_roots_one_by_one():
     assert residual[met].abs().max() <= 1e-13  # mm: tens of roundings of coordinates of 10 mm
 
 
-@pytest.mark.parametrize("kind", ["curvature", "conic", "coefficients", "position"])
+@pytest.mark.parametrize(
+    "kind", ["curvature", "conic", "coefficients", pytest.param("position", marks=pytest.mark.slow)]
+)
 def test_derivatives_through_the_search_with_failed_rays(kind):
     """First and second derivatives of the hit, in a batch with a ray that misses and one found by the bracket."""
     numbers = {

@@ -118,6 +118,44 @@ def test_a_stopped_run_resumes_to_the_same_end(run, pictures, monkeypatch):
     assert len(err.splitlines()) == 1
 
 
+def test_a_run_as_built_resumes_and_lists_its_perturbed_cameras(run, pictures, monkeypatch):
+    few = ("--limits", "thickness=0.1", "element_decenter=0.05", "--rays", "20", "--drt-rays", "20", "--cameras", "2")
+    command = ("double_gauss", "--data", pictures, *SMALL, "--center", "chief", *few, "--as-built")
+    code, text, err = run(*command, "-o", "whole")
+    assert code == 0, err
+    with monkeypatch.context() as patch:
+        interrupt(patch, "joint", 5)
+        assert run(*command, "-o", "parts")[0] == 130
+    assert run(*command, "-o", "parts", "--resume")[0] == 0
+    for name in ("outcome.json", "joint/log.csv", "refine/log.csv"):
+        assert Path(f"parts/{name}").read_bytes() == Path(f"whole/{name}").read_bytes()
+    found = read("whole/outcome.json")
+    assert [*found["l1_as_built"]] == [*found["psnr_as_built"]] == ["1", "2"]
+    assert "2 perturbed cameras of no training, mean ± standard deviation (trained as built):" in text
+    assert f"{sum(found['l1_as_built'].values()) / 2:.5f} ± " in text
+    code, _, err = run(*command[:-1], "-o", "parts")
+    assert code == 1
+    assert "parts/joint holds another run: as_built was True, now False; choose another folder" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--as-built",), "the lens has no tolerances of its own: give --limits, as .* or --grade, as"),
+        (("--limits", "radius:40=0.1%"), "surface 40"),
+        (("--grade", "precison"), "invalid choice: 'precison'"),
+        (("--grade", "high", "--model", "paraxial"), "model 'paraxial' traces no rays of a lens as built"),
+        (("--grade", "high", "--loss", "spectral"), "--as-built, --grade and --limits belong to training"),
+        (("--grade", "high", "--rays", "20"), "pupil_points are about the chief ray: give center chief"),
+    ],
+)
+def test_wrong_tolerances_of_a_run_are_refused(run, pictures, words, message):
+    code, out, err = run("double_gauss", "--data", pictures, *SMALL, "-o", "none", *words)
+    assert (code in (1, 2), out) == (True, "")
+    assert re.search(message, err), err
+    assert not Path("none").exists()
+
+
 def test_other_pictures_are_another_run(run, pictures):
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")
     assert run(*command)[0] == 0
@@ -333,6 +371,7 @@ def test_a_study_that_was_not_started_is_refused(compare):
         compare("double_gauss", *SMALL, "--limit", 5, "-o", "out", "--models", study.AFTER_PARAXIAL)
 
 
+@pytest.mark.slow
 def test_compare_writes_the_table_and_the_page(compare, pictures):
     """Paraxial, and Gaussian DRT begun where that ended; then the page again with a seed that is missing."""
     after = study.AFTER_PARAXIAL

@@ -118,7 +118,9 @@ def test_the_adjoint_equals_autograd(name, dtype, close, with_path):
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 
-@two_of_each
+@pytest.mark.parametrize(
+    "name", [name if name == "biconic" else pytest.param(name, marks=pytest.mark.slow) for name in FACES]
+)
 @pytest.mark.parametrize(
     ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
 )

@@ -234,7 +234,7 @@ def test_derivatives_by_tilts():
             scene_of(lens, torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)), points, weights
         )
         mtf = rt.mtf(lens, [5.0], geometric=True)
-        kernel = rt.psf(lens, rt.Gaussian(order=3), center="axis", size=5, pixel=0.36).kernel
+        kernel = rt.psf(lens, rt.Gaussian(order=3), center="axis", size=3, pixel=0.6).kernel
         return rt.spot(lens, rings=4).mean_square_radius, 1e3 * rms(front), mtf.tangential, mtf.sagittal, kernel
 
     at = [real(number).requires_grad_() for number in (3.0, 0.5)]

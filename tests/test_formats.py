@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import number, vector
+from problems import for_examples, number, vector
 
 import raytrace as rt
 from raytrace.files import shipped
@@ -380,19 +380,13 @@ def read_damaged(path: Path, content: bytes) -> None:
 _ORIGINALS = [(path, path.read_bytes()) for path in (*OWN, *CORPUS)]
 
 
-@settings(max_examples=750, deadline=None)
-@given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
-def test_damaged_files_give_a_lens_or_a_clear_error(seed, which):
-    path, content = _ORIGINALS[which]
-    read_damaged(path, damaged(content, random.Random(seed)))
+@pytest.mark.parametrize("examples", [250, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_damaged_files_give_a_lens_or_a_clear_error(examples):
+    def read_one(seed, which):
+        path, content = _ORIGINALS[which]
+        read_damaged(path, damaged(content, random.Random(seed)))
 
-
-@pytest.mark.slow
-@settings(max_examples=20_000, deadline=None)
-@given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
-def test_very_many_damaged_files_give_a_lens_or_a_clear_error(seed, which):
-    path, content = _ORIGINALS[which]
-    read_damaged(path, damaged(content, random.Random(seed)))
+    for_examples(examples, read_one, seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
 
 
 @settings(max_examples=300, deadline=None)

@@ -162,7 +162,9 @@ def test_irregularity_and_tilt_are_their_formulas():
     assert as_polynomial(tilt).coefficients.tolist() == [0.3, -0.2]
 
 
-LONG = dict.fromkeys(("fringe", "irregular", "polynomial on a toroid"), pytest.mark.slow)
+LONG = dict.fromkeys(
+    ("fringe", "irregular", "polynomial", "polynomial on a toroid", "cylinder along y"), pytest.mark.slow
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=LONG.get(name, ())) for name in ALL])

@@ -287,7 +287,7 @@ def test_all_of_it_follows_the_scale(engine, dtype, power):
         assert_close(scaled, plain, rtol=close, atol=close)
 
 
-@both_engines
+@pytest.mark.parametrize("engine", [pytest.param("eager", marks=pytest.mark.slow), "compiled"], indirect=True)
 def test_derivatives_with_failed_rays_by_every_number(engine):
     """By finite differences, of first and of second order; some rays are evanescent, some miss, some are cut off."""
     rays = beam([-9.0, -1.0, 0.5, 2.0, 40.0, 1.0], slope=[0.0, 0.02, -0.03, 0.05, 0.0, 0.95])

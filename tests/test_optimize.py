@@ -173,6 +173,7 @@ def test_a_limit_is_kept_where_it_is_in_the_way_and_is_let_go_where_it_is_not(tr
     assert tight.merit_after > free.merit_after
 
 
+@pytest.mark.slow
 def test_both_engines_end_at_the_same_lens(triplet):
     ends = []
     for engine in ("eager", "auto"):

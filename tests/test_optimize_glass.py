@@ -140,6 +140,7 @@ def test_predicted_merits_rank_the_optimised_merits(triplet):
 # -- the lens ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_lens_ends_with_glasses_of_the_catalog_and_no_worse_than_with_its_own(triplet, found):
     own = rt.optimize(triplet, merit=MERIT, vary="curvature thickness", hold="efl=100", cycles=40)
     assert found.merit_after <= own.merit_after * 1.0001
@@ -154,6 +155,7 @@ def test_a_lens_ends_with_glasses_of_the_catalog_and_no_worse_than_with_its_own(
     assert found.merit_after <= min(step.reached for step in found.glasses if step.kind in ("own", "swap")) * 1.0001
 
 
+@pytest.mark.slow
 def test_the_lens_is_written_with_its_glasses_and_reads_the_same(found, tmp_path):
     found.save(tmp_path / "found.zmx")
     again = rt.read_lens(tmp_path / "found.zmx")
@@ -190,7 +192,7 @@ def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
     optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))
     lens = dataclasses.replace(triplet, optimization_data=optimization_data)
-    found = rt.optimize(lens, merit=MERIT, vary="curvature sensor glass", hold="efl=100", cycles=6)
+    found = rt.optimize(lens, merit=MERIT, vary="curvature sensor glass", hold="efl=100", cycles=3)
     assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
     assert {step.surface for step in found.glasses} <= {0, 1, 3}
 
@@ -214,7 +216,7 @@ def test_the_command_prints_the_sequence(capsys):
 def test_interrupted_exchanges_resume(triplet, tmp_path, monkeypatch):
     """Ended hard behind the first exchanges, and begun again from the checkpoint: the same lens to the last digit."""
     path, done = tmp_path / "kept.json", []
-    how = {"merit": MERIT, "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 5, "checkpoint": path}
+    how = {"merit": MERIT, "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 2, "checkpoint": path}
     whole = rt.optimize(triplet, **how)
     swap = Choice._swap
 

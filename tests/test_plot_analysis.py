@@ -49,7 +49,7 @@ COMMANDS = (
 
 
 TWELVE = ("double_gauss", "--field", *map(str, range(12)))
-DEAR = ("mtf", "encircled-energy", "wavefront", "opd-fan", "field-curvature")  # seconds of twelve fields
+DEAR = ("mtf", "encircled-energy", "wavefront", "opd-fan", "ray-fan", "field-curvature")  # seconds of twelve fields
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_mtf_through_focus_is_smooth_and_passes_through_the_value_reported():
         assert np.abs(np.diff(y, 2)).max() < 0.01  # no corners
 
 
-@pytest.mark.parametrize("lens", ["phone", "cooke_triplet", "singlet"])
+@pytest.mark.parametrize("lens", [pytest.param("phone", marks=pytest.mark.slow), "cooke_triplet", "singlet"])
 def test_illumination_is_a_line(drawn, lens):
     (panel,) = drawn("relative-illumination", lens).axes
     line = max(panel.lines, key=lambda line: line.get_linewidth())

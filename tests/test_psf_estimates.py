@@ -203,7 +203,7 @@ def test_estimates_bound_the_true_error_of_lenses_they_were_not_fitted_to(model)
     assert close >= 0.5
 
 
-@pytest.mark.parametrize("model", ["gaussian", "drt", "wave"])
+@pytest.mark.parametrize("model", [pytest.param("gaussian", marks=pytest.mark.slow), "drt", "wave"])
 def test_estimates_hold_in_single_precision(model):
     """Against the reference of the same rounded numbers in double precision, at a tolerance rounding may not meet."""
     computed = []

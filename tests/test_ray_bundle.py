@@ -138,7 +138,16 @@ def test_derivatives_are_those_of_finite_differences(cases, name, engine):
             assert (np.abs(slopes[:, hits.valid] - difference) <= 2e-5 * size + rounding).all()
 
 
-@pytest.mark.parametrize("name", ["at infinity", "near", "image heights, near", "aimed", "aimed by the paraxial ray"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "at infinity",
+        "near",
+        "image heights, near",
+        "aimed",
+        pytest.param("aimed by the paraxial ray", marks=pytest.mark.slow),
+    ],
+)
 def test_the_launch_in_numpy_is_that_of_torch(cases, name):
     model, bundle = bundle_of(cases[name], name)
     state = model.views[0].state(Dual(model.start, np.eye(len(model.start))))

@@ -255,7 +255,7 @@ def with_lost_rays():
 
 
 @pytest.mark.parametrize("direction", ["one", pytest.param("each", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["zernike", "grid"])
+@pytest.mark.parametrize("kind", ["zernike", pytest.param("grid", marks=pytest.mark.slow)])
 def test_first_and_second_derivatives_by_every_number_with_failed_rays(kind, direction):
     """First derivatives along one random direction of all numbers, or by each of them; second ones along one."""
     face = dataclasses.replace(ALL[kind], curvature=vector(-0.03)[0], semi_diameter=4.0)

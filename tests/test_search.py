@@ -146,6 +146,7 @@ def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
     assert found.lens is found.lenses[0]
 
 
+@pytest.mark.slow
 def test_each_minimum_is_reported_once_and_is_one():
     how = {
         **HOW,
@@ -256,6 +257,7 @@ def test_along_both_lines_of_a_null_meniscus_the_merit_stays(best_triplet):
         assert one.whole.evaluated(x).residuals == pytest.approx(before, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_from_a_singlet_to_better_lenses_of_two_elements(found, tmp_path):
     how = {**HOW, "hold": "efl=50"}
     two = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
@@ -316,6 +318,7 @@ def test_tasks_that_are_known_are_not_done_again_and_a_torn_line_is(tmp_path):
         Journal(tmp_path, about, 0.0).each([task("d")], 2)
 
 
+@pytest.mark.slow
 def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
     class Bar:
         """Interrupts at the fifth start."""

@@ -74,19 +74,19 @@ def vignetted() -> Lens:
     return lens().replace(1, apertures=(Aperture("circular", (0.0, 20.0)),))
 
 
-def cases() -> dict[str, dict[str, np.ndarray]]:
-    """All cases, by the processes there are."""
+def cases(names: tuple[str, ...]) -> dict[str, dict[str, np.ndarray]]:
+    """Cases of these names, by the processes there are."""
     clear, clipped = lens(), vignetted()
-    return {name: kernels(clipped if name in CLIPPED else clear, case) for name, case in CASES.items()}
+    return {name: kernels(clipped if name in CLIPPED else clear, CASES[name]) for name in names}
 
 
-def work(folder: str) -> None:
+def work(folder: str, names: tuple[str, ...]) -> None:
     """Each process of `test_two_processes_compute_and_train_as_one_does`: kernels, ten steps of training, an error."""
     with shards.processes() as share:
         weights = fit(Path(folder, "training of two"), 10)
         if share.rank == 0:
             torch.save(weights, Path(folder, "weights.pt"))
-        found = {f"{name}/{key}": t for name, numbers in cases().items() for key, t in numbers.items()}
+        found = {f"{name}/{key}": t for name, numbers in cases(names).items() for key, t in numbers.items()}
         np.savez(Path(folder, f"{share.rank}.npz"), **found)
         try:
             with shards.agreeing() as largest:
@@ -136,15 +136,20 @@ def run_function(call: str, *, folder: Path, processes: int = 2) -> subprocess.C
 # ---------------------------------------------------------------- several processes
 
 
-def test_two_processes_compute_and_train_as_one_does(tmp_path):
+@pytest.mark.parametrize(
+    "names",
+    [("fields", "distances", "wavelengths", "paraxial"), pytest.param(tuple(CASES), marks=pytest.mark.slow)],
+    ids=["one of each axis", "all"],
+)
+def test_two_processes_compute_and_train_as_one_does(tmp_path, names):
     """One start of torchrun. Kernels of every model, each axis of a scene cut in turn, to rounding in both processes;
 
     weights after ten steps of Adam, to 1e-12; an error of one process is raised in all.
     """
-    done = run_function(f"work({str(tmp_path)!r})", folder=tmp_path)
+    done = run_function(f"work({str(tmp_path)!r}, {names!r})", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     together = [np.load(tmp_path / f"{rank}.npz") for rank in range(2)]
-    for name, numbers in cases().items():
+    for name, numbers in cases(names).items():
         for key, expected in numbers.items():
             first, second = (found[f"{name}/{key}"] for found in together)
             np.testing.assert_array_equal(first, second, err_msg=f"{name}: {key} of the processes")

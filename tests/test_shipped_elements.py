@@ -50,7 +50,7 @@ def sharp_leaves():
     return Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
 
 
-@pytest.mark.parametrize("name", ["learned-0.01.npy", "learned-smooth-0.01.json"])
+@pytest.mark.parametrize("name", [pytest.param("learned-0.01.npy", marks=pytest.mark.slow), "learned-smooth-0.01.json"])
 def test_learned_elements_are_judged_as_the_page_has_them(sharp_leaves, name, tmp_path):
     """Sharp leaves, both filters, noise 0.01: to a hundredth of a dB, from the file alone."""
     element = read_element(DOCS / "elements" / name, aperture=5.0)

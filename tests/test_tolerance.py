@@ -2,6 +2,9 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -100,15 +103,15 @@ def test_a_trial_is_the_same_in_any_study(triplet, built):
 
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
     file = tmp_path / "trials.jsonl"
-    first = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    first = rt.tolerance(triplet, limits=LIMITS, trials=1100, checkpoint=file)
     lines = file.read_text().splitlines(keepends=True)
     assert len(lines) == 3  # the study, and two pieces
     file.write_text("".join(lines[:2]) + lines[2][:40])  # as a killed process leaves it
-    again = rt.tolerance(triplet, limits=LIMITS, trials=600, checkpoint=file)
+    again = rt.tolerance(triplet, limits=LIMITS, trials=1100, checkpoint=file)
     assert torch.equal(first.trials, again.trials)
     assert torch.equal(first.changes, again.changes)
     with pytest.raises(rt.BadTolerance, match="trials of another study"):
-        rt.tolerance(triplet, limits="radius=0.2%", trials=600, checkpoint=file)
+        rt.tolerance(triplet, limits="radius=0.2%", trials=1100, checkpoint=file)
 
 
 def test_compensators_stay_within_their_limits(triplet):
@@ -241,3 +244,43 @@ def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
         lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, arms=rt.gauss_rings(4)[0].shape[1] // 4
     ).nominal
     assert float(nominal) == pytest.approx(rms(lens.at(fields=[0, 8.4, -8.4])), abs=1e-9)
+
+
+PLATE = [{"thickness": 5, "glass": "N-BK7"}, {"thickness": 50}]
+
+
+def test_a_compensator_without_effect_is_refused():
+    plate = rt.lens(PLATE, stop=1, entrance_pupil_diameter=10, fields=[0, 5])
+    with pytest.raises(rt.BadTolerance, match="thickness of surface 2: it does not improve the criterion"):
+        rt.tolerance(plate, limits="thickness=0.1", trials=0)
+
+
+@pytest.mark.slow
+def test_a_million_trials_of_a_plane_plate():
+    plate = rt.lens(PLATE, stop=1, entrance_pupil_diameter=10, fields=[0, 5])
+    rows = rt.tolerances(plate, "thickness=0.1 index=0.001", compensators=[])
+    found = rt.tolerance(plate, rows, trials=1_000_000)
+    # The beam stays parallel: the RMS distance from its centre is that of the pupil, R/√2.
+    assert float((found.trials - 5000 / math.sqrt(2)).abs().max()) < 1e-6
+    assert float(found.expected) == pytest.approx(5000 / math.sqrt(2), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_killed_study_loses_nothing(triplet, tmp_path):
+    trials, file = 6000, tmp_path / "trials.jsonl"
+    script = (
+        "import raytrace as rt\n"
+        "lens = rt.read_lens('cooke_triplet').at(ray_aiming='off', fields=[0, 8.4, -8.4, 11.9, -11.9])\n"
+        "lens = rt.focus(lens, fields=[0, 8.4, 11.9]).lens\n"
+        f"rt.tolerance(lens, limits={LIMITS!r}, trials={trials}, checkpoint={str(file)!r})\n"
+    )
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", script])
+    while not (file.exists() and len(file.read_bytes().splitlines()) > 2):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    before = len(file.read_bytes().splitlines())
+    again = rt.tolerance(triplet, limits=LIMITS, trials=trials, checkpoint=file)
+    assert 2 < before < 1 + math.ceil(trials / 1024)
+    assert torch.equal(again.trials, rt.tolerance(triplet, limits=LIMITS, trials=trials).trials)

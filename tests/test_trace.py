@@ -230,8 +230,15 @@ def test_the_lossy_system_loses_rays_in_every_way():
     assert 0 < crossings[-1].rays.valid.sum() < 7
 
 
-@both_engines
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize(
+    ("engine", "number"),
+    [
+        pytest.param(engine, k, marks=pytest.mark.slow if engine == "eager" and k != 2 else ())
+        for engine in ("eager", "compiled")
+        for k in range(5)
+    ],
+    indirect=["engine"],
+)
 def test_first_and_second_derivatives_of_every_number_with_failed_rays(number):
     """Thickness, curvature, conic, terms and index of each surface, and the rays themselves."""
     flat, structure = torch.utils._pytree.tree_flatten(LOSSY.surfaces[1 + number])

@@ -118,7 +118,9 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     "change",
     [
         {},
-        {"loss": "images", "restoration": "towards", "optimizer": "sgd", "rate": 0.5},
+        pytest.param(
+            {"loss": "images", "restoration": "towards", "optimizer": "sgd", "rate": 0.5}, marks=pytest.mark.slow
+        ),
         {"kind": "rings", "pitch": 0.02, "tolerance": 3e-5},
     ],
     ids=["smooth", "pictures", "tolerance"],

@@ -22,6 +22,7 @@ def run(capsys, *words):
     return code, *capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_one_row_as_json(capsys, monkeypatch):
     monkeypatch.setattr(wave_run, "LEAF_COUNT", 6)
     assert not table.main(["--rows", "singlet", "fresnel", "--json"])

@@ -72,7 +72,7 @@ FINE = {"polynomials": 600, "cubic on a PMMA lens": 768, "pixels of a lens": 160
 SAMPLINGS = [
     *(("blurred lens", "pupil", {"samples": n}) for n in (96, 128)),
     *(("blurred lens", "radial", {"samples": n}) for n in (70, 80)),
-    ("blurred lens", "fresnel", {"samples": 1700}),
+    pytest.param("blurred lens", "fresnel", {"samples": 1700}, marks=pytest.mark.slow),
     ("lens in focus", "pupil", {"samples": 40}),
     *(("few waves, wide blur", "pupil", {"samples": n}) for n in (56, 96)),
     *(("few waves, wide blur", "fresnel", {"samples": n}) for n in (80, 160, 400)),
@@ -159,7 +159,7 @@ def test_width_and_steps_of_a_ring():
     assert float(spread(flat).width) == pytest.approx(R * 35.5e-3, rel=0.02)
 
 
-@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("exact", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_kinoform_under_a_cubic_plate_is_computed_without_cutting_its_rings(exact):
     """Beside the sum over every ring and angle, to half of what is predicted."""
     elements = baseline("cubic", aim(radius=0.2, exact=exact))

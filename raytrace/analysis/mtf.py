@@ -335,7 +335,7 @@ def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
     usual = not points_needed(beam) > _FINE_GRID
     if usual or frequencies.requires_grad or not bool(beam.wavefront.valid.all()):
         return None
-    rules = [_rule(float((beam.blur.max() * frequency.abs()).detach())) for frequency in frequencies]
+    rules = [rule_of_blur(float((beam.blur.max() * frequency.abs()).detach())) for frequency in frequencies]
     polynomials = None if None in rules else polynomials_of(scene, beam)
     if polynomials is None:
         return None
@@ -349,7 +349,7 @@ def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
     return tuple(result)
 
 
-def _rule(turns: float) -> int | None:
+def rule_of_blur(turns: float) -> int | None:
     """Points along and across for a phase of 2π `turns` from the chief ray to the rim; None: more than there are."""
     return next((n for n in _RULES if n >= 16 + 6 * turns), None)
 

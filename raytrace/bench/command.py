@@ -8,7 +8,7 @@ from types import ModuleType
 
 import torch
 
-from raytrace.bench import psf, speed, trace
+from raytrace.bench import psf, speed, tolerance, trace
 from raytrace.bench.report import Measured, Request
 from raytrace.cli.run import CommandError, printed_on_failure, say
 from raytrace.shards import torch_threads
@@ -18,6 +18,7 @@ _SUBJECTS = {
     "trace": (trace.bench, ("lens", "rays", "device", "output", "plot")),
     "psf": (psf.bench, ("lenses", "output", "csv", "plot")),
     "speed": (speed.bench, ("docs", "quick")),
+    "tolerance": (tolerance.bench, ("output", "plot")),
 }
 
 

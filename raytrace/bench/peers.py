@@ -17,6 +17,7 @@ import importlib
 import importlib.util
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 import numba
@@ -30,16 +31,21 @@ from optiland.physical_apertures import RadialAperture, RectangularAperture
 from optiland.psf import FFTPSF
 from optiland.psf.huygens_fresnel import ScalarHuygensPSF
 from optiland.rays import RealRays
+from optiland.samples.objectives import CookeTriplet
+from optiland.tolerancing import Tolerancing
+from optiland.tolerancing.monte_carlo import MonteCarlo
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from raytrace.bench.measure import DTYPES, Tracer, name_of, shape_of, squared_radius, variables
+from raytrace.bench.measure import DTYPES, Tracer, clock, name_of, shape_of, squared_radius, variables
 from raytrace.bench.psf import Case, Method, Truth
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
+from raytrace.system.tolerance_data import Tolerance
+from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
 
@@ -279,6 +285,60 @@ def _fft(optic: Optic, field, wavelength: float, grid: Grid, across: int, points
 def _pixels(fine: np.ndarray, parts: int) -> np.ndarray:
     """Sums over parts × parts."""
     return fine.reshape(fine.shape[0] // parts, parts, fine.shape[1] // parts, parts).sum((1, 3))
+
+
+class _Given:
+    """A sampler of numbers that are given, in their order."""
+
+    def __init__(self, numbers: Sequence[float]):
+        self.numbers = iter(numbers)
+
+    def sample(self) -> float:
+        return next(self.numbers)
+
+
+def tolerancing(
+    tolerances: Tolerances, errors: Tensor, rings: int, done: Callable[[], object], threads: int
+) -> tuple[list[float], list[float]]:
+    """Optiland's tolerancing of its Cooke triplet with errors (L, N): the root of the mean square, mm, and s, of each.
+
+    The sensor is adjusted by its own optimiser. Of hexapolar rings, of all fields and wavelengths, each spot about its
+    own centroid.
+    """
+    be.set_backend("numpy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        optic = CookeTriplet()
+        study = Tolerancing(optic, tol=1e-9)
+        for field in optic.fields.get_field_coords():
+            for wavelength in optic.wavelengths.get_wavelengths():
+                about = {"optic": optic, "surface_number": -1, "Hx": field[0], "Hy": field[1], "num_rays": rings}
+                study.add_operand("rms_spot_size", about | {"wavelength": wavelength}, target=0.0)
+        for row, numbers in zip(tolerances, errors.T.tolist(), strict=True):
+            kind, nominal, settings = _variable(optic, row)
+            scale = nominal / 100 if row.unit == "%" else math.radians(1.0) if row.unit == "degrees" else 1.0
+            given = _Given([nominal + scale * number for number in (0.0, *numbers)])  # the first trial compiles
+            study.add_perturbation(kind, given, surface_number=row.surfaces[0], **settings)
+        study.add_compensator("thickness", surface_number=tolerances.compensators[0].surface)
+        trials, found, seconds, now = MonteCarlo(study), [], [], clock(threads)
+        for _ in range(len(errors) + 1):
+            start = now()
+            trials.run(1)
+            seconds.append(now() - start)
+            spots = trials.get_results().iloc[0][trials.operand_names].to_numpy(dtype=float)
+            found.append(float(np.sqrt((spots**2).mean())))
+            done()
+    return found[1:], seconds[1:]
+
+
+def _variable(optic: Optic, row: Tolerance) -> tuple[str, float, dict[str, str]]:
+    """Optiland's name of a variable, its nominal value and its axis."""
+    k = row.surfaces[0]
+    if row.kind == "radius":
+        return "radius", float(optic.surfaces[k].geometry.radius), {}
+    if row.kind == "thickness":
+        return "thickness", float(np.asarray(optic.surfaces.get_thickness(k)).item()), {}
+    return ("decenter" if "decenter" in row.kind else "tilt"), 0.0, {"axis": row.kind[-1]}
 
 
 #: Model, limit of its error, its computation, its sampling in words, and samplings: numbers of rays; rays across the

@@ -6,7 +6,7 @@ from raytrace.cli.options import ROWS as OPTIONS
 from raytrace.cli.options import catalog, json, output_folder, plot, substitute
 from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
 from raytrace.cli.types import count, field_point, file_name, folder_or_lens, positive, positive_finite
-from raytrace.settings import MODELS, CodesignSettings
+from raytrace.settings import GRADES, MODELS, CodesignSettings
 
 SUMMARY = "optimise a lens together with a restoration network"
 DESCRIPTION = """\
@@ -26,7 +26,9 @@ EXAMPLES = """examples:
   raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o from_closed_form
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
-  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json"""
+  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
+  raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
+  raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal"""
 
 #: The options by the field of `CodesignSettings`.
 ROWS = {
@@ -101,13 +103,39 @@ ROWS = {
         "of the network; auto (default) uses the faster one on this machine and stores the choice in the run",
         choices=("auto", "float32", "bfloat16"),
     ),
+    "as_built": option(
+        "train on perturbed lenses, another one for each patch: lens and network learn to bear the errors of "
+        "manufacture; the tolerances are those of --grade and --limits, or of the file"
+    ),
+    "grade": option(
+        "tolerances of a published grade (default: those of the file); without --as-built the training is nominal, and "
+        "the test alone takes perturbed cameras",
+        choices=GRADES,
+    ),
+    "limits": option(
+        "limits ± that replace those of the grade or the file, radius=0.1%% thickness=0.02 element_tilt=0.05; index=0 "
+        "leaves one out",
+        nargs="+",
+    ),
+    "refocus": option(
+        "sensor (default): the sensor of every perturbed lens moves by as much as its errors move the best focus; "
+        "none: it stays",
+        choices=("sensor", "none"),
+    ),
+    "cameras": option("perturbed cameras of the test, in no training, the same for every seed and training"),
+    "center": option(
+        "origin of the PSF window: chief (the chief ray; default of a nominal lens) or centroid (of the light; default "
+        "with tolerances)",
+        choices=("chief", "centroid"),
+    ),
     "patch": option("pixels across a restored patch"),
     "crops": option("patches of a picture in an epoch"),
 }
 _PICTURES = ("patch", "crops")
 _TRAINING = ("depth", "width", "epochs", "batch", "rate_network", "rate_optics", "decay", "precision")
 _OF_ONE_RUN = ("model", "seed")
-_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING))
+_AS_BUILT = ("as_built", "grade", "limits", "refocus", "cameras")
+_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING, *_AS_BUILT))
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -143,6 +171,13 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     scene.add_argument(
         "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
     )
+    built = parser.add_argument_group(
+        "lens as built",
+        "Errors of manufacture are drawn by the number of the sample: a run resumes\n"
+        "bit-identically, and processes share its batches. The result lists L1 and PSNR of\n"
+        "perturbed cameras that no training sees.",
+    )
+    add_options(built, defaults, ROWS, *_AS_BUILT)
     training = parser.add_argument_group("network and training")
     training.add_argument(
         "--preset",

@@ -116,7 +116,7 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
     preset = PRESETS[arguments.preset]
     options = {name: value for name, value in vars(arguments).items() if value is not None}
     options = {"depth": preset.depth, "width": preset.width} | options | _wavelengths(arguments)
-    options |= {name: " ".join(options[name]) for name in ("vary", "bounds", "hold") if name in options}
+    options |= {name: " ".join(options[name]) for name in ("vary", "bounds", "hold", "limits") if name in options}
     if "fields" in options:
         if any(x for x, _ in options["fields"]):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
@@ -278,6 +278,7 @@ class CodesignResult(Result):
                 f"  after step 1, with its own PSFs  {result.l1_joint:.5f}",
                 f"  the same network with DRT PSFs   {result.l1_before:.5f}",
                 f"  after step 2, with DRT PSFs      {result.l1_drt:.5f}",
+                *self._as_built_lines(),
             ]
             distances = [float(z) / 1e3 for z in result.by_distance]
             losses = Column("L1 with DRT PSFs", form=".5f")
@@ -290,6 +291,15 @@ class CodesignResult(Result):
         errors = f"{result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs"
         title = f"{result.model} PSFs, mean square error of a pixel behind the best linear filter"
         return [Table(course, [title], [*self._lens_lines(), f"error of this lens: {errors}"])]
+
+    def _as_built_lines(self) -> Iterator[str]:
+        if count := len(self.lens.l1_as_built):
+            l1, psnr = (np.array([*errors.values()]) for errors in (self.lens.l1_as_built, self.lens.psnr_as_built))
+            training = "trained as built" if self.experiment.settings.as_built else "nominal training"
+            yield f"{count} perturbed cameras of no training, mean ± standard deviation ({training}):"
+            yield f"  L1                               {l1.mean():.5f} ± {l1.std():.5f}"
+            spread = f"{psnr.mean():.3f} ± {psnr.std():.3f} dB, least {psnr.min():.3f} dB"
+            yield f"  PSNR                             {spread}"
 
     def _lens_lines(self) -> Iterator[str]:
         result = self.lens
@@ -345,7 +355,10 @@ def _train(arguments: argparse.Namespace) -> None:
 def _spectral(arguments: argparse.Namespace) -> None:
     if arguments.resume:
         raise CommandError("--resume belongs to training; leave out --resume or --loss spectral")
-    experiment = open_experiment(arguments, settings_of(arguments))
+    settings = settings_of(arguments)
+    if settings.is_toleranced:
+        raise CommandError("--as-built, --grade and --limits belong to training; leave them out, or --loss spectral")
+    experiment = open_experiment(arguments, settings)
     optimum = closed_form(experiment.lens, experiment.settings, experiment.spectrum())
     for name in optimum.at_end:
         say(f"warning: {name} ends at a bound, and the loss still falls beyond it")

@@ -16,6 +16,7 @@ from types import ModuleType
 from raytrace import PUBLIC
 from raytrace.cli import codesign, wave_design, wave_restore
 from raytrace.cli.options import (
+    AS_BUILT,
     FREEDOM,
     LENS_SUFFIXES,
     MERIT,
@@ -412,16 +413,19 @@ COMMANDS = (
         "optimize",
         "minimise the merit function of a lens",
         "Optimise a lens by damped least squares on exact derivatives of its merit function: the file's, or the one of "
-        "--merit. Solves and pickups hold at every step. -o writes the lens with its variables and merit function. "
+        "--merit. Solves and pickups hold at every step. --as-built adds the expected spot of the manufactured lens, "
+        "which makes the lens less sensitive to its tolerances. -o writes the lens with its variables and merit "
+        "function. "
         "Ctrl-C stops and writes the best lens so far.",
         """
         lens.zmx -o better.zmx --plot better.png
         double_gauss --merit spot --vary curvature thickness --seconds 10 -o better.zmx
         tessar --merit spot --vary curvature sensor thickness:2,4 --bounds thickness:1.. --hold efl=100
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
+        double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
         group("stopping", parameters(
             "optimize", "cycles", "seconds", "paths",
             cycles={"help": "maximum, including those before --resume (default 500)"},
@@ -596,14 +600,15 @@ COMMANDS = (
         "measure speed against error",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
         "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
-        "with gradients, aspheres and the step of the sensor distance (minutes). With the extra [bench] Optiland and "
-        "ray-optics are measured, too.",
+        "with gradients, aspheres and the step of the sensor distance (minutes); or Cooke triplets perturbed and "
+        "refocused. With the extra [bench] Optiland and ray-optics are measured, too.",
         """
         trace
         psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
         trace --rays 1000 100000 -o bench.md --plot bench.png
-        speed --quick --repeats 1""",
-        option("what", choices=("trace", "psf", "speed"), help="subject of the measurement"),
+        speed --quick --repeats 1
+        tolerance --json""",
+        option("what", choices=("trace", "psf", "speed", "tolerance"), help="subject of the measurement"),
         option(
             "lenses",
             metavar="LENS",
@@ -789,15 +794,16 @@ COMMANDS = (
     _command(
         "tolerance",
         "the lens as built: sensitivities, expectation and Monte Carlo",
-        "Change of the RMS spot radius or wavefront by every tolerance at its limits, the mean of the lens as built by "
-        "second derivatives, and its distribution over perturbed and compensated lenses. The tolerances are those of "
-        "the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the sensor distance unless the "
-        "file has others.",
+        "Change of a criterion (RMS spot radius or wavefront, MTF) by every tolerance at its limits, its mean of the "
+        "lens as built by second derivatives, and its distribution over perturbed and compensated lenses. The "
+        "tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the "
+        "sensor distance unless the file has others.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
         double_gauss --grade commercial --save-trials built
-        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0""",
+        tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
+        cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
         option(
             "--save-trials", metavar="FOLDER", type=folder_name,

@@ -67,6 +67,12 @@ def _default_merits() -> Iterable[str]:
     return KINDS
 
 
+def _grades() -> Iterable[str]:
+    from raytrace.tolerancing.grades import GRADES
+
+    return GRADES
+
+
 def _written_formats() -> Iterable[str]:
     from raytrace.io import WRITTEN
 
@@ -78,7 +84,7 @@ LENS_SUFFIXES = Names(_written_formats)
 #: Parameters that are no options: arguments of the runner, and objects.
 NO_OPTIONS = (
     *("lens", "path", "catalogs", "progress", "watch", "share", "execution", "grid", "window", "pupil", "folder"),
-    *("merit", "tolerances"),
+    *("merit", "tolerances", "as_built"),
 )
 
 _MM, _UM = {"metavar": "MM"}, {"metavar": "UM", "type": positive_finite, "nargs": "+"}
@@ -312,3 +318,25 @@ FREEDOM = group(
     "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "
     "'thickness:8=marginal_height(0)' 'curvature:7=marginal_angle(-0.1)'.",
 )
+
+#: --as-built and its options: `tolerancing.as_built.AsBuilt`.
+AS_BUILT = group(
+    "the lens as built",
+    option(
+        "--as-built", action="store_true", default=None,
+        help="with the expected mean square spot radius of the manufactured lens, its sensor refocused: the mean over "
+        "perturbed lenses that give the second order in all tolerances exactly",
+    ),
+    option(
+        "--grade", choices=Names(_grades), help="tolerances of a published grade (default: those of the file)"
+    ),
+    option(
+        "--limits", metavar="NAME=LIMIT", nargs="+",
+        help="other limits, as radius=0.1%% thickness=0.02 element_tilt=0.05; index=0 leaves one out",
+    ),
+    option(
+        "--as-built-weight", dest="weight", metavar="W", type=positive_finite,
+        help="weight relative to all rows of the merit function that are no boundaries (default 1: of --merit spot the "
+        "lens without errors and the lens as built count alike)",
+    ),
+)  # fmt: skip

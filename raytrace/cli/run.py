@@ -130,6 +130,8 @@ def result_of_lens(arguments: argparse.Namespace) -> Result:
     """
     lens, options = open_lens(arguments), options_of(arguments)
     try:
+        if _takes(arguments, "as_built"):
+            options |= _as_built(options)
         if _takes(arguments, "merit"):
             names = [name for name in options if name == "merit" or not _takes(arguments, name)]
             if of_merit := {name: options.pop(name) for name in names}:
@@ -139,6 +141,19 @@ def result_of_lens(arguments: argparse.Namespace) -> Result:
         return getattr(raytrace, arguments.run.verb)(lens, **options)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
+
+
+def _as_built(options: dict) -> dict:
+    """The keyword `as_built`, of the options of --as-built, which are taken out; none without it."""
+    settings = {name: options.pop(name) for name in ("grade", "limits", "weight") if name in options}
+    if not options.pop("as_built", False):
+        if settings:
+            spelled = {"weight": "as-built-weight"}
+            raise CommandError(f"--{spelled.get(min(settings), min(settings))} goes with --as-built")
+        return {}
+    from raytrace.tolerancing.as_built import AsBuilt  # loads the package of tolerances
+
+    return {"as_built": AsBuilt(**settings)}
 
 
 # -- the lens

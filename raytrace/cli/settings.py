@@ -38,6 +38,9 @@ def words(settings, rows: Mapping[str, Mapping]) -> list[str]:
         if field.name not in rows or value == defaults[field.name]:
             continue
         name, unit = _spelled(field.name, rows[field.name]), rows[field.name]["unit"]
+        if value is True:
+            found.append(f"--{name}")
+            continue
         found.append(f"--{name} {_text(value) if unit == 1 else f'{value / unit:.12g}'}")
     return found
 

@@ -16,11 +16,12 @@ A training step of lens and network:
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Self
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
 
+from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.variables import Variables, converted
 from raytrace.maths.numerics import safe_divide
@@ -29,6 +30,9 @@ from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, 
 from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import moments_of_rays
 from raytrace.system.lens import Lens, field_points
+from raytrace.tolerancing.perturbation import check_tolerances
+from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
 from raytrace.words import named_value
@@ -49,6 +53,10 @@ class Camera(nn.Module):
     network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
     pupil_points: (2, P), PSFs of these rays, all of one weight, instead of as many rays as `tol` needs ("gaussian",
     "drt"): a Gaussian of twelve rays has their centroid and covariance, not those of all light.
+    center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): image position is no
+    error. tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
+    for each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
+    compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
     The object is planar and upright; image inversion and magnification are ignored.
     Warns UnfilledStop once, for the lens at construction.
     """
@@ -68,6 +76,8 @@ class Camera(nn.Module):
         rho: float = 0.5,
         network_dtype: torch.dtype | None = None,
         pupil_points: Tensor | None = None,
+        center: Literal["chief", "centroid"] = "chief",
+        tolerances: Tolerances | None = None,
     ):
         super().__init__()
         if not isinstance(variables, Variables):
@@ -81,7 +91,22 @@ class Camera(nn.Module):
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self.pupil_points, self._order = pupil_points, None
+        self.center, self.tolerances = center, tolerances
+        self._check()
         self._memo = Memo(object_distances=object_distances)
+
+    def _check(self) -> None:
+        """Refuse what cannot be simulated. Raises ValueError, BadTolerance."""
+        if self.center not in ("chief", "centroid"):
+            raise ValueError(f"center {self.center!r}: expected chief or centroid")
+        if self.center == "centroid" and self.pupil_points is not None:
+            raise ValueError("windows of the rays of pupil_points are about the chief ray: give center chief")
+        if self.tolerances is None:
+            return
+        if not MODELS[self.model].traces:
+            raise ValueError(f"model {self.model!r} traces no rays of a lens as built; expected gaussian, drt or wave")
+        check_tolerances(self.variables.lens, self.tolerances)
+        sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         values = self.fields, self.pixels, self.pupil_points
@@ -97,45 +122,70 @@ class Camera(nn.Module):
     def use(self, model: str, pupil_points: Tensor | None = None) -> None:
         """Simulate with another PSF model; pupil_points: as for the constructor."""
         self.model, self.pupil_points, self._order = model, pupil_points, None
+        self._check()
+
+    def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
+        """The lens with errors (N,), or a lens for each row of (L, N), its sensor focused again."""
+        if self.tolerances is None:
+            raise ValueError("errors, but no tolerances: give Camera(…, tolerances=rt.tolerances(lens, grade=…))")
+        return lens_as_built(self.variables(), self.tolerances, errors, self.fields)
 
     @torch.no_grad()
     def plan(self) -> int:
         """The order of the PSF model that meets the tolerance at the ends and the middle of the range."""
         near, far = self.range
         distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
+        errors = None if self.tolerances is None else draw_errors(self.tolerances, len(distances))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
-            self._order = self._psf(distances, self.fields, tol=self.tol).order
+            self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
         return self._order
 
-    def kernels(self, object_distances: Tensor, field: int = 0) -> Tensor:
-        """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, around its chief ray."""
-        if self.pupil_points is not None:
-            return self._kernels_of_points(object_distances, self.fields[:, [field]])
-        order = self.plan() if self._order is None else self._order
-        return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
+    def kernels(self, object_distances: Tensor, field: int = 0, errors: Tensor | None = None) -> Tensor:
+        """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, in a window about its `center`.
 
-    def _psf(self, distances: Tensor, fields: Tensor, *, tol: float | None = None, order: int | None = None):
+        errors: of manufacture, (N,) of one lens or (B, N).
+        """
+        if self.pupil_points is not None:
+            return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
+        order = self.plan() if self._order is None else self._order
+        return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
+
+    def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
+        """The current lens with its stored rays, or as built, whose rays are of one call."""
+        return (self.variables(), self._memo) if errors is None else (self.as_built(errors), None)
+
+    def _psf(
+        self,
+        distances: Tensor,
+        fields: Tensor,
+        *,
+        tol: float | None = None,
+        order: int | None = None,
+        errors: Tensor | None = None,
+    ):
         # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
         # traced one by the distortion.
         fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
-        lens, distances = self.variables(), distances.to(self.fields.dtype)
+        lens, memo = self._lens(errors)
+        distances, is_nominal = distances.to(self.fields.dtype), errors is None and self.center == "chief"
         return psf(
             lens,
             Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
             tol=tol,
             fields=fields,
             object_distances=distances,
-            grid=self._window(lens, fields, distances),
+            grid=self._window(lens, fields, distances, memo) if is_nominal else self.pixels,
+            center="axis" if is_nominal else self.center,
             normalise=self.normalise,
-            execution=Execution(memo=self._memo),
+            execution=Execution(memo=memo),
         )
 
-    def _kernels_of_points(self, distances: Tensor, fields: Tensor) -> Tensor:
+    def _kernels_of_points(self, distances: Tensor, fields: Tensor, errors: Tensor | None) -> Tensor:
         """PSFs (B, rows, columns) of the rays through the pupil points alone."""
-        lens, distances = self.variables(), distances.to(fields.dtype)
-        light = scene(lens, fields, distances, lens.wavelengths, self._memo)
-        window = self._window(lens, fields, distances)
+        (lens, memo), distances = self._lens(errors), distances.to(fields.dtype)
+        light = scene(lens, fields, distances, lens.wavelengths, memo)
+        window = self._window(lens, fields, distances, memo)
         if window.centre.dim() > 1:  # chief rays (2, D, F), for every wavelength
             centre = window.centre[..., None].expand(*window.centre.shape, len(lens.wavelengths))
             window = dataclasses.replace(window, centre=centre)
@@ -157,21 +207,22 @@ class Camera(nn.Module):
         kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
 
-    def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
+    def _window(self, lens: Lens, fields: Tensor, distances: Tensor, memo: Memo | None) -> Grid:
         """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""
-        if bool((fields == 0).all()):
+        if bool((fields == 0).all()) and memo is not None:
             return self.pixels
-        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], self._memo))[..., 0]
+        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], memo))[..., 0]
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
-    def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
+    def image(self, picture: Tensor, object_distances: Tensor, field: int = 0, errors: Tensor | None = None) -> Tensor:
         """The noise-free sensor image, (B, H - margin, W - margin).
 
         picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
+        errors: of manufacture, (N,) of one lens or (B, N).
         Raises ValueError for other shapes, as of colour images, and other ranges, as 0 to 255.
         """
         picture = _grey(picture, object_distances)
-        return blur(picture, self.kernels(object_distances, field).to(picture.dtype))
+        return blur(picture, self.kernels(object_distances, field, errors).to(picture.dtype))
 
     def restore(self, image: Tensor) -> Tensor:
         """The network's estimate (B, h, w) from a noisy image."""
@@ -189,9 +240,13 @@ class Camera(nn.Module):
         field: int = 0,
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
+        errors: Tensor | None = None,
     ) -> Tensor:
-        """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise."""
-        image = self.image(picture, object_distances, field)
+        """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise.
+
+        errors: of manufacture, (N,) of one lens or (B, N).
+        """
+        image = self.image(picture, object_distances, field, errors)
         if noise is None:
             return self.restore(add_noise(image, self.noise, generator=generator))
         return self.restore(image + self.noise * noise)

@@ -3,7 +3,8 @@
 Step 1 ("joint") trains the variables of the lens and the network with one PSF model. Step 2 ("refine") freezes the lens
 and continues to train the network on ray-traced (DRT) PSFs, for as many epochs: a comparison of the lenses.
 
-Samples are keyed by their number: crop, object distance and noise are the same for all models of a seed.
+Samples are keyed by their number: crop, object distance, noise and errors of manufacture are the same for all models of
+a seed.
 """
 
 import dataclasses
@@ -30,6 +31,7 @@ from raytrace.imaging.closed_form import (
 )
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
+from raytrace.imaging.restoration import psnr
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
 from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
@@ -41,10 +43,14 @@ from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.system.parameter_paths import parse_range
+from raytrace.tolerancing.grades import tolerances
+from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers
 TEST_EPOCH = 2**20  # epoch of the test samples, which training never reaches
+_UNSEEN = 2**62  # number of the first perturbed camera of the test, of seed 0, which training never reaches
 STEPS = ("joint", "refine")
 LENS = "lens.zmx"  # of a run: the optimised lens
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
@@ -105,6 +111,18 @@ def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor |
     return sobol(count, seed=seed)[0]
 
 
+def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | None:
+    """Tolerances of an experiment, of its grade and limits or of the file; None without. Raises BadTolerance."""
+    if not settings.is_toleranced:
+        return None
+    if settings.refocus not in ("sensor", "none"):
+        raise ValueError(f"refocus {settings.refocus!r}: expected sensor or none")
+    compensators = None if settings.refocus == "sensor" else ()
+    return tolerances(
+        lens_at_start(lens, settings), settings.limits, grade=settings.grade or None, compensators=compensators
+    )
+
+
 def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     """The camera of an experiment at its start."""
     like = lens.wavelengths
@@ -124,6 +142,8 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
         rho=settings.rho,
         network_dtype=torch.bfloat16 if settings.precision == "bfloat16" else None,
         pupil_points=pupil_points(settings.sampling, rays.get(settings.model), seed=settings.seed),
+        center=settings.center or ("centroid" if settings.is_toleranced else "chief"),
+        tolerances=tolerances_at_start(lens, settings),
     )
 
 
@@ -138,16 +158,34 @@ def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Samples of one step: picture (B, H, W) float32, distance (B,) mm float64, noise (B, h, w) of deviation 1."""
+    """Samples of one step: picture (B, H, W) float32, distance (B,) mm float64, noise (B, h, w) of deviation 1.
+
+    errors: of manufacture, (B, N) or (N,) of one lens, float64; None of the nominal lens.
+    """
 
     picture: Tensor
     distance: Tensor
     noise: Tensor
     field: list[int]
+    errors: Tensor | None = None
+
+    def part(self, where: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Picture, distance, noise and errors of some samples."""
+        errors = self.errors if self.errors is None or self.errors.dim() == 1 else self.errors[where]
+        return self.picture[where], self.distance[where], self.noise[where], errors
 
 
-def batch(pictures: Pictures, settings: CodesignSettings, samples: list[int], epoch: int) -> Batch:
-    """The samples of an epoch with these numbers; object distances are uniform in z or in 1/z."""
+def batch(
+    pictures: Pictures,
+    settings: CodesignSettings,
+    samples: list[int],
+    epoch: int,
+    tolerances: Tolerances | None = None,
+) -> Batch:
+    """The samples of an epoch with these numbers; object distances are uniform in z or in 1/z.
+
+    tolerances: of a perturbed lens for each sample, the trial of its number, counted over all epochs.
+    """
     size, parts = settings.patch + settings.size - 1, []
     for sample in samples:
         patch = crop(pictures, sample, epoch=epoch, size=size, crops=settings.crops, seed=settings.seed)
@@ -158,7 +196,12 @@ def batch(pictures: Pictures, settings: CodesignSettings, samples: list[int], ep
             distance = 1 / random.uniform(1 / settings.far, 1 / settings.near)
         parts.append((patch, distance, random.standard_normal((settings.patch,) * 2, dtype=np.float32)))
     picture, distance, noise = (torch.as_tensor(np.stack(part)) for part in zip(*parts, strict=True))
-    return Batch(picture, distance, noise, [sample % len(settings.fields) for sample in samples])
+    errors, count = None, len(pictures) * settings.crops
+    if tolerances is not None:
+        first, last = min(samples), max(samples)
+        drawn = draw_errors(tolerances, last - first + 1, settings.seed, first=epoch * count + first)
+        errors = drawn[torch.tensor(samples) - first]
+    return Batch(picture, distance, noise, [sample % len(settings.fields) for sample in samples], errors)
 
 
 def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
@@ -174,8 +217,8 @@ def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
 class Batches:
     """The batches of a run by step; the next one is prepared by a thread while a step is taken."""
 
-    def __init__(self, pictures: Pictures, settings: CodesignSettings):
-        self.pictures, self.settings = pictures, settings
+    def __init__(self, pictures: Pictures, settings: CodesignSettings, tolerances: Tolerances | None = None):
+        self.pictures, self.settings, self.tolerances = pictures, settings, tolerances
         self.steps_per_epoch = steps_per_epoch(pictures, settings)
         self._thread = ThreadPoolExecutor(1)
         self._next: dict[tuple[int, Share], object] = {}
@@ -189,28 +232,36 @@ class Batches:
         epoch, place = divmod(step, self.steps_per_epoch)
         first = place * self.settings.batch
         samples = share.of(range(first, first + self.settings.batch))
-        return self._thread.submit(batch, self.pictures, self.settings, samples, epoch)
+        return self._thread.submit(batch, self.pictures, self.settings, samples, epoch, self.tolerances)
 
 
 def absolute_error(camera: Camera, batch: Batch) -> Tensor:
     """Σ |restored - picture| of every sample, (B,)."""
+    return _summed(camera, batch, lambda difference: difference.abs())[0]
+
+
+def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor]) -> list[Tensor]:
+    """Σ over pixels of measures of restored - picture, each (B,)."""
     if len(camera.fields[0]) == 1:
-        restored = camera(batch.picture, batch.distance, noise=batch.noise)
-        return (restored - camera.target(batch.picture)).abs().sum((-2, -1))
-    errors = torch.zeros(len(batch.field))
+        restored = camera(batch.picture, batch.distance, noise=batch.noise, errors=batch.errors)
+        difference = restored - camera.target(batch.picture)
+        return [measure(difference).sum((-2, -1)) for measure in measures]
+    sums = [torch.zeros(len(batch.field)) for _ in measures]
     for field in sorted(set(batch.field)):
         where = torch.tensor([i for i, number in enumerate(batch.field) if number == field])
-        restored = camera(batch.picture[where], batch.distance[where], field=field, noise=batch.noise[where])
-        difference = (restored - camera.target(batch.picture[where])).abs().sum((-2, -1))
-        errors = errors.index_put((where,), difference)
-    return errors
+        picture, distance, noise, errors = batch.part(where)
+        difference = camera(picture, distance, field=field, noise=noise, errors=errors) - camera.target(picture)
+        parts = [measure(difference).sum((-2, -1)) for measure in measures]
+        sums = [total.index_put((where,), part) for total, part in zip(sums, parts, strict=True)]
+    return sums
 
 
 def optimise(
     camera: Camera, pictures: Pictures, settings: CodesignSettings, run: Run, *, every: int = 50
 ) -> Iterator[tuple[int, Record]]:
     """The steps of one training, one at a time; variables of the lens that need no gradient are fixed."""
-    batches, pixels = Batches(pictures, settings), settings.batch * settings.patch**2
+    batches = Batches(pictures, settings, camera.tolerances if settings.as_built else None)
+    pixels = settings.batch * settings.patch**2
     optics = [p for p in camera.variables.parameters() if p.requires_grad]
     groups = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
@@ -258,6 +309,30 @@ def held_out_error(
     return total / (count * settings.patch**2)
 
 
+@torch.no_grad()
+def errors_as_built(
+    camera: Camera,
+    pictures: Pictures,
+    settings: CodesignSettings,
+    *,
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> tuple[Tensor, Tensor]:
+    """Mean |restored - picture| (C,) and PSNR (C,) dB of the mean square error, of perturbed cameras of no training.
+
+    All cameras take the same test samples, a batch; they are the same lenses for all seeds and for any training.
+    progress: wraps the numbers of the cameras, for a bar.
+    """
+    count, pixels = len(pictures) * settings.crops, settings.patch**2
+    samples = batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
+    drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_UNSEEN), []
+    for number in progress(range(settings.cameras)):
+        one = dataclasses.replace(samples, errors=drawn[number])
+        sums = _summed(camera, one, lambda difference: difference.abs(), lambda difference: difference.square())
+        means.append([float(part.sum()) / (len(samples.field) * pixels) for part in sums])
+    absolute, square = torch.tensor(means, dtype=torch.float64).unbind(-1)
+    return absolute, psnr(square)
+
+
 # -- a run
 
 
@@ -269,7 +344,8 @@ class Outcome:
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
     vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty:
     mm², violation of the thickness limits, not part of the losses; no_optimum: the reason why the lens is no optimum
-    ("" if none is known).
+    ("" if none is known). l1_as_built, psnr_as_built: of perturbed cameras after step 2, by their number, with DRT
+    PSFs; empty without tolerances.
     """
 
     model: str
@@ -284,6 +360,8 @@ class Outcome:
     by_distance: dict[str, float]
     penalty: float = 0.0
     no_optimum: str = ""
+    l1_as_built: dict[str, float] = dataclasses.field(default_factory=dict)
+    psnr_as_built: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def document(self) -> dict:
         return dataclasses.asdict(self)
@@ -331,7 +409,10 @@ def run_model(
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
     for step, record in optimise(trained, train_pictures, settings, run(STEPS[1])):
         yield STEPS[1], step, record
-    optimised = trained.variables()
+    optimised, built = trained.variables(), [{}, {}]
+    if trained.tolerances is not None:
+        found = errors_as_built(trained, test_pictures, settings, progress=progress)
+        built = [{str(number): error for number, error in enumerate(errors.tolist(), 1)} for errors in found]
     result = Outcome(
         model=settings.model,
         seed=settings.seed,
@@ -342,6 +423,8 @@ def run_model(
         variables=trained.variables.numbers(),
         penalty=float(trained.variables.violation().detach()),
         no_optimum=out_of_focus(trained),
+        l1_as_built=built[0],
+        psnr_as_built=built[1],
         by_distance={
             f"{d:g}": held_out_error(trained, test_pictures, settings, distance=d, progress=progress) for d in distances
         },

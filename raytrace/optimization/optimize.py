@@ -53,6 +53,8 @@ from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import (
     RELATIONS,
     Condition,
+    Expectation,
+    ExpectationSettings,
     FunctionMerit,
     NoProblem,
     Problem,
@@ -536,13 +538,35 @@ def _glass_table(steps: Sequence[GlassStep]) -> Table:
 
 
 @value
+class AsBuiltChange:
+    """RMS spot radius in mm, before and after: expected of the lens as built (the root of the mean square), and of the
+    refocused lens without errors; tolerances: of which errors."""
+
+    tolerances: str
+    expected: tuple[float, float]
+    nominal: tuple[float, float]
+
+    @classmethod
+    def of(cls, term: Expectation, before: Lens, after: Lens) -> "AsBuiltChange":
+        with torch.no_grad():
+            figures = [tuple(float(q(lens)) ** 0.5 for lens in (before, after)) for q in (term.expected, term.nominal)]
+        return cls(term.words(), *figures)
+
+    def __str__(self) -> str:
+        pairs = (self.expected, self.nominal)
+        expected, nominal = (" → ".join(f"{1e3 * one:.5g}" for one in pair) + " µm" for pair in pairs)
+        return f"RMS spot radius as built ({self.tolerances}): expected {expected}, without errors {nominal}"
+
+
+@value
 class Optimized(Result):
     """The lens at the lowest merit reached, and the initial one.
 
     merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
     before and after; contributions: (R,) of each to the square of the merit, of sum 1; history: (cycles, 5) merit,
     largest violation of a condition, step, damping and seconds of every cycle; stopped: a key of `checkpoint.STOPPED`;
-    glasses: the steps in which variable glasses were chosen; conditions: targets and attained values.
+    glasses: the steps in which variable glasses were chosen; conditions: targets and attained values; as_built: spots
+    of the lens as built, if it is a term of the merit, which then includes it.
     """
 
     lens: Lens
@@ -564,6 +588,7 @@ class Optimized(Result):
     stopped: str
     glasses: tuple[GlassStep, ...] = ()
     conditions: tuple[Reached, ...] = ()
+    as_built: AsBuiltChange | None = None
 
     def draw(self):
         """One page: lens, spots and merit function before and after."""
@@ -629,6 +654,7 @@ class Optimized(Result):
                     for i in self.rows
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
+                **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
                 "conditions": [one.document() for one in self.conditions],
             }
         )
@@ -641,6 +667,7 @@ class Optimized(Result):
             f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            *([f"  {self.as_built}"] if self.as_built else []),
             *self._unsharp_start(),
             "",
         ]
@@ -816,6 +843,7 @@ def optimize(
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = None,
+    as_built: ExpectationSettings | None = None,
     cycles: int | None = None,
     seconds: float | None = None,
     paths: int = 1,
@@ -831,7 +859,8 @@ def optimize(
     merit: `Merit`, the settings `DefaultMerit` of a default merit function or its kind ("spot", "wavefront", "angular",
     "mtf"), rows, by default the file's; or any function of a lens that returns one number () to minimise, by L-BFGS.
     vary: variables, or their syntax, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
-    "thickness:2,15"; hold: constraints met exactly, as "efl=50 total_track<=80" (`optimization.problem`). cycles,
+    "thickness:2,15"; hold: constraints met exactly, as "efl=50 total_track<=80" (`optimization.problem`). as_built:
+    `AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit. cycles,
     seconds: limits, by default 500 cycles a path; paths: damping strategies to try. catalog: shipped catalogs or
     AGF files for variable glasses, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
@@ -842,7 +871,7 @@ def optimize(
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable).
-    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
+    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance.
     """
     prepare()
     started = time.monotonic()
@@ -873,6 +902,8 @@ def optimize(
             raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
         if hold:
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
+        if as_built is not None:
+            raise NoProblem("`as_built` goes with a merit of rows: add `as_built.of(lens).expected` to the function")
         of["merit"] = getattr(merit, "__qualname__", type(merit).__name__)
         function = FunctionMerit(model, merit, stored().evaluated)
         start = np.clip(model.start, lower, upper)
@@ -894,8 +925,10 @@ def optimize(
     function = merit_for(lens, merit)
     conditions = conditions_in_unit(lens, hold, function.unit)
     of_rows = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    problem = Problem(model, function.rows, conditions, **of_rows)
+    term = None if as_built is None else as_built.of(free.lens)
+    problem = Problem(model, function.rows, conditions, as_built=term, **of_rows)
     of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
+    of |= {} if term is None else {"as built": digest(term.about())}
     resumed = stored()
     if set(resumed.glasses) - set(glasses):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
@@ -924,6 +957,7 @@ def optimize(
         if glasses and not opening.interrupted:
             pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
             of_choice = {"cycles": cycles, "until": until, "keep": observer.checkpoint.write_glasses, **of_rows}
+            of_choice |= {"as_built": term}
             choice = Choice(free, glasses, pool, function.rows, conditions, limits, **of_choice)
             start, problem = choice.run(start, resumed).x, choice.problem(choice.best.glasses, ())
         settings["seconds"] = None if seconds is None else until - time.monotonic()
@@ -945,11 +979,14 @@ def optimize(
         evaluations=descent.evaluations + (choice.evaluations if choice else 0),
     )
     after = problem.evaluated(x)
+    end = lens_at(x)
     result = _optimized(
-        lens, lens_at(x), problem.model, names, x, descent, started, rows=problem.rows,
-        merits=(problem.merit(before), problem.merit(after)), values=(before.values[:count], after.values[:count]),
+        lens, end, problem.model, names, x, descent, started, rows=problem.rows,
+        merits=(problem.merit(before, model.start), problem.merit(after, x)),
+        values=(before.values[:count], after.values[:count]),
         contributions=tuple(end.contributions(np.arange(count)) for end in (before, after)),
         glasses=tuple(choice.steps) if choice else (), conditions=reached(problem, x, lower=lower, upper=upper),
+        as_built=None if term is None else AsBuiltChange.of(term, lens, end),
     )  # fmt: skip
     return _warned(result)
 

@@ -20,6 +20,8 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -287,6 +289,31 @@ def _miss(state: LensState, surface: int, wavelength: int, position, direction):
 RELATIONS = {"=": 0, "<=": 1, ">=": -1}
 
 
+class Expectation(Protocol):
+    """The lens as built as a term of a merit function: `tolerancing.as_built.AsBuiltTerm`.
+
+    residuals: (R,) of a state of the lens, their derivatives (R, n), None without, and the number of failed rays; unit:
+    mm in the unit of length of the rows. expected, nominal: mean square spot radius () mm² as built and without errors.
+    """
+
+    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray | None, int]: ...
+
+    def expected(self, lens: Lens) -> Tensor: ...
+
+    def nominal(self, lens: Lens) -> Tensor: ...
+
+    def words(self) -> str: ...
+
+    def about(self) -> str: ...
+
+
+@runtime_checkable
+class ExpectationSettings(Protocol):
+    """Settings of an expectation: `tolerancing.as_built.AsBuilt`."""
+
+    def of(self, lens: Lens) -> Expectation: ...
+
+
 class NoProblem(ValueError):
     """An optimisation without variables, rows or light; the message says what is missing."""
 
@@ -303,8 +330,12 @@ class Problem:
         unit: float = 1.0,
         skip_unknown: bool = False,
         conventions: Conventions | None = None,
+        as_built: Expectation | None = None,
     ):
-        """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
+        """unit: mm in the unit of length of rows and conditions; as_built: a term in addition to the rows, of the lens
+        in its current configuration, in proportion to the weights of all rows but boundaries. Raises NoProblem and
+        UnknownOperand."""
+        self.as_built = as_built
         held = tuple(_held(model.lens, rows, conditions))
         self._settings = {"unit": unit, "skip_unknown": skip_unknown, "conventions": conventions}
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
@@ -319,7 +350,7 @@ class Problem:
         self.recovery = Recovery(self.evaluation)
 
     def through(self, opening: float) -> "Problem":
-        """The same with rays through a part of the pupil and of the field alone."""
+        """The same with rays through a part of the pupil and of the field alone, and without the lens as built."""
         model = dataclasses.replace(self.model, opening=opening)
         return Problem(model, self.rows, self.conditions, **self._settings)
 
@@ -327,7 +358,8 @@ class Problem:
         return self.evaluation(x, derivatives=derivatives)
 
     def state(self, x: np.ndarray, derivatives: bool) -> State:
-        """Residuals of rows of positive weight, and violations of the others, in units of their rows."""
+        """Residuals of rows of positive weight and of the lens as built, and violations of the other rows, in units of
+        their rows."""
         evaluated = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
         of_row, weights, residuals = evaluated.of_row, self.evaluation.weights, evaluated.residuals
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
@@ -349,16 +381,34 @@ class Problem:
             residuals[equal] / factors[equal],
             np.concatenate([signs[limit] * residuals[limit] / factors[limit], excess[hard] / of_hard]),
         )
+        added, by_variables, lost = self._as_built(x, derivatives)
+        state = dataclasses.replace(state, residuals=np.concatenate([state.residuals, added]), lost=state.lost + lost)
         jacobian = evaluated.jacobian
         if jacobian is None:
             return state
         of_limits = (signs[limit] / factors[limit])[:, None] * jacobian[limit], slopes[hard] / of_hard[:, None]
         return dataclasses.replace(
             state,
-            jacobian=np.where(np.isfinite(jacobian[squared]), jacobian[squared], 0.0),
+            jacobian=np.concatenate([np.where(np.isfinite(jacobian[squared]), jacobian[squared], 0.0), by_variables]),
             held_slope=jacobian[equal] / factors[equal, None],
             limits_slope=np.concatenate(of_limits),
         )
+
+    def _as_built(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None, int]:
+        if self.as_built is None:
+            return np.zeros(0), np.zeros((0, len(x))), 0
+        view = self.model.views[self.model.lens.current_configuration - 1]
+        state = view.state(Dual(x, np.eye(len(x))) if derivatives else x)
+        residuals, slopes, lost = self.as_built.residuals(state, self.unit)
+        factor = self._share**0.5
+        return factor * residuals, None if slopes is None else factor * slopes, lost
+
+    @cached_property
+    def _share(self) -> float:
+        """The part of the rows that are no boundaries in the sum of the weights."""
+        weights = np.maximum(self.evaluation.weights, 0.0)
+        free = [not (row.operand in OPERANDS and OPERANDS[row.operand].bounds) for row in self.evaluation.rows]
+        return float(weights[free].sum() / weights.sum())
 
     def _charged(self, evaluated: Evaluated, x: np.ndarray) -> Evaluated:
         """The charge for a failed ray raised the earlier it fails, and its miss as a further residual.
@@ -382,10 +432,11 @@ class Problem:
             of_row=np.concatenate([evaluated.of_row, rows]),
         )
 
-    def merit(self, evaluated: Evaluated) -> float:
-        """M over the rows of the merit function alone."""
+    def merit(self, evaluated: Evaluated, x: np.ndarray | None = None) -> float:
+        """M over the rows of the merit function alone; with x and the lens as built in addition."""
         residuals = evaluated.residuals[evaluated.of_row < len(self.rows)]
-        return float(np.sqrt(residuals @ residuals))
+        added = self._as_built(x, False)[0] if x is not None else np.zeros(0)
+        return float(np.sqrt(residuals @ residuals + added @ added))
 
 
 class FunctionMerit:

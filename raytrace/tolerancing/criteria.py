@@ -1,15 +1,18 @@
 """Criteria: measures of image quality that a lens as built is judged by, of a batch of lenses in one pass.
 
-A criterion f comes of a quantity q that the compensators minimise, f = √q where q is a mean square. The mean square
-radius of spots is a parabola in the position of a plane sensor, whose minimum needs no second trace.
+A criterion f comes of a quantity q that the compensators minimise: f = √q where q is a mean square, f = 1 - q of the
+MTF. The mean square radius of spots is a parabola in the position of a plane sensor, whose minimum needs no second
+trace.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from raytrace.analysis.sheared_batch import ShearedPupils
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
@@ -17,6 +20,7 @@ from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import image_rays, spot_of_points
 from raytrace.tracing.wavefront import wavefront_of, without
+from raytrace.words import did_you_mean
 
 
 @value
@@ -31,16 +35,24 @@ class Sampling:
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
-    """A measure of image quality, the root of a mean square q.
+    """A measure of image quality f(q) of a quantity q that the compensators minimise.
 
-    square: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
-    with the sensor s mm further along its normal; None: no closed form.
+    quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
+    with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
+    where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
+    derivatives. settings: what q depends on beyond lens, fields and pupil.
     """
 
     name: str
     unit: str
-    square: Callable[[Lens, Sampling], Tensor]
+    quantity: Callable[[Lens, Sampling], Tensor]
     parabola: Callable[[Lens, Sampling], tuple[Tensor, Tensor, Tensor]] | None = None
+    value: Callable[[Tensor], Tensor] = torch.sqrt
+    quantity_of: Callable[[float], float] = lambda f: f * f
+    sign: int = 1
+    scale: float = 0.0
+    together: int = 256
+    settings: tuple = ()
 
 
 def _spots(lens: Lens, sampling: Sampling) -> tuple[Rays, Tensor]:
@@ -74,11 +86,49 @@ def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
     return (sampling.field_weights * ((share * flat * flat).sum(-1) * shares).sum(-1)).sum(-1)
 
 
-#: Criteria by name.
+def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
+    """Mean of tangential and sagittal MTF over the fields; q is what is missing to 1."""
+    pupils = ShearedPupils(lens, sampling.fields, frequency)
+
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        tangential, sagittal = pupils(lenses)
+        return 1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1)
+
+    name = f"MTF at {frequency:g} cycles/mm"
+
+    def missing(number):
+        return 1 - number
+
+    return Criterion(name, "", quantity, value=missing, quantity_of=missing, sign=-1, scale=1.0, together=32)
+
+
+#: Criteria of every lens by name, and those that are made of the nominal lens.
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
 }
+NAMES = (*CRITERIA, "mtf@F")
+
+
+def criterion_of(word: str, lens: Lens, sampling: Sampling) -> Criterion:
+    """The criterion of a word, "rms" or "mtf@30", for lenses near a nominal one. Raises ValueError."""
+    if word in CRITERIA:
+        return CRITERIA[word]
+    name, mark, number = word.partition("@")
+    if name == "mtf":
+        try:
+            return _modulation(float(number), lens, sampling)
+        except ValueError as error:
+            message = str(error) if mark and _is_number(number) else "expected a frequency in cycles/mm, as mtf@30"
+            raise ValueError(f"criterion {word!r}: {message}") from error
+    raise ValueError(f"criterion {word!r}: expected one of {', '.join(NAMES)}{did_you_mean(name, NAMES)}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def at_best_focus(

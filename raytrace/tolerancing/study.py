@@ -1,15 +1,15 @@
 """Tolerancing: sensitivities, the expectation of the lens as built, and its distribution by Monte Carlo.
 
-The criterion f of a lens with errors e and compensators c is √q, the root of a mean square; the lens as built has the
-compensators that minimise it. Of one trial they come from Newton's method with the exact gradient
-and differences of gradients, all lenses of a batch at once.
+The criterion of a lens with errors e and compensators c is a function f(q), the root of a mean square q or what is
+missing of the MTF; the lens as built has the compensators that minimise q. Of one trial they come from Newton's method
+with the exact gradient and differences of gradients, all lenses of a batch at once.
 
 Second order: with g and H the derivatives of q by the errors, H those of differences of exact gradients and with the
 compensators eliminated,
 
     H = q_ee - q_ec q_cc⁻¹ q_ce,     E[q] = q₀ + g·m + ½ (tr(H Σ) + m·H m),
 
-m and Σ the means and variances of the errors. The distribution of f is that of the root of the same quadratic form.
+m and Σ the means and variances of the errors. The distribution of f is that of f of the same quadratic form.
 Source of the expansion: Rimmer, Appl. Opt. 9, 533 (1970).
 """
 
@@ -26,7 +26,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from raytrace.io import write_lens
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, styled
@@ -37,7 +37,7 @@ from raytrace.system.lens import Lens, aligned, field_points
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus
+from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, criterion_of
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
@@ -47,8 +47,9 @@ from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
-_CHUNK = 512  # lenses traced at once
-_MODEL = 2**15  # draws of the second-order model
+_REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
+_CHUNK = 1024  # lenses traced at once
+_MODEL = 2**13  # draws of the second-order model
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 
@@ -71,10 +72,10 @@ class Study:
         self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
         self.unsettled = 0  # lenses whose compensators still gained 1e-6 of q in the last step
 
-    def square(self, errors: Tensor, changes: Tensor) -> Tensor:
+    def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
         lens = with_changes(self.perturbation(errors), self.compensators, changes)
-        return self.criterion.square(aligned(lens, 3), self.sampling)
+        return self.criterion.quantity(aligned(lens, 3), self.sampling)
 
     def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor] | None:
         """q (L,) with the sensor at its least, and its shift (L, 1); None where no parabola has it."""
@@ -88,51 +89,71 @@ class Study:
 
     def slope(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) and its derivatives by the errors (L, N) and the compensators (L, C)."""
-        with torch.enable_grad():
-            errors, changes = (x.detach().requires_grad_() for x in (errors, changes))
-            q = self.square(errors, changes)
-            found = torch.autograd.grad(q.sum(), (errors, changes), allow_unused=True)
-        by_errors, by_changes = (
-            torch.zeros_like(x) if g is None else g for g, x in zip(found, (errors, changes), strict=True)
-        )
-        return q.detach(), by_errors, by_changes
+        return self._slopes(errors, changes, by_errors=True)
 
-    def slope_of_compensators(self, errors: Tensor, changes: Tensor) -> Tensor:
-        """Derivatives (L, C) of q by the compensators."""
-        with torch.enable_grad():
-            changes = changes.detach().requires_grad_()
-            q = self.square(errors, changes)
-            found = torch.autograd.grad(q.sum(), changes, allow_unused=True)[0] if q.requires_grad else None
-            return torch.zeros_like(changes) if found is None else found
+    def slope_of_compensators(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor]:
+        """q (L,) and its derivatives (L, C) by the compensators."""
+        q, _, by_changes = self._slopes(errors, changes, by_errors=False)
+        return q, by_changes
+
+    def _slopes(self, errors: Tensor, changes: Tensor, *, by_errors: bool) -> tuple[Tensor, Tensor, Tensor]:
+        rows = []
+        for e, c in zip(*(x.detach().split(self.criterion.together) for x in (errors, changes)), strict=True):
+            with torch.enable_grad():
+                e, c = e.requires_grad_(by_errors), c.requires_grad_()
+                q = self.quantity(e, c)
+                asked = [x for x in (e, c) if x.requires_grad]
+                unused = [None] * len(asked)
+                found = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
+            slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(found, asked, strict=True)]
+            rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1]))
+        return tuple(torch.cat(part) for part in zip(*rows, strict=True))
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
-        """q (L,) with the compensators that minimise it, and their changes (L, C)."""
-        changes = errors.new_zeros(len(errors), len(self.compensators))
+        """q (L,) with the compensators that minimise it, and their changes (L, C).
+
+        Newton's method with the curvature of the nominal lens, scaled for each lens by the last two slopes. A step that
+        does not improve q is shortened.
+        """
+        at = errors.new_zeros(len(errors), len(self.compensators))
         if not self.compensators:
             with torch.no_grad():
-                return self.square(errors, changes), changes
+                parts = errors.split(self.criterion.together)
+                return torch.cat([self.quantity(part, at[: len(part)]) for part in parts]), at
         with torch.no_grad():
             if (found := self.refocused(errors)) is not None:
                 return found
-        curvature = self.nominal_curvature()
-        for _ in range(_NEWTON):
-            slopes = self.slope_of_compensators(errors, changes)
-            step = torch.linalg.solve(curvature, slopes[..., None])[..., 0]
-            moved = torch.clamp(changes - step, self.least, self.most)
-            gain, changes = (0.5 * (slopes * (changes - moved)).sum(-1)).abs(), moved
-            with torch.no_grad():
-                q = self.square(errors, changes)
-            if not bool((gain > _SETTLED * q).any()):
+        curvature, trial, count = self.nominal_curvature(), at, len(errors)
+        q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(at), torch.zeros(count).to(errors)
+        scale, least, moving = errors.new_ones(count, 1), 1e-6 * self.criterion.scale, torch.arange(count)
+        for step in range(_NEWTON + 1):
+            q_trial, slopes_trial = self.slope_of_compensators(errors[moving], trial)
+            better, start, before = ~(q_trial > q[moving]), at[moving], slopes[moving]
+            if step:
+                moved = trial - start
+                expected = ((moved @ curvature) * moved).sum(-1)
+                ratio = ((slopes_trial - before) * moved).sum(-1) / expected
+                secant = torch.where((expected > 0) & (ratio > 0), ratio, 1.0).clamp(0.2, 25.0)
+                scale[moving] = torch.where(better, secant, torch.maximum(secant, 4 * scale[moving, 0]))[:, None]
+            q[moving] = torch.where(better, q_trial, q[moving])
+            at[moving] = start = torch.where(better[:, None], trial, start)
+            slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
+            full = torch.linalg.solve(curvature, before[..., None])[..., 0]
+            trial = torch.clamp(start - full / scale[moving], self.least, self.most)
+            gain[moving] = (0.5 * (before * (start - trial)).sum(-1)).abs()
+            going = gain[moving] > _SETTLED * (q[moving] + least)
+            moving, trial = moving[going], trial[going]
+            if not len(moving):
                 break
-        self.unsettled += int((gain > 1e-6 * q).sum())
-        return q, changes
+        self.unsettled += int((gain > 1e-6 * (q + least)).sum())
+        return q, at
 
     def harm(self, errors: Tensor) -> Tensor:
         """How much worse the criterion (L,) of compensated lenses is than that of the nominal one."""
         zero = self.half.new_zeros(1, errors.shape[1])
         found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(_CHUNK))]
-        nominal, *others = (q.sqrt() for q in found)
-        return torch.cat(others) - nominal
+        nominal, *others = (self.criterion.value(q) for q in found)
+        return self.criterion.sign * (torch.cat(others) - nominal)
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -141,14 +162,25 @@ class Study:
             zero = self.half.new_zeros(2 * count, len(self.half))
             steps = self.scale_of_compensators()
             moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
-            slopes = self.slope_of_compensators(zero, moved)
+            q, slopes = self.slope_of_compensators(zero, moved)
             found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
             self._curvature = 0.5 * (found + found.T)
-            dead = torch.diagonal(self._curvature) <= 0
-            if bool(dead.any()):
-                one = self.compensators[int(dead.int().argmax())]
-                raise BadTolerance(f"compensator {one}: it does not improve the criterion; leave it out")
+            self._refuse_idle(torch.diagonal(self._curvature), q)
         return self._curvature
+
+    def _refuse_idle(self, curvatures: Tensor, q: Tensor) -> None:
+        """Refuse compensators without effect on q, and those that the nominal lens is no minimum of."""
+        effect = 0.5 * curvatures * (_REACH * self.scale_of_compensators()) ** 2
+        least = _NO_EFFECT * (float(q.min()) + self.criterion.scale)
+        for one, gain in zip(self.compensators, effect.tolist(), strict=True):
+            if abs(gain) <= least:
+                what = f"it has no effect on the {self.criterion.name}"
+                raise BadTolerance(f"compensator {one}: it does not improve the criterion: {what}; leave it out")
+            if not gain > 0:
+                message = (
+                    f"the {self.criterion.name} has no optimum near the nominal lens; focus the lens first (rt.focus)"
+                )
+                raise BadTolerance(f"compensator {one}: {message}, or optimise it")
 
     def scale_of_compensators(self) -> Tensor:
         """Steps (C,) of the differences by the compensators."""
@@ -161,18 +193,17 @@ class Study:
         _, best = self.compensated(self.half.new_zeros(1, count))
         steps = torch.cat([_STEP * self.half, self.scale_of_compensators()])
         places = torch.diag(steps)
-        moved = torch.cat([places, -places])
+        moved = torch.cat([places, -places, torch.zeros_like(places[:1])])
         moved[:, count:] += best
-        slopes = [self.slope(part[:, :count], part[:, count:]) for part in moved.split(_CHUNK)]
-        both = torch.cat([torch.cat(found[1:], -1) for found in slopes])
-        whole = (both[: count + others] - both[count + others :]) / (2 * steps[:, None])
+        q, *both = self.slope(moved[:, :count], moved[:, count:])
+        ahead, behind, (slope,) = torch.cat(both, -1).split((len(steps), len(steps), 1))
+        whole = (ahead - behind) / (2 * steps[:, None])
         whole = 0.5 * (whole + whole.T)
-        q, slope, _ = self.slope(self.half.new_zeros(1, count), best)
         H = whole[:count, :count]
         if others:
             mixed = whole[:count, count:]
             H = H - mixed @ torch.linalg.solve(whole[count:, count:], mixed.T)
-        return float(q), slope[0], H
+        return float(q[-1]), slope[:count], H
 
 
 def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
@@ -209,7 +240,9 @@ def _check(lens: Lens, one: Compensator) -> None:
 
 
 def moments(row: Tolerance) -> tuple[float, float]:
-    """Mean and variance of the error of a row."""
+    """Mean and variance of the error of a row. Rows of a group have errors on a sphere, alike in all directions."""
+    if row.group:
+        return 0.0, row.maximum**2
     middle, half = 0.5 * (row.minimum + row.maximum), 0.5 * (row.maximum - row.minimum)
     if row.distribution == "normal":
         s = row.sigmas
@@ -222,12 +255,14 @@ def moments(row: Tolerance) -> tuple[float, float]:
 class Toleranced(Result):
     """The lens as built.
 
+    better: "smaller" or "larger", which values of the criterion are better.
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
     of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
     second order; slope: (N,) its derivative times the half width.
-    estimated: () nominal + √Σ ½(Δmin² + Δmax²), as OpticStudio. expected: () the mean of the criterion by second order;
-    expected_square: () that of its square. predicted: (K,) draws of the second-order model. trials: (T,) the criterion
-    of the perturbed and compensated lenses, nan where no ray arrives; changes: (T, C) of the compensators.
+    estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
+    second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
+    second-order model. trials: (T,) the criterion of the perturbed and compensated lenses, nan where no ray arrives;
+    changes: (T, C) of the compensators.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
     goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
     before their limits were tightened, or None.
@@ -254,6 +289,7 @@ class Toleranced(Result):
     goal: float | None = None
     share: float = 0.9
     given: object = None
+    better: str = "smaller"
 
     COLUMNS = property(
         lambda self: (
@@ -269,23 +305,34 @@ class Toleranced(Result):
     )
 
     @property
+    def title(self) -> str:
+        """The criterion and its unit."""
+        return f"{self.criterion}, {self.unit}" if self.unit else self.criterion
+
+    @property
+    def sign(self) -> int:
+        """1 where smaller values of the criterion are better, else -1."""
+        return -1 if self.better == "larger" else 1
+
+    @property
     def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change first."""
-        return torch.argsort(torch.maximum(self.minimum, self.maximum), descending=True)
+        """(N,) places of the tolerances, the largest change to the worse first."""
+        return torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
 
     def percentile(self, percent: float) -> Tensor:
-        """The criterion that so many percent of the trials are below; failed trials are above all."""
-        return torch.quantile(torch.nan_to_num(self.trials, nan=torch.inf), percent / 100, interpolation="higher")
+        """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
+        ordered = torch.nan_to_num(self.sign * self.trials, nan=torch.inf)
+        return self.sign * torch.quantile(ordered, percent / 100, interpolation="higher")
 
-    def yield_at(self, most: float) -> float:
-        """Share of the trials whose criterion is at most a number."""
-        return float((self.trials <= most).double().mean())
+    def yield_at(self, limit: float) -> float:
+        """Share of the trials whose criterion is a number or better: at most it, or at least it of the MTF."""
+        return float((self.sign * self.trials <= self.sign * limit).double().mean())
 
     def table_of_shares(self) -> dict[str, Tensor]:
-        """The criterion that shares of the trials are below, the same by second order, and the difference."""
+        """The criterion that shares of the trials meet or surpass, the same by second order, and the difference."""
         shares = sorted({*PERCENTILES, 100 * self.share})
         traced = torch.stack([self.percentile(p) for p in shares])
-        predicted = torch.quantile(self.predicted, traced.new_tensor(shares) / 100)
+        predicted = self.sign * torch.quantile(self.sign * self.predicted, traced.new_tensor(shares) / 100)
         off = 100 * (predicted / traced - 1)
         return {"share": traced.new_tensor(shares), "trials": traced, "predicted": predicted, "difference": off}
 
@@ -314,7 +361,7 @@ class Toleranced(Result):
         lens = Perturbation(self.lens, self.tolerances)(errors)
         lens = with_changes(lens, self.tolerances.compensators, self.changes[number])
         figure = float(self.trials[number])
-        stated = "no light" if math.isnan(figure) else f"{self.criterion} {figure:.6g} {self.unit}"
+        stated = "no light" if math.isnan(figure) else f"{self.criterion} {figure:.6g} {self.unit}".rstrip()
         data = lens.optimization_data
         data = data and dataclasses.replace(data, variables=(), solves=(), kept=(), tolerances=())
         notes = (*lens.notes, f"As built: trial {number} of seed {self.seed}, {stated}")
@@ -328,13 +375,13 @@ class Toleranced(Result):
 
     @property
     def worst_trial(self) -> int:
-        """The number of the trial with the largest criterion of those that light arrives in."""
-        return int(self._arrived().nan_to_num(-torch.inf).argmax())
+        """The number of the trial with the worst criterion of those that light arrives in."""
+        return int((self.sign * self._arrived()).nan_to_num(-torch.inf).argmax())
 
     @property
     def best_trial(self) -> int:
-        """The number of the trial with the smallest criterion."""
-        return int(self._arrived().nan_to_num(torch.inf).argmin())
+        """The number of the trial with the best criterion."""
+        return int((self.sign * self._arrived()).nan_to_num(torch.inf).argmin())
 
     def _arrived(self) -> Tensor:
         """The trials. Raises ValueError where light arrives in none."""
@@ -379,25 +426,30 @@ class Toleranced(Result):
             "nominal": float(self.nominal),
             "estimated": float(self.estimated),
             "expected": float(self.expected),
-            "expected_root_mean_square": math.sqrt(float(self.expected_square)),
         }
+        if self.better == "smaller":
+            found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
         if len(self.trials):
             good = self.trials[~self.trials.isnan()]
-            found |= {"mean": float(good.mean()), "sigma": float(good.std()), "best": float(good.min())}
-            found |= {"worst": float(good.max()), "failed": int(self.trials.isnan().sum())}
+            found |= {"mean": float(good.mean()), "sigma": float(good.std())}
+            found |= {"best": float((good * self.sign).min()) * self.sign}
+            found |= {"worst": float((good * self.sign).max()) * self.sign, "failed": int(self.trials.isnan().sum())}
             found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
         if self.goal is not None:
-            found |= {"goal": self.goal, "yield_by_second_order": float((self.predicted <= self.goal).double().mean())}
+            reached = self.sign * self.predicted <= self.sign * self.goal
+            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
             if len(self.trials):
                 found["yield"] = self.yield_at(self.goal)
         return found
 
     def tables(self) -> list[Table]:
         found = self.summary()
-        about = [f"{self.criterion}, {self.unit}: nominal {found['nominal']:.6g}"]
+        about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
+        root = found.get("expected_root_mean_square")
         about.append(
-            f"as built, expected by second order: mean {found['expected']:.6g}, root mean square "
-            f"{found['expected_root_mean_square']:.6g}; estimated by RSS {found['estimated']:.6g}"
+            f"as built, expected by second order: mean {found['expected']:.6g}"
+            + (f", root mean square {root:.6g}" if root is not None else "")
+            + f"; estimated by RSS {found['estimated']:.6g}"
         )
         if len(self.trials):
             about.append(
@@ -416,7 +468,8 @@ class Toleranced(Result):
         if self.goal is not None:
             traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
             share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
-            about.append(f"within {self.goal:g} {self.unit}: {share}{traced}")
+            bound = "at most" if self.sign > 0 else "at least"
+            about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
         if self.given is not None:
             drawn = self.tightened()
             listed = ", ".join(f"{label} × {factor:.3g}" for label, factor in drawn[:6])
@@ -427,8 +480,9 @@ class Toleranced(Result):
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
         found = [Table(self.columns(), about)]
         if len(self.trials):
+            bound = "within" if self.sign > 0 else "above"
             found.append(
-                Table(self.table_of_shares(), ["share of the trials within a limit, and the same by second order"])
+                Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
             )
         return found
 
@@ -441,7 +495,9 @@ class Toleranced(Result):
         figure = new_figure(9.0, 4.2)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
         shown = self.trials[~self.trials.isnan()] if len(self.trials) else self.predicted
-        span = (float(min(shown.min(), self.nominal)), float(torch.quantile(shown, 0.998)))
+        tail = torch.quantile(self.sign * shown, 0.998) * self.sign
+        ends = ((self.sign * shown).min() * self.sign, self.nominal, tail)
+        span = (float(min(ends)), float(max(ends)))
         bins = np.linspace(*span, 41)
         if len(self.trials):
             left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(self.trials):,} trials")
@@ -449,10 +505,10 @@ class Toleranced(Result):
         left.stairs(density, bins, color=INK, linewidth=1.2, label="second order")
         left.axvline(float(self.nominal), color=GREY, linestyle=":", label="nominal")
         left.axvline(float(self.expected), color="#d62728", label="expected")
-        left.set(xlabel=f"{self.criterion}, {self.unit}", ylabel="density", xlim=span)
+        left.set(xlabel=self.title, ylabel="density", xlim=span)
         curve = left.twinx()
         ordered = torch.sort(shown).values
-        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered)), color="#2ca02c", linewidth=1.2)
+        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
         curve.set(ylabel="yield, %", ylim=(0, 100))
         left.legend(fontsize=8, loc="center right")
         order = self.worst[:12].flip(0)
@@ -460,7 +516,7 @@ class Toleranced(Result):
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
-        right.set(xlabel=f"change of the criterion, {self.unit}")
+        right.set(xlabel=", ".join(filter(None, ("change of the criterion", self.unit))))
         right.legend(fontsize=8, loc="lower right")
         return figure
 
@@ -477,7 +533,7 @@ def tolerance(
     *,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
-    criterion: Literal["rms", "wavefront"] = "rms",
+    criterion: str = "rms",
     trials: int = 1000,
     seed: int = 0,
     increment: float | None = None,
@@ -498,12 +554,13 @@ def tolerance(
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
-        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt. The compensators of every
-        lens minimise its square.
+        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
+        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields. The compensators of every lens
+        bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
-    goal: what the criterion of a good lens is at most; the share of such lenses is reported.
+    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
         least total tightness until this share reaches the goal, by second order.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
@@ -515,8 +572,6 @@ def tolerance(
     progress: (count, unit) -> a progress bar.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
     """
-    if criterion not in CRITERIA:
-        raise ValueError(f"criterion {criterion!r}: expected one of {', '.join(CRITERIA)}")
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
@@ -527,47 +582,59 @@ def tolerance(
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
-    chosen, sampling, given = CRITERIA[criterion], _sampling(lens, fields, rings, arms), tolerances
+    sampling, given = sampling_of(lens, fields, rings, arms), tolerances
+    chosen = criterion_of(criterion, lens, sampling)
     study = Study(lens, tolerances, chosen, sampling)
+    if study.compensators:
+        study.nominal_curvature()  # refuses those without effect
     with torch.no_grad():
-        nominal_square, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
-        if not bool(nominal_square.isfinite().all()):
+        nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
+        if not bool(nominal_quantity.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
-        nominal = nominal_square[0].sqrt()
+        nominal = chosen.value(nominal_quantity[0])
         if increment is not None:
             tolerances = limited_to_change(tolerances, study.harm, increment)
             study = Study(lens, tolerances, chosen, sampling)
         model = study.second_order()
         if goal is not None and yield_ is not None:
-            tolerances = limited_to_yield(tolerances, model, goal**2, yield_, seed + 1)
+            tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
             study = Study(lens, tolerances, chosen, sampling)
         low, high = _at_limits(study)
-        changes = [q.sqrt() - nominal for q in (low, high)]
+        changes = [chosen.value(q) - nominal for q in (low, high)]
         seconds = [
-            _second_order_change(model, limits.to(study.half)) for limits in (tolerances.minimum, tolerances.maximum)
+            _second_order_change(chosen, model, limits.to(study.half))
+            for limits in (tolerances.minimum, tolerances.maximum)
         ]
-        predicted, mean_square = _model(tolerances, *model, seed)
-        predicted = predicted.clamp_min(0).sqrt()
+        predicted, expected, mean_square = second_order_draws(tolerances, chosen, *model, seed)
         values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
         minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
-        slope=model[1] * study.half / (2 * nominal), estimated=nominal + rss, expected=predicted.mean(),
+        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=expected,
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
         unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
-        given=None if tolerances is given else given,
+        given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
     )  # fmt: skip
 
 
-def _second_order_change(model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
-    """√(q₀ + g e + ½ H_ee e²) - √q₀ (N,) of errors (N,), each alone."""
+def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
+    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
     q0, g, H = model
-    found = q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2
-    return found.clamp_min(0).sqrt() - math.sqrt(q0)
+    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
+    return criterion.value(found) - criterion.value(found.new_tensor(q0))
 
 
-def _sampling(lens: Lens, fields, rings: int, arms: int) -> Sampling:
+def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
+    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
+    if q0 <= 1e-12 * criterion.scale:
+        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
+    with torch.enable_grad():
+        q = g.new_tensor(q0).requires_grad_()
+        return g * torch.autograd.grad(criterion.value(q), q)[0]
+
+
+def sampling_of(lens: Lens, fields, rings: int, arms: int) -> Sampling:
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
     weights = lens.fields.weight if fields is None else torch.ones_like(points[0])
@@ -586,13 +653,20 @@ def _at_limits(study: Study) -> tuple[Tensor, Tensor]:
     return found[: len(low)], found[len(low) :]
 
 
-def _model(tolerances: Tolerances, q0: float, g: Tensor, H: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws (K,) of the quadratic form, and its exact mean ()."""
+def second_order_draws(
+    tolerances: Tolerances, criterion: Criterion, q0: float, g: Tensor, H: Tensor, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draws (K,) of the criterion by second order, its mean (), and the exact mean of q ().
+
+    The mean of q, which is known, is a control variate of that of the criterion.
+    """
     mean, variance = (g.new_tensor(part) for part in zip(*map(moments, tolerances), strict=True))
     errors = draw_errors(tolerances, _MODEL, seed + 1).to(g)
     drawn = q0 + errors @ g + 0.5 * ((errors @ H) * errors).sum(-1)
     exact = q0 + g @ mean + 0.5 * (torch.diagonal(H) @ variance + mean @ H @ mean)
-    return drawn, exact
+    found = criterion.value(drawn.clamp_min(0))
+    off = drawn - drawn.mean()
+    return found, found.mean() - safe_divide((off * found).sum(), (off * off).sum()) * (drawn.mean() - exact), exact
 
 
 _JOURNAL = Kind(
@@ -612,6 +686,7 @@ class _Trials:
         about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
         about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
         about |= {"fields and pupil": digest(study.sampling)}
+        about |= {"settings": digest(repr(study.criterion.settings))} if study.criterion.settings else {}
         self.store = Records(path, about, _JOURNAL, _TRIALS)
         self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
 
@@ -634,7 +709,7 @@ def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Sha
         if rows is None or len(rows) != len(part):
             errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
             q, changes = study.compensated(errors.reshape(len(part), count))
-            rows = torch.cat([q.sqrt()[:, None], changes], -1)
+            rows = torch.cat([study.criterion.value(q)[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
         found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)

@@ -148,7 +148,7 @@ FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno
 _THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
 _TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
 _COMPILERS = ("c++", "g++", "clang++")
-_TAKES = "10 to 60 s"  # of a processor that is free, with g++
+_TAKES = "a minute or two"
 _BUILDING = "building-"
 _DAY = 24 * 3600.0  # s
 _LONG = 90 * _DAY

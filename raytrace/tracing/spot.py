@@ -13,6 +13,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
 from raytrace.tracing.trace import is_bent, sequence_of, trace_surfaces, without_apertures
@@ -114,13 +115,20 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
     The image surface does not refract: the sensor may touch glass. Raises budget.OverBudget for
     more rays than memory holds.
     """
+    surfaces, rays, arguments = to_image(lens, pupil, fields=fields, wavelengths=wavelengths)
+    return trace_surfaces(surfaces, rays, **arguments)
+
+
+def to_image(
+    lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None
+) -> tuple[Sequence[Surface], Rays, dict]:
+    """The surfaces to the sensor, the launched rays, and the other arguments of `trace_surfaces`, of `image_rays`."""
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     count = lens.fields.y.numel() if fields is None else fields.shape[1]
     afford_rays(pupil.shape[-1], fields=count, wavelengths=len(wavelengths))
     indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    indices = [*indices[:-1], indices[-2]]
-    return trace_surfaces(sequence_of(lens), rays, indices=indices, wavelength=wavelengths[:, None])
+    return sequence_of(lens), rays, {"indices": [*indices[:-1], indices[-2]], "wavelength": wavelengths[:, None]}
 
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status

@@ -1,0 +1,242 @@
+"""A study of co-design as built: training on perturbed lenses against nominal training, at equal processor time.
+
+    python docs/experiments/codesign_as_built.py double_gauss --data DIR -o FOLDER --docs docs
+
+Of every seed, `--start` epochs on the nominal lens are the common start. From there each training has `--seconds` of
+processor time: its number of steps follows from the measured time of a step. All are tested on the same perturbed
+cameras, which no training sees; differences are paired by seed. A second call resumes, and computes what is missing.
+"""
+
+import argparse
+import csv
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import t as student
+
+from raytrace.files import write_json
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.codesign import Batches, absolute_error, camera, errors_as_built, optimise, steps_per_epoch
+from raytrace.imaging.pictures import Pictures, digest, files, read, split
+from raytrace.imaging.training import Run, load_state, read_json, read_state
+from raytrace.io import as_lens
+from raytrace.plotting.style import FIELD_COLOURS, GREY, new_figure
+from raytrace.settings import CodesignSettings
+from raytrace.shards import Share
+from raytrace.system.lens import Lens
+from raytrace.tracing.compiled import prepare
+
+BASE = CodesignSettings(
+    vary="curvature:1-3,5,7,9-11 sensor", hold="efl", noise=0.02, width=16, batch=16, patch=32,
+    rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=16,
+)  # fmt: skip
+#: What cameras are built with: (grade, refocus).
+BUILDS = {
+    "precision": ("precision", "sensor"),
+    "commercial": ("commercial", "sensor"),
+    "precision, fixed sensor": ("precision", "none"),
+}
+MEASURES = {"l1": "mean L¹", "psnr": "PSNR, dB"}
+COLUMNS = (
+    "build",
+    "psf",
+    "training",
+    "seed",
+    "steps",
+    "seconds",
+    "l1",
+    "psnr",
+    "l1_spread",
+    "psnr_spread",
+    "psnr_least",
+)
+_CHECK = 6  # cameras of the test with DRT PSFs
+
+
+def settings_of(training: str, seed: int) -> CodesignSettings:
+    """Of a training on the nominal lens, or on those of a build."""
+    grade, refocus = BUILDS.get(training, ("", "sensor"))
+    return dataclasses.replace(BASE, as_built=bool(grade), grade=grade, refocus=refocus, seed=seed)
+
+
+def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, count: int = 8) -> float:
+    """Median processor time of a training step, s."""
+    trained = camera(lens, settings)
+    trained.plan()
+    batches = Batches(pictures, settings, trained.tolerances if settings.as_built else None)
+    optimizer, seconds = torch.optim.Adam(trained.parameters(), 0.0), []
+    for step in range(count + 2):
+        start = time.process_time()
+        optimizer.zero_grad(set_to_none=True)
+        (absolute_error(trained, batches(step, Share())).mean() + trained.variables.violation()).backward()
+        optimizer.step()
+        seconds.append(time.process_time() - start)
+    return float(np.median(seconds[2:]))
+
+
+def train_one(
+    lens: Lens, pictures: Pictures, settings: CodesignSettings, folder: Path, about: dict, start_of: Path | None = None
+) -> float:
+    """Train, or what remains of it, from the end of the run in another folder; processor time in s."""
+    run, spent = Run(folder, {**dataclasses.asdict(settings), **about}), folder / "seconds.json"
+    done = read_json(spent)["seconds"] if spent.exists() else 0.0
+    trained, start = camera(lens, settings), time.process_time()
+    trained.plan()
+    if start_of is not None:
+        load_state(trained, read_state(start_of / "checkpoint.pt"), start_of)
+    for _ in optimise(trained, pictures, settings, run):
+        write_json(spent, {"seconds": done + time.process_time() - start})
+    return read_json(spent)["seconds"]
+
+
+def restored(lens: Lens, settings: CodesignSettings, folder: Path, build: str, psf: str) -> Camera:
+    """A trained camera with the tolerances of a build."""
+    grade, refocus = BUILDS[build]
+    tested = camera(lens, dataclasses.replace(settings, grade=grade, refocus=refocus))
+    tested.use(psf)
+    tested.plan()  # at the start, so that all trainings have the same PSFs
+    run = Run(folder, read_json(folder / "settings.json"))
+    load_state(tested, run.load(), run.checkpoint)
+    return tested.requires_grad_(False)
+
+
+def tested(lens: Lens, pictures: Pictures, settings: CodesignSettings, folder: Path, build: str, psf: str) -> dict:
+    """Means over the perturbed cameras of a build, their standard deviation, and the least PSNR."""
+    path = folder / f"{_file_name(build)}_{psf}.json"
+    if not path.exists():
+        built = restored(lens, settings, folder, build, psf)
+        of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=16)
+        l1, ratio = errors_as_built(built, pictures, of_test)
+        write_json(path, {"l1": l1.tolist(), "psnr": ratio.tolist()})
+    found = {name: np.array(numbers) for name, numbers in read_json(path).items()}
+    return {
+        **{name: float(numbers.mean()) for name, numbers in found.items()},
+        **{f"{name}_spread": float(numbers.std(ddof=1)) for name, numbers in found.items()},
+        "psnr_least": float(found["psnr"].min()),
+    }
+
+
+def interval(differences: list[float]) -> tuple[float, float]:
+    """Mean and half width of its 95 % confidence interval by Student's t."""
+    count = len(differences)
+    width = student.ppf(0.975, count - 1) * np.std(differences, ddof=1) / np.sqrt(count) if count > 1 else np.nan
+    return float(np.mean(differences)), float(width)
+
+
+def paired(rows: list[dict], build: str, psf: str, measure: str) -> list[float]:
+    """As-built less nominal training, by seed."""
+    found = {(row["training"], row["seed"]): row[measure] for row in rows if (row["build"], row["psf"]) == (build, psf)}
+    seeds = [seed for training, seed in found if training == build and ("nominal", seed) in found]
+    return [found[build, seed] - found["nominal", seed] for seed in seeds]
+
+
+def table(rows: list[dict]) -> str:
+    """The table of the page."""
+    lines = [
+        "| perturbed cameras | PSFs of the test | seeds | PSNR, nominal training | as-built training | "
+        "difference (95 %) | L¹, nominal | as-built | difference (95 %) |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for build, psf in dict.fromkeys((row["build"], row["psf"]) for row in rows):
+        each = {name: paired(rows, build, psf, name) for name in MEASURES}
+        if not each["l1"]:
+            continue
+        words = [build, psf, str(len(each["l1"]))]
+        for name, form in (("psnr", ".3f"), ("l1", ".5f")):
+            of = [r for r in rows if (r["build"], r["psf"]) == (build, psf)]
+            for training in ("nominal", build):
+                words.append(f"{np.mean([r[name] for r in of if r['training'] == training]):{form}}")
+            mean, width = interval(each[name])
+            words.append(f"{mean:+{form}} ± {width:{form}}")
+        lines.append("| " + " | ".join(words) + " |")
+    return "\n".join(lines)
+
+
+def figure(rows: list[dict]):
+    """Difference of PSNR of every seed, with the mean and its interval, by build."""
+    builds = [b for b in BUILDS if paired(rows, b, "gaussian", "psnr")]
+    drawn = new_figure(6.4, 3.2)
+    for panel, (measure, label) in zip(drawn.subplots(1, 2), MEASURES.items(), strict=True):
+        for number, build in enumerate(builds):
+            values = paired(rows, build, "gaussian", measure)
+            mean, width = interval(values)
+            panel.plot([number - 0.15] * len(values), values, "o", ms=3.5, color=GREY)
+            panel.errorbar(number + 0.1, mean, width, fmt="s", capsize=4, ms=5, color=FIELD_COLOURS[number])
+        panel.axhline(0, color=GREY, linewidth=0.8, linestyle=":")
+        panel.set_xticks(range(len(builds)), [b.replace(", ", ",\n") for b in builds], fontsize=8)
+        panel.set(xlim=(-0.5, len(builds) - 0.5), ylabel=f"as-built less nominal training: {label}")
+    return drawn
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("lens")
+    parser.add_argument("--data", required=True, help="folder of pictures")
+    parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
+    parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the trainings")
+    parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
+    parser.add_argument("--start", type=int, default=4, help="epochs of the common start")
+    parser.add_argument("--seconds", type=float, default=15.0, help="processor time of a training from there")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--builds", nargs="+", default=["precision", "commercial"], choices=[*BUILDS])
+    parser.add_argument("--check", action="store_true", help="test with DRT PSFs as well")
+    chosen = parser.parse_args(words)
+    torch.set_num_threads(1)
+    prepare()
+    lens = as_lens(chosen.lens, "the study")
+    pictures = read(files(chosen.data, chosen.limit), least=BASE.patch + BASE.size - 1)
+    of_training, of_test = split(pictures)
+    about = {"lens": chosen.lens, "pictures": digest(pictures.samples)}
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    measured = chosen.folder / "steps.json"
+    costs = read_json(measured) if measured.exists() else {}
+    trainings = ["nominal", *chosen.builds]
+    for training in trainings:
+        if training not in costs:
+            costs[training] = step_seconds(lens, of_training, settings_of(training, 0))
+            write_json(measured, costs)
+            print(f"{training}: {costs[training]:.3f} s a step", flush=True)
+    per_epoch, spent = steps_per_epoch(of_training, BASE), {}
+    for seed in range(chosen.seeds):
+        start = chosen.folder / f"start_{seed}"
+        settings = dataclasses.replace(settings_of("nominal", seed), epochs=chosen.start, decay="none")
+        train_one(lens, of_training, settings, start, about)
+        for training in trainings:
+            epochs = max(1, round(chosen.seconds / costs[training] / per_epoch))
+            settings = dataclasses.replace(settings_of(training, seed), epochs=epochs)
+            folder = chosen.folder / f"{_file_name(training)}_{seed}"
+            seconds = train_one(lens, of_training, settings, folder, about, start)
+            spent[training, seed] = (settings, folder, epochs * per_epoch, seconds)
+            print(f"{training}, seed {seed}: {epochs * per_epoch} steps, {seconds:.0f} s", flush=True)
+        rows = _rows(lens, of_test, spent, chosen)
+        print(table(rows), flush=True)
+    if chosen.docs:
+        with open(chosen.docs / "codesign_as_built.csv", "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+        figure(rows).savefig(chosen.docs / "codesign_as_built.png", dpi=150, bbox_inches="tight")
+
+
+def _file_name(words: str) -> str:
+    return words.replace(", ", "_").replace(" ", "_")
+
+
+def _rows(lens: Lens, pictures: Pictures, spent: dict, chosen: argparse.Namespace) -> list[dict]:
+    """A row for each finished training, build and PSF of the test."""
+    rows = []
+    for build in chosen.builds:
+        for psf in ("gaussian", "drt") if chosen.check else ("gaussian",):
+            for (training, seed), (settings, folder, steps, seconds) in spent.items():
+                if training in ("nominal", build):
+                    means = tested(lens, pictures, settings, folder, build, psf)
+                    row = {"build": build, "psf": psf, "training": training, "seed": seed}
+                    rows.append({**row, "steps": steps, "seconds": seconds, **means})
+    return rows
+
+
+if __name__ == "__main__":
+    main()
