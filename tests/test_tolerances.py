@@ -456,7 +456,12 @@ def test_a_trial_is_the_same_in_any_batch():
 
 @pytest.mark.parametrize(
     ("distribution", "variance"),
-    [("normal", None), ("uniform", 1 / 3), ("parabolic", 3 / 5), ("end_points", 1.0)],
+    [
+        ("normal", None),
+        pytest.param("uniform", 1 / 3, marks=pytest.mark.slow),
+        pytest.param("parabolic", 3 / 5, marks=pytest.mark.slow),
+        ("end_points", 1.0),
+    ],
 )
 def test_errors_have_their_distribution(distribution, variance):
     row = T("thickness", (1,), 1.0, 3.0, distribution=distribution, sigmas=1.5)

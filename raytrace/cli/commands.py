@@ -811,6 +811,7 @@ COMMANDS = (
         ),
         run=_tolerance,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),
     Command(
