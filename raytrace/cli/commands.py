@@ -141,11 +141,10 @@ def _tolerance(arguments: argparse.Namespace):
     from raytrace.cli.run import CommandError, catalogs, printed_on_failure, result_of_lens, say
     from raytrace.shards import share
 
-    values = dict(vars(arguments))
-    folder = values.pop("save_trials")
+    folder = arguments.save_trials
     if folder and arguments.trials == 0:
         raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
-    result = result_of_lens(argparse.Namespace(**values))
+    result = result_of_lens(arguments)
     if folder and not share().rank:
         folder = f"{folder}{getattr(arguments, 'suffix', '')}"
         with printed_on_failure(result, arguments):

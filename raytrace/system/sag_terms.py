@@ -17,14 +17,13 @@ PolynomialSag and, for the compiled trace, all but splines to PowerSag, by linea
 import dataclasses
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import Sag, degree, polynomial_xy, powers, shifted, zernike_to_powers
+from raytrace.maths.bivariate import Sag, degree, polynomial_xy, powers, round_power, shifted, zernike_to_powers
 from raytrace.maths.numerics import broadcast_shape, polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
@@ -490,9 +489,9 @@ def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> Polynomia
     """A sum of powers with Σ_n a_n (x² + y²)^n added; coefficients: (m,) a_1, a_2, … in mm^(1-2n)."""
     radius, highest = sag_terms.radius, 2 * len(coefficients)
     even = {
-        (2 * (n - j), 2 * j): a * radius ** (2 * n) * math.comb(n, j)
+        power: a * radius ** (2 * n) * factor
         for n, a in enumerate(coefficients.unbind(0), 1)
-        for j in range(n + 1)
+        for power, factor in round_power(n).items()
     }
     order = powers(max(len(sag_terms.coefficients), highest * (highest + 3) // 2))
     zero = torch.zeros_like(radius)
