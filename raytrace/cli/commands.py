@@ -447,16 +447,18 @@ COMMANDS = (
         "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
         "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
         "optimised; the best are converged, and the search hops on from the best minima. --insert instead adds an "
-        "element: a thin meniscus at a surface is a saddle point that leads to new minima. -o stores every minimum as "
-        "a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
+        "element: a thin meniscus at a surface is a saddle point that leads to new minima. --as-built orders the "
+        "minima by the merit with the expected spot of the manufactured lens, and lists both. -o stores every minimum "
+        "as a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
         "Ctrl-C stops and keeps the minima found. Processes share the work: "
         "torchrun --nproc-per-node 2 -m raytrace search …",
         """
         lens.zmx --starts 200 --seconds 60 -o minima
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
+        cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
         group("extent", parameters(
             "search", "starts", "insert", "seconds", "seed",
             starts={"help": "initial designs (default 64)"},
