@@ -137,6 +137,22 @@ def _convert(arguments: argparse.Namespace):
     return _with_catalogs(arguments, source=find_lens(arguments.source))
 
 
+def _tolerance(arguments: argparse.Namespace):
+    from raytrace.cli.run import CommandError, catalogs, printed_on_failure, result_of_lens, say
+    from raytrace.shards import share
+
+    folder = arguments.save_trials
+    if folder and arguments.trials == 0:
+        raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
+    result = result_of_lens(arguments)
+    if folder and not share().rank:
+        folder = f"{folder}{getattr(arguments, 'suffix', '')}"
+        with printed_on_failure(result, arguments):
+            result.save_trials(folder, catalogs=catalogs(arguments))
+        say(f"written: typical.zmx, worst.zmx and best.zmx in {folder}")
+    return result
+
+
 def _bench(arguments: argparse.Namespace):
     # Benchmarks are a layer above the commands, so the import is dynamic.
     return importlib.import_module("raytrace.bench.command").run(arguments)
@@ -786,9 +802,15 @@ COMMANDS = (
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
+        double_gauss --grade commercial --save-trials built
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
+        option(
+            "--save-trials", metavar="FOLDER", type=folder_name,
+            help="write the lenses of the typical, the worst and the best trial there, as .zmx files",
+        ),
+        run=_tolerance,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
         model={"choices": ("gaussian", "drt"), "help": "PSFs of psf: gaussian (default), smooth in the errors, or drt"},
         pixel="pixel pitch of psf (default 0.005)", size="pixels across the windows of psf (default 21)",

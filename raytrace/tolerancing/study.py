@@ -17,6 +17,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ import torch
 from scipy.special import ndtr
 from torch import Tensor
 
+from raytrace.io import write_lens
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.sampling import gauss_rings
@@ -225,12 +227,13 @@ def is_plain_sensor(surface: Surface) -> bool:
 
 
 def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tensor) -> Lens:
-    """The lens with compensators moved by (L, C)."""
+    """The lens with compensators moved by (C,), or L lenses with those moved by (L, C)."""
     surfaces = list(lens.surfaces)
     for one, change in zip(compensators, changes.unbind(-1), strict=True):
+        change = change.reshape(-1, 1, 1, 1) if change.dim() else change
         surface = modelled(surfaces[one.surface], one.parameter)
         path = path_of(surface, one.parameter)
-        surfaces[one.surface] = with_number(surface, path, number_at(surface, path) + change.reshape(-1, 1, 1, 1))
+        surfaces[one.surface] = with_number(surface, path, number_at(surface, path) + change)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
@@ -355,6 +358,60 @@ class Toleranced(Result):
         """How many trials have a compensator, by its number from 0, at one of its limits."""
         one, moved = self.tolerances.compensators[number], self.changes[:, number]
         return int(((moved <= one.minimum) | (moved >= one.maximum)).sum())
+
+    def trial(self, number: int) -> Lens:
+        """The lens of a trial, by its number from 0: perturbed, its compensators moved; a note has its criterion.
+
+        Its numbers are those that were fabricated: it has no variables, solves and tolerances. Raises ValueError for a
+        trial that was not traced.
+        """
+        if not 0 <= number < len(self.trials):
+            raise ValueError(f"trial {number}: expected 0 to {len(self.trials) - 1}, as {len(self.trials)} were traced")
+        errors = draw_errors(self.tolerances, 1, self.seed, first=number)[0]
+        lens = Perturbation(self.lens, self.tolerances)(errors)
+        lens = with_changes(lens, self.tolerances.compensators, self.changes[number])
+        figure = float(self.trials[number])
+        stated = "no light" if math.isnan(figure) else f"{self.criterion} {figure:.6g} {self.unit}".rstrip()
+        data = lens.optimization_data
+        data = data and dataclasses.replace(data, variables=(), solves=(), kept=(), tolerances=())
+        notes = (*lens.notes, f"As built: trial {number} of seed {self.seed}, {stated}")
+        return dataclasses.replace(lens, notes=notes, optimization_data=data)
+
+    @property
+    def typical(self) -> int:
+        """The number of the trial nearest to the median of those that light arrives in."""
+        good = self._arrived()
+        return int((good - good[good.isfinite()].median()).abs().nan_to_num(torch.inf).argmin())
+
+    @property
+    def worst_trial(self) -> int:
+        """The number of the trial with the worst criterion of those that light arrives in."""
+        return int((self.sign * self._arrived()).nan_to_num(-torch.inf).argmax())
+
+    @property
+    def best_trial(self) -> int:
+        """The number of the trial with the best criterion."""
+        return int((self.sign * self._arrived()).nan_to_num(torch.inf).argmin())
+
+    def _arrived(self) -> Tensor:
+        """The trials. Raises ValueError where light arrives in none."""
+        if not bool(self.trials.isfinite().any()):
+            reason = "no light arrives in any trial" if len(self.trials) else "no trials; give `trials` above 0"
+            raise ValueError(f"no typical trial and no worst one: {reason}")
+        return self.trials
+
+    def save_trials(self, folder: str | PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
+        """Write the lenses of three trials: typical.zmx, worst.zmx and best.zmx, which replace those of another study.
+
+        Glasses with index errors are in catalogs beside them, as worst-melts.agf. The folder is made. catalogs: the
+        glass catalogs (.agf) that the lens was read with. Raises ValueError without trials, LensFileError for a lens
+        that a .zmx file cannot hold.
+        """
+        lenses = [self.trial(k) for k in (self.typical, self.worst_trial, self.best_trial)]
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, lens in zip(("typical", "worst", "best"), lenses, strict=True):
+            write_lens(lens, folder / f"{name}.zmx", catalogs=catalogs)
 
     def columns(self) -> dict[str, Tensor]:
         order = self.worst
