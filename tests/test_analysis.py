@@ -419,6 +419,20 @@ def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
     assert capsys.readouterr().out.split()[0] == "field"
 
 
+def test_through_focus_counts_its_sensor_distances():
+    seen = []
+
+    def progress(work, unit):
+        for step in work:
+            yield step
+            seen.append(unit)
+
+    found = rt.mtf("singlet", 20, through_focus=0.1, fields=[0, 5], geometric=True, progress=progress)
+    assert seen == ["sensor distance"] * found.tangential.numel()
+    alone = rt.mtf("singlet", 20, through_focus=0.1, fields=[5], geometric=True)
+    torch.testing.assert_close(found.tangential[:, 1:], alone.tangential, rtol=1e-12, atol=0)
+
+
 def test_through_focus_needs_one_frequency(capsys):
     assert main(["mtf", "double_gauss", "--through-focus", "0.1"]) == 1
     assert "--frequency" in capsys.readouterr().err

@@ -16,7 +16,6 @@ import hardcases_wave
 import pytest
 import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
-from problems import both_engines
 
 from raytrace.materials.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
 from raytrace.tracing.wavefront import path_to_reference_sphere
@@ -37,8 +36,23 @@ def of_kind(kind: str) -> list:
     return [pytest.param(case, id=f"{kind}-{case['id']}") for case in CASES if case["kind"] == kind]
 
 
-@both_engines
-@pytest.mark.parametrize("case", [case for kind in dict.fromkeys(c["kind"] for c in CASES) for case in of_kind(kind)])
+def by_engine() -> list:
+    """Parameters of a test: all cases by both engines, the dearest of those by torch alone in the slow suite."""
+    listed = [case for kind in dict.fromkeys(c["kind"] for c in CASES) for case in of_kind(kind)]
+    dearest = "property-A7-d-gradcheck", "eager"
+    return [
+        pytest.param(
+            *case.values,
+            engine,
+            id=f"{case.id}-{engine}",
+            marks=pytest.mark.slow if (case.id, engine) == dearest else (),
+        )
+        for engine in ("eager", "compiled")
+        for case in listed
+    ]
+
+
+@pytest.mark.parametrize(("case", "engine"), by_engine(), indirect=["engine"])
 def test_hard_case(case, engine):
     check(case)
 

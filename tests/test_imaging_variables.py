@@ -130,6 +130,7 @@ def test_bounds_of_the_solved_number_are_a_penalty(lens):
     assert focal_length(variables()) == pytest.approx(focal_length(lens), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
     """With so little room for the spaces about the stop that the solved space is at an end of its bounds."""
     bounds = "thickness_2:0.1,1.5 thickness_9:0.1,1.5 thickness_5:14.2,14.3 thickness_6:12.4,12.5"

@@ -258,7 +258,7 @@ def seen(lens: rt.Lens) -> torch.Tensor:
 FUNCTIONS = {"spots": spot_sizes, "psf": sharpness, "image": seen}
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", ["spots", pytest.param("psf", marks=pytest.mark.slow), "image"])
 def test_any_function_of_a_lens_is_a_row(name):
     """A spot, a kernel of waves, a blurred picture: value and derivatives, solves and pickups among the numbers."""
     lens, function = rt.read_lens("cooke_triplet"), FUNCTIONS[name]

@@ -141,6 +141,7 @@ def test_derivative_of_drt_comes_near_that_of_the_converged_kernel(kind):
     assert errors[1] < 0.4 * errors[0]
 
 
+@pytest.mark.slow
 def test_derivative_of_the_transmitted_light_follows_the_edge_of_the_pupil():
     """Energy and σ² of `gaussian` at order 4 against differences at order 12: their own accuracy is 1e-6 here."""
 

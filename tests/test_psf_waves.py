@@ -259,7 +259,7 @@ def test_gradients_with_rays_vignetted(model, name):
     assert (derivative - difference).abs().max() <= 1e-5 * difference.abs().max()
 
 
-@pytest.mark.parametrize("model", WAVES)
+@pytest.mark.parametrize("model", ["fourier", pytest.param("wave", marks=pytest.mark.slow)])
 def test_transforms_of_torch_func_give_the_same_derivative(model):
     def total(curvature):
         return small_kernel(model, curvature=curvature).square().sum()

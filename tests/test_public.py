@@ -324,7 +324,10 @@ def assert_alike(one, other) -> None:
 NEEDED = {"tolerance": {"limits": "radius=0.1%", "trials": 20}}
 
 
-@pytest.mark.parametrize("command", OF_A_LENS, ids=lambda command: command.name)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name == "compare" else ()) for c in OF_A_LENS],
+)
 def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
     """As JSON by the function itself; as text the result already computed."""
     needed = NEEDED.get(command.name, {})

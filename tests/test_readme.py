@@ -16,6 +16,7 @@ OVERVIEW = (ROOT / "docs" / "reference" / "overview.md").read_text(encoding="utf
 PYTHON = [
     ROOT / "README.md",
     *(ROOT / "docs" / "reference" / f"{name}.md" for name in ("lens_files", "rays", "psf", "learning")),
+    *(ROOT / "docs" / f"{name}.md" for name in ("merit", "opticstudio")),
 ]
 #: Pages of every public name with an example each.
 API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))

@@ -87,6 +87,7 @@ def test_starts_are_spread_evenly_and_are_the_same_in_any_order(plate):
     assert np.array_equal(counts, np.full_like(counts, 8))  # a net: as many in each eighth
 
 
+@pytest.mark.slow
 def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeypatch):
     steep = plates(1.8, diameter=36.0, fields=(0.0, 25.0))
     for k, c in ((1, -0.05), (2, -0.06)):

@@ -31,7 +31,7 @@ from raytrace.tracing.compiled import prepare
 
 BASE = CodesignSettings(
     vary="curvature:1-3,5,7,9-11 sensor", hold="efl", noise=0.02, width=16, batch=16, patch=32,
-    rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=16,
+    start="57.59", rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=16,
 )  # fmt: skip
 #: What cameras are built with: (grade, refocus).
 BUILDS = {
@@ -105,7 +105,7 @@ def restored(lens: Lens, settings: CodesignSettings, folder: Path, build: str, p
 
 def tested(lens: Lens, pictures: Pictures, settings: CodesignSettings, folder: Path, build: str, psf: str) -> dict:
     """Means over the perturbed cameras of a build, their standard deviation, and the least PSNR."""
-    path = folder / f"{_file_name(build)}_{psf}.json"
+    path = folder / f"{file_name(build)}_{psf}.json"
     if not path.exists():
         built = restored(lens, settings, folder, build, psf)
         of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=16)
@@ -171,8 +171,7 @@ def figure(rows: list[dict]):
     return drawn
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lens")
     parser.add_argument("--data", required=True, help="folder of pictures")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
@@ -183,6 +182,11 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--builds", nargs="+", default=["precision", "commercial"], choices=[*BUILDS])
     parser.add_argument("--check", action="store_true", help="test with DRT PSFs as well")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     prepare()
@@ -207,7 +211,7 @@ def main(words: list[str] | None = None) -> None:
         for training in trainings:
             epochs = max(1, round(chosen.seconds / costs[training] / per_epoch))
             settings = dataclasses.replace(settings_of(training, seed), epochs=epochs)
-            folder = chosen.folder / f"{_file_name(training)}_{seed}"
+            folder = chosen.folder / f"{file_name(training)}_{seed}"
             seconds = train_one(lens, of_training, settings, folder, about, start)
             spent[training, seed] = (settings, folder, epochs * per_epoch, seconds)
             print(f"{training}, seed {seed}: {epochs * per_epoch} steps, {seconds:.0f} s", flush=True)
@@ -221,7 +225,7 @@ def main(words: list[str] | None = None) -> None:
         figure(rows).savefig(chosen.docs / "codesign_as_built.png", dpi=150, bbox_inches="tight")
 
 
-def _file_name(words: str) -> str:
+def file_name(words: str) -> str:
     return words.replace(", ", "_").replace(" ", "_")
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -159,6 +159,7 @@ def mtf(
     through_focus: float | None = None,
     fields: Points = None,
     wavelengths: Numbers = None,
+    progress: Callable | None = None,
 ) -> Mtf | ThroughFocusMtf:
     """MTF at frequencies (K,) cycles/mm, by default 41 of `frequency_range`; of diffraction, or geometric:
 
@@ -170,8 +171,9 @@ def mtf(
     to change by at most 1e-3 at every frequency: that field is geometric, as `by_rays` reports. The wavelengths' OTFs
     add by weight and transmitted light, each at its own place on the sensor: lateral colour counts. frequencies:
     cycles/mm, by default 41 from 0 to the resolution of the sharpest field, at most half of the diffraction cutoff;
-    through_focus: move the sensor by ± this, mm, at one frequency. fields: y or (x, y); wavelengths: µm. Raises
-    ValueError where too few rays arrive or the blur is too large.
+    through_focus: move the sensor by ± this, mm, at one frequency; progress, such as tqdm, is then called with (work,
+    unit) and returns the iterable. fields: y or (x, y); wavelengths: µm. Raises ValueError where too few rays arrive or
+    the blur is too large.
     """
     if lens.count is not None and not (geometric and through_focus is None and frequencies is not None):
         message = "a batch of lenses has the geometric MTF alone: give `frequencies` and `geometric=True`"
@@ -183,7 +185,7 @@ def mtf(
         if asked is None or len(asked) != 1:
             raise ValueError("`through_focus` needs one spatial frequency: give `frequencies`")
         distances = lens.surfaces[-2].thickness + through_focus * torch.linspace(-1, 1, _DISTANCES, **like(lens))
-        return _through_focus(lens, fields, asked, distances, choice)
+        return _through_focus(lens, fields, asked, distances, choice, progress)
     given = frequency_range(lens, fields, _FREQUENCIES) if asked is None else asked
     return _mtf(lens, fields, given, choice, marked=asked is not None)
 
@@ -257,23 +259,23 @@ def _change_by_diffraction(scene: Scene, frequencies: Tensor, both: tuple[Tensor
 
 
 def _through_focus(
-    lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, choice: Tensor | None
+    lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, choice: Tensor | None, progress: Callable | None
 ) -> ThroughFocusMtf:
     """The MTF at each sensor distance (S,). A beam is aimed and traced once: for the `Memo` of a field the sensor
     distance is a variable, so that rays are stored in front of the sensor."""
     wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
     constant = not any(varies(number) for number in pytree.tree_leaves((lens, fields, frequency)))
-    tangential, sagittal, by_rays = [], [], []
+    work = [(f, distance) for f in range(len(wanted)) for distance in distances]
+    memo, last, rows = None, None, []
     with torch.no_grad() if constant else contextlib.nullcontext():
-        for field, geometric in zip(fields.split(1, 1), wanted, strict=True):
-            memo, rows = Memo(_BUNDLES), []
-            for distance in distances:
-                sensor = distance.detach().requires_grad_() if constant else distance
-                rows.append(_of_field(with_sensor_distance(lens, sensor), field, geometric, frequency, memo))
-            for column, parts in zip((tangential, sagittal, by_rays), zip(*rows, strict=True), strict=True):
-                column.append(parts)
-    tangential, sagittal = (torch.stack([torch.cat(c)[:, 0] for c in some], -1) for some in (tangential, sagittal))
-    by_rays = torch.tensor(by_rays, device=fields.device).T
+        for f, distance in work if progress is None else progress(work, "sensor distance"):
+            memo, last = (memo if f == last else Memo(_BUNDLES)), f
+            sensor = distance.detach().requires_grad_() if constant else distance
+            moved = with_sensor_distance(lens, sensor)
+            rows.append(_of_field(moved, fields[:, f : f + 1], wanted[f], frequency, memo))
+    shape = len(wanted), len(distances)
+    tangential, sagittal = (torch.cat(c)[:, 0].reshape(shape).T for c in list(zip(*rows, strict=True))[:2])
+    by_rays = torch.tensor([row[2] for row in rows], device=fields.device).reshape(shape).T
     whole = bool(by_rays.all())
     return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, whole, by_rays)
 

@@ -115,6 +115,7 @@ ROWS = {
     "limits": option(
         "limits ± that replace those of the grade or the file, radius=0.1%% thickness=0.02 element_tilt=0.05; index=0 "
         "leaves one out",
+        "NAME=LIMIT",
         nargs="+",
     ),
     "refocus": option(

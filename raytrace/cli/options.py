@@ -269,7 +269,8 @@ MERIT = (
     option(
         "--merit", metavar="KIND", choices=Names(_default_merits),
         help="a default merit function instead of the file's: spot (where rays land), wavefront (path differences), "
-        "angular (directions behind an afocal lens) or mtf",
+        "angular (directions behind an afocal lens) or mtf; further rows of operands come with the file, as "
+        "rt.write_lens stores them",
     ),
     option("--skip-unknown", action="store_true", default=None, help="leave rows of operands that are not known out"),
     option(

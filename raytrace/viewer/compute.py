@@ -21,7 +21,7 @@ from raytrace.analysis.setting import field_range
 from raytrace.analysis.spot_diagram import airy_radius, field_spots
 from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached
-from raytrace.maths.result import masked
+from raytrace.maths.result import masked, plain
 from raytrace.maths.sampling import hexapolar
 from raytrace.plotting import style
 from raytrace.system.configurations import count
@@ -37,15 +37,6 @@ from raytrace.viewer.state import State, shown_fields, word_of
 #: Rays of a fan and of a field in the layout, rings of dots, fields of a curve, frequencies of the MTF.
 FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
 _DIGITS = 5  # of the cross section
-
-
-def plain(numbers) -> list | float | None:
-    """Numbers for JSON; None for nan and infinity."""
-    if isinstance(numbers, Tensor):
-        numbers = numbers.tolist()
-    if isinstance(numbers, list):
-        return [plain(one) for one in numbers]
-    return numbers if math.isfinite(numbers) else None
 
 
 def curves(values: Tensor) -> list:
@@ -132,7 +123,7 @@ def spots_of(lens: Lens, fields: Tensor) -> dict:
     for field in np.moveaxis(scaled, 0, -1):  # (W, P, 2)
         listed.append([dot[~np.isnan(dot[:, 0])].round().astype(int).ravel().tolist() for dot in field])
     return {
-        "rms": plain(1e3 * whole.rms_radius),
+        "rms": plain((1e3 * whole.rms_radius).tolist()),
         "airy": plain(1e3 * float(airy_radius(lens))),
         "half": 1e3 * half,
         "dots": listed,
@@ -143,7 +134,7 @@ def fans_of(lens: Lens, fields: Tensor) -> dict:
     """Ray fans in µm, (F, W, P) each; None where no ray arrives."""
     fan = ray_fan_of(lens, fields, FAN)
     tangential, sagittal = masked(fan.tangential, fan.tangential_valid), masked(fan.sagittal, fan.sagittal_valid)
-    return {"pupil": plain(fan.pupil), "tangential": curves(1e3 * tangential), "sagittal": curves(1e3 * sagittal)}
+    return {"pupil": fan.pupil.tolist(), "tangential": curves(1e3 * tangential), "sagittal": curves(1e3 * sagittal)}
 
 
 def curvature_of(lens: Lens) -> dict:
@@ -151,7 +142,7 @@ def curvature_of(lens: Lens) -> dict:
     fields = field_range(lens, FIELDS)
     found = field_curvature_of(lens, fields)
     tangential, sagittal = (masked(curve, found.valid).T for curve in (found.tangential, found.sagittal))
-    return {"field": plain(fields[1]), "tangential": curves(tangential), "sagittal": curves(sagittal)}
+    return {"field": fields[1].tolist(), "tangential": curves(tangential), "sagittal": curves(sagittal)}
 
 
 def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = False) -> dict:
@@ -159,7 +150,7 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
     frequencies = torch.linspace(0.0, highest, FREQUENCIES, dtype=fields.dtype)
     found = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
     return {
-        "frequency": plain(frequencies),
+        "frequency": frequencies.tolist(),
         "tangential": curves(found.tangential),
         "sagittal": curves(found.sagittal),
         "limit": None if found.limit is None else curves(found.limit),
@@ -206,7 +197,7 @@ def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
     fields = shown_fields(lens)
     found = {
         "fields": [field_label(lens, point) for point in fields.T.tolist()],
-        "wavelengths": plain(lens.wavelengths),
+        "wavelengths": lens.wavelengths.tolist(),
         "field_colours": style.field_colours(fields.shape[1]),
         "wavelength_colours": [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
     }
@@ -291,8 +282,8 @@ def prescription(state: State) -> dict:
     return {
         "name": lens.name,
         "rows": rows,
-        "fields": {"unit": lens.fields.unit, "x": plain(lens.fields.x), "y": plain(lens.fields.y)},
-        "wavelengths": plain(lens.wavelengths),
+        "fields": {"unit": lens.fields.unit, "x": lens.fields.x.tolist(), "y": lens.fields.y.tolist()},
+        "wavelengths": lens.wavelengths.tolist(),
         "primary": lens.primary_wavelength,
         "aperture": {
             "kind": lens.aperture.kind,

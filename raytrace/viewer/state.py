@@ -234,23 +234,19 @@ def _fields_at(lens: Lens, values: Sequence[float]) -> Fields:
 
 def _wavelengths(state: State, event: Mapping) -> State:
     """The primary wavelength and weights stay where the new list has them."""
-    lens = state.lens
-    values = numbers(event["values"], "wavelengths")
-    found = lens.at(wavelengths=values)
+    lens, values = state.lens, numbers(event["values"], "wavelengths")
     weights = dict(zip(lens.wavelengths.tolist(), lens.wavelength_weights.tolist(), strict=True))
     primary = float(lens.primary)
-    found = dataclasses.replace(
-        found,
-        wavelength_weights=lens.wavelength_weights.new_tensor([weights.get(one, 1.0) for one in values]),
+    lens = lens.at(
+        wavelengths=values,
+        wavelength_weights=[weights.get(one, 1.0) for one in values],
         primary_wavelength=1 + values.index(primary) if primary in values else 1,
     )
-    return edited(state, solved(found))
+    return edited(state, solved(lens))
 
 
 def _primary(state: State, event: Mapping) -> State:
-    lens = dataclasses.replace(state.lens, primary_wavelength=int(event["number"]))
-    check(lens)
-    return edited(state, solved(lens))
+    return edited(state, solved(state.lens.at(primary_wavelength=int(event["number"]))))
 
 
 def _aperture(state: State, event: Mapping) -> State:
