@@ -158,7 +158,7 @@ def test_optimize_lowers_the_expectation(cooke):
     assert change.nominal[1] < change.expected[1] < change.expected[0]
     assert robust.merit_after < robust.merit_before
     assert abs(robust.merit_after / float(robust.history[-1, 0]) - 1) < 1e-12
-    assert "as built (of `limits`, 6 tolerances, weight 20): expected" in str(robust)
+    assert "as built (6 tolerances, of `limits`, weight 20): expected" in str(robust)
     assert robust.document()["as_built"]["expected"] == list(change.expected)
     assert usual.as_built is None
 
@@ -199,3 +199,24 @@ def test_errors(cooke):
         rt.optimize(cooke, merit=merit, vary="curvature:1", as_built=rt.AsBuilt("precision"))
     with pytest.raises(TypeError, match="as_built"):
         rt.optimize(cooke, as_built="precision", **spots)
+
+
+def test_search_orders_minima_by_the_merit_as_built(cooke):
+    """The same minima as without, in another order, each with the figures of `optimize`."""
+    lens = cooke.at(f_number=5, fields=[0, 8])
+    settings = {"merit": "spot", "vary": "curvature:1,4 sensor", "hold": "efl=101.2", "starts": 3}
+    as_built = rt.AsBuilt(limits="element_decenter:3=0.2", weight=5.0, rings=2)
+    usual, ranked = rt.search(lens, **settings), rt.search(lens, as_built=as_built, **settings)
+    assert sorted(usual.merit.tolist()) == sorted(ranked.merit.tolist())
+    merit, expected, nominal = ranked.as_built.unbind(-1)
+    assert (merit.diff() >= 0).all()
+    for k, one in enumerate(ranked.lenses[:2]):
+        end = rt.optimize(one, merit="spot", vary="sensor", cycles=0, as_built=as_built)
+        assert abs(float(merit[k]) / end.merit_before - 1) < 1e-9
+        assert abs(float(expected[k]) / end.as_built.expected[0] - 1) < 1e-12
+        assert abs(float(nominal[k]) / end.as_built.nominal[0] - 1) < 1e-12
+    assert "merit_as_built" in ranked.columns()
+    assert "in the order of the merit as built: of `limits`, weight 5" in str(ranked)
+    assert usual.as_built is None
+    with pytest.raises(rt.BadTolerance, match="no tolerances of its own"):
+        rt.search(lens, as_built=rt.AsBuilt(), **settings)

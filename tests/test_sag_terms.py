@@ -8,7 +8,7 @@ import torch
 from differences import gradcheck, gradgradcheck
 from problems import lens, points, surface, vector
 
-from raytrace.io import write_lens
+from raytrace.io import read_lens, write_lens
 from raytrace.io.source import LensFileError
 from raytrace.maths import zernike
 from raytrace.maths.numerics import to
@@ -17,7 +17,7 @@ from raytrace.psf_models import model_of, psf
 from raytrace.system.intersection import intersect, normal
 from raytrace.system.lens import media
 from raytrace.system.rays import start
-from raytrace.system.sag_terms import GridSag, Relief, ZernikeSag, relief, spline
+from raytrace.system.sag_terms import GridSag, Relief, ZernikeSag, about_vertex, relief, spline
 from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -336,10 +336,17 @@ def test_paraxial_power_sees_the_mean_curvature_of_the_vertex():
         assert float(first_order(singlet(sag_terms)).effective_focal_length) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["lens.csv", "lens.zmx"])
-def test_no_file_holds_a_sag_terms(name, tmp_path):
+def test_no_table_holds_sag_terms(tmp_path):
     with pytest.raises(LensFileError, match=r"surface 1.*[zZ]ernike ?[sS]ag"):
-        write_lens(singlet(bumpy()), tmp_path / name)
+        write_lens(singlet(bumpy()), tmp_path / "lens.csv")
+
+
+def test_a_file_of_opticstudio_holds_noll_s_polynomials_as_powers(tmp_path):
+    write_lens(singlet(bumpy()), tmp_path / "lens.zmx")
+    found = read_lens(tmp_path / "lens.zmx").surfaces[1].sag_terms
+    polynomial, _ = about_vertex(bumpy())
+    assert found.coefficients.equal(polynomial.coefficients)
+    assert found.radius.equal(polynomial.radius)
 
 
 def test_sag_by_radius_alone_is_refused():

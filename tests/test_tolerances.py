@@ -12,7 +12,7 @@ from problems import number
 import raytrace as rt
 from raytrace.materials.environment import Environment, index_in
 from raytrace.materials.glass import LINES, InvalidIndex, abbe_number, index, model_glass, with_index_errors
-from raytrace.system.poses import undone
+from raytrace.system.poses import Pose, pose_of, rows_along, undone
 from raytrace.system.sag_terms import FringeSag, GridSag, PolynomialSag, TiltSag, ZernikeSag, spline
 from raytrace.system.surface import sag_at
 from raytrace.system.tolerance_data import KINDS
@@ -77,12 +77,18 @@ def nominal(tmp_path):
     return read(tmp_path, *blocks())
 
 
-def hits(lens, start=None):
-    """Position and direction (6, ...) on the sensor of rays that start as those of another lens."""
+def hits(lens, start=None, shift=0.0):
+    """Position and direction (6, ...) on the sensor of rays that start as those of another lens.
+
+    shift: mm along z of the axes in front of surface 1, relative to those of the other lens.
+    """
     start = lens if start is None else start
     points = torch.tensor([[0.0, 0.3, -0.8], [0.0, 0.7, -0.4]], dtype=torch.float64)
     fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
     rays = launch(start, points, fields=fields, wavelengths=start.wavelengths)
+    rays = dataclasses.replace(
+        rays, position=rays.position - torch.tensor([0, 0, shift], dtype=torch.float64)[:, None, None, None]
+    )
     end = trace_lens(lens, rays, start.wavelengths[:, None])
     assert end.valid.all()
     return torch.cat([end.position, end.direction])
@@ -149,7 +155,10 @@ def test_elements_move_inside_groups_and_surfaces_inside_elements(nominal, tmp_p
         *(back(*MOVE, thickness=2.5), standard(0.0, -12.0, 0.0, 8.0), back(*group, thickness=12.0)),
         standard(0.0, 40.0, 0.0, 7.0),
     )
-    close(hits(found, nominal), hits(explicit, nominal))
+    # the object at infinity stays where it is: rays start from axes that follow the vertex of surface 1
+    group = Pose(*map(number, (-0.3, 0.2)), None, *map(number, (-0.5, 0.9, -2.0)))
+    z = pose_of(rows_along([group, Pose(y=number(-0.25))])).z
+    close(hits(found, nominal, shift=float(z)), hits(explicit, nominal))
 
 
 def test_errors_of_mirrors_between_coordinate_breaks(tmp_path):
@@ -241,6 +250,19 @@ def test_every_kind_of_error_has_a_row_here():
 
 def errors(factor=1.0):
     return factor * torch.tensor([value for _, value in ROWS], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("place", range(len(ROWS)), ids=lambda place: f"{place}-{ROWS[place][0].kind}")
+def test_every_kind_of_error_is_written_and_read_back(place, asphere, tmp_path):
+    found = rt.perturbed(asphere, *zip(*(ROWS[k] for k in sorted({place, 19, 20})), strict=True))
+    rt.write_lens(found, tmp_path / "lens.zmx")
+    close(hits(rt.read_lens(tmp_path / "lens.zmx")), hits(found), atol=1e-11)
+
+
+def test_all_kinds_of_errors_are_written_and_read_back(asphere, tmp_path):
+    found = rt.perturbed(asphere, *zip(*ROWS, strict=True))
+    rt.write_lens(found, tmp_path / "lens.zmx")
+    close(hits(rt.read_lens(tmp_path / "lens.zmx")), hits(found), atol=1e-11)
 
 
 def test_no_error_is_the_nominal_lens(asphere):
@@ -484,6 +506,14 @@ def test_rows_of_a_group_share_an_rms():
 def test_a_tolerance_that_the_lens_does_not_have_is_refused(row, message, nominal):
     with pytest.raises(rt.BadTolerance, match=message):
         rt.perturbed(nominal, [row], [0.0])
+
+
+def test_elements_that_share_a_cemented_surface_are_refused_with_the_fix(nominal):
+    message = (
+        r"shares the cemented surface 2 with 1-2 .* tolerance the cemented group \(1, 3\), or the surfaces \(3, 3\)"
+    )
+    with pytest.raises(rt.BadTolerance, match=message):
+        rt.perturbed(nominal, [*element(1, 2), *element(2, 3)], torch.zeros(10))
 
 
 def test_elements_that_share_a_part_are_refused(nominal):
@@ -809,3 +839,19 @@ def sensor_of(lens, rows):
     fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
     rays = launch(lens, points, fields=fields, wavelengths=lens.wavelengths)
     return lambda values: trace_lens(rt.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]).position[:2]
+
+
+def test_lines_behind_the_configurations_are_read(tmp_path):
+    source = Path(__file__).parents[1] / "lenses" / "cooke_triplet.zmx"
+    lines = [
+        "MNUM 1 1",
+        'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""',
+        "TOL COMP 7 0 -1 1 0 0 0",
+        "TOL TTHI 2 4 -0.02 0.02 0 0 0",
+    ]
+    file = tmp_path / "triplet.zmx"
+    file.write_text(source.read_text() + "\n".join(lines) + "\n")
+    found = rt.read_tolerances(file)
+    assert [row.kind for row in found] == ["thickness"]
+    assert [(one.surface, one.parameter, one.maximum) for one in found.compensators] == [(7, "thickness", 1.0)]
+    assert not found.unread

@@ -137,6 +137,22 @@ def _convert(arguments: argparse.Namespace):
     return _with_catalogs(arguments, source=find_lens(arguments.source))
 
 
+def _tolerance(arguments: argparse.Namespace):
+    from raytrace.cli.run import CommandError, catalogs, printed_on_failure, result_of_lens, say
+    from raytrace.shards import share
+
+    folder = arguments.save_trials
+    if folder and arguments.trials == 0:
+        raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
+    result = result_of_lens(arguments)
+    if folder and not share().rank:
+        folder = f"{folder}{getattr(arguments, 'suffix', '')}"
+        with printed_on_failure(result, arguments):
+            result.save_trials(folder, catalogs=catalogs(arguments))
+        say(f"written: typical.zmx, worst.zmx and best.zmx in {folder}")
+    return result
+
+
 def _bench(arguments: argparse.Namespace):
     # Benchmarks are a layer above the commands, so the import is dynamic.
     return importlib.import_module("raytrace.bench.command").run(arguments)
@@ -431,16 +447,18 @@ COMMANDS = (
         "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
         "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
         "optimised; the best are converged, and the search hops on from the best minima. --insert instead adds an "
-        "element: a thin meniscus at a surface is a saddle point that leads to new minima. -o stores every minimum as "
-        "a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
+        "element: a thin meniscus at a surface is a saddle point that leads to new minima. --as-built orders the "
+        "minima by the merit with the expected spot of the manufactured lens, and lists both. -o stores every minimum "
+        "as a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
         "Ctrl-C stops and keeps the minima found. Processes share the work: "
         "torchrun --nproc-per-node 2 -m raytrace search …",
         """
         lens.zmx --starts 200 --seconds 60 -o minima
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
+        cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM,
+        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
         group("extent", parameters(
             "search", "starts", "insert", "seconds", "seed",
             starts={"help": "initial designs (default 64)"},
@@ -777,17 +795,25 @@ COMMANDS = (
     _command(
         "tolerance",
         "the lens as built: sensitivities, expectation and Monte Carlo",
-        "Change of a criterion (RMS spot radius or wavefront, MTF) by every tolerance at its limits, its mean of the "
-        "lens as built by second derivatives, and its distribution over perturbed and compensated lenses. The "
-        "tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the "
-        "sensor distance unless the file has others.",
+        "Change of a criterion (RMS spot radius or wavefront, MTF, merit, …) by every tolerance at its limits, "
+        "its mean of the lens as built by second derivatives, and its distribution over perturbed and compensated "
+        "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the "
+        "compensator is the sensor distance unless the file has others.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
+        double_gauss --grade commercial --save-trials built
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
+        option(
+            "--save-trials", metavar="FOLDER", type=folder_name,
+            help="write the lenses of the typical, the worst and the best trial there, as .zmx files",
+        ),
+        run=_tolerance,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        model={"choices": ("gaussian", "drt"), "help": "PSFs of psf: gaussian (default), smooth in the errors, or drt"},
+        pixel="pixel pitch of psf (default 0.005)", size="pixels across the windows of psf (default 21)",
         limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),

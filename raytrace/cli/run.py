@@ -31,6 +31,7 @@ CONDITIONS = (
 #: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.
 RUNNER_OPTIONS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "spelled"),
+    "save_trials",
     *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
 #: Options that are fields of the parameter `execution`.

@@ -2,6 +2,7 @@
 
 source            text, numbers, records, errors with file, line and surface; the report of every keyword
 assembly          glasses by name; a neutral draft of a lens, checked once for all readers
+melts             glasses with index errors as a catalog beside a lens file
 zemax/            .zmx and .zar of OpticStudio
 codev/            .seq of CODE V
 oslo              .len of OSLO, read
@@ -20,6 +21,7 @@ files in `tests/test_corpus*.py`.
 
 import dataclasses
 import os
+import tempfile
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
@@ -31,6 +33,7 @@ from raytrace.io import oslo, ray_optics
 from raytrace.io.assembly import changes
 from raytrace.io.codev import read as codev_read
 from raytrace.io.codev import write as codev_write
+from raytrace.io.melts import check_catalog, with_melts
 from raytrace.io.source import (
     NONE,
     Draft,
@@ -53,6 +56,7 @@ from raytrace.io.table import write as table_write
 from raytrace.io.zemax import archive as zemax_archive
 from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
+from raytrace.materials.agf import write_agf
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
 from raytrace.maths.numerics import value
@@ -70,7 +74,8 @@ class Format(NamedTuple):
 
     name: in the report; parse: (content, file, report, catalogs) -> Lens; write: (lens, file, catalogs) -> content,
     None for a format that is only read; load: path -> content, text or bytes; configurations: whether a file may hold
-    several, of which `parse` takes the number.
+    several, of which `parse` takes the number; catalogs: whether a file names the catalogs of its glasses, so that
+    glasses with index errors may be those of a catalog beside it.
     """
 
     name: str
@@ -78,6 +83,7 @@ class Format(NamedTuple):
     write: Callable[..., bytes] | None = None
     load: Callable[[Path], str | bytes] = read_text
     configurations: bool = False
+    catalogs: bool = False
 
     def read(
         self,
@@ -99,16 +105,16 @@ class Format(NamedTuple):
         return lens, report.finished(strict=strict)
 
 
-_TEXT_TABLE = Format("table", table_read.read, partial(table_write.write, separator="\t"))
+_TEXT_TABLE = Format("table", table_read.read, partial(table_write.write, separator="\t"), catalogs=True)
 
 #: The formats by suffix, in lower case.
 FORMATS = {
-    ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True),
+    ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True, catalogs=True),
     ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format("seq", codev_read.read, codev_write.write),
     ".len": Format("len", oslo.read),
     ".roa": Format("roa", ray_optics.read, load=read_content),
-    ".csv": Format("table", table_read.read, table_write.write),
+    ".csv": Format("table", table_read.read, table_write.write, catalogs=True),
     ".tsv": _TEXT_TABLE,
     ".txt": _TEXT_TABLE,
 }
@@ -277,6 +283,8 @@ def convert(
 def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
     """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
 
+    Glasses with index errors are written as melts into a glass catalog beside a .zmx file or a table, as
+    worst-melts.agf of worst.zmx, which readers find there (`io.melts`).
     catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
     cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
     and other data that the file does not bring back.
@@ -287,6 +295,26 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     except ValueError as error:
         raise LensFileError(str(error), place) from error
     form = _format(path, WRITTEN)
+    plain, melts = with_melts(lens, path) if form.catalogs else (lens, None)
+    with tempfile.TemporaryDirectory() as folder:
+        if melts is not None:  # as it will be found beside the file
+            beside = Path(folder) / f"{melts.name}.agf"
+            write_agf(melts, beside)
+            catalogs = (beside, *catalogs)
+        content = _checked(form, plain, path, catalogs)
+    try:
+        if melts is not None:
+            beside = path.with_name(f"{melts.name.lower()}.agf")
+            check_catalog(beside, place)
+            write_agf(melts, beside)  # first: a lens that is read finds its glasses
+        write_atomically(path, lambda file: file.write(content))
+    except OSError as error:
+        raise LensFileError(error.strerror or str(error), place) from error
+
+
+def _checked(form: Format, lens: Lens, path: Path, catalogs: Sequence[str | Path]) -> bytes:
+    """The content of the file of a lens, after it was read again; as `write_lens`."""
+    place = Place(str(path))
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
     try:
         again, _ = form.read(decode(content, place), str(path), catalogs=catalogs)
@@ -300,7 +328,4 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     if changed:
         message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
         warnings.warn(message, LensFileWarning, stacklevel=calling_level())
-    try:
-        write_atomically(path, lambda file: file.write(content))
-    except OSError as error:
-        raise LensFileError(error.strerror or str(error), place) from error
+    return content

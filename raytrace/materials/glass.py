@@ -537,26 +537,104 @@ def from_table(
     if len(torch.unique(w)) < len(w):
         raise ValueError(f"a wavelength stands twice in {w.tolist()}: expected one index for each")
     terms, exact = min(len(w), terms, len(_SCHOTT_POWERS)), min(exact, len(w))
-    basis = torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1)
-    if len(w) > terms > exact > 0:  # a = Q (y, z): the first rows decide y, least squares z
-        q, r = torch.linalg.qr(basis[:exact].T, mode="complete")
-        y = torch.linalg.solve_triangular(r[:exact].T, (n * n)[:exact, None], upper=False)
-        rest = basis[exact:] @ q
-        left = (n * n)[exact:, None] - rest[:, :exact] @ y
-        a = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
-        missed = (n * n)[:exact, None] - basis[:exact] @ a[:, None]  # by rounding
-        a = a + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
-    else:
-        a = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
+    a = _meeting(torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1), n * n, exact)
     coefficients = a.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), a)
     return Glass(name, "schott", coefficients, wavelength_range=(float(w.min()), float(w.max())))
 
 
+def _meeting(basis: Tensor, values: Tensor, exact: int) -> Tensor:
+    """a (k,) of basis (m, k) · a = values (m,) by least squares, the first `exact` rows, fewer than k, met exactly."""
+    if not len(values) > basis.shape[1] > exact > 0:
+        return torch.linalg.lstsq(basis, values[:, None]).solution[:, 0]
+    # a = Q (y, z): the first rows decide y, least squares z
+    values, (q, r) = values[:, None], torch.linalg.qr(basis[:exact].T, mode="complete")
+    y = torch.linalg.solve_triangular(r[:exact].T, values[:exact], upper=False)
+    rest = basis[exact:] @ q
+    left = values[exact:] - rest[:, :exact] @ y
+    a = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
+    missed = values[:exact] - basis[:exact] @ a[:, None]  # by rounding
+    return a + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
+
+
+#: Powers of λ in the formula "extended_3", in the order of its coefficients.
+_EXTENDED_POWERS = (0, 2, 4, -2, -4, -6, -8, -10, -12)
+
+#: Largest difference of a melt's index from the index that it stands for, between the wavelengths of a lens.
+MELT_ERROR = 1e-7
+_MARGIN = 0.1  # of the wavelengths of a lens, by which the fit of a melt reaches further
+
+
+class NoMelt(ValueError):
+    """No formula of a catalog comes near the dispersion of a glass with index errors."""
+
+
+def melt(glass: Glass, wavelengths: Tensor) -> Glass:
+    """The medium of a glass with index errors by a formula that lens files hold.
+
+    wavelengths: (W,) µm, those of a lens. A constant index, a model glass and Conrady's formula keep their formula and
+    are the same at all wavelengths. Others are n² = a₀ + a₁ λ² + a₂ λ⁴ + a₃ λ⁻² + … + a₈ λ⁻¹² ("extended_3", status
+    "melt"): the same at up to 9 wavelengths, between them by least squares. A glass without errors passes as it is.
+    Raises NoMelt where the indices differ by more than MELT_ERROR between the wavelengths, or where there is none.
+    """
+    if not glass.formula.endswith(WITH_ERRORS):
+        return glass
+    formula = glass.formula.removesuffix(WITH_ERRORS)
+    own, errors = glass.coefficients[:-_ERRORS], glass.coefficients[-_ERRORS:]
+    if formula == "constant":
+        return dataclasses.replace(glass, formula=formula, coefficients=own + errors[:1])
+    if formula in ("model", "conrady"):
+        return dataclasses.replace(glass, formula=formula, coefficients=_of_three(glass, formula))
+    w = torch.unique(wavelengths.detach().double().cpu())
+    low, high = float(w.min()), float(w.max())
+    span = glass.wavelength_range or (0.0, math.inf)
+    between, error = torch.linspace(low, high, 201, dtype=torch.float64), math.inf
+    for margin in (_MARGIN, 0.0):
+        ends = min(low, max(low * (1 - margin), span[0])), max(high, min(high * (1 + margin), span[1]))
+        found = _extended(glass, w, ends)
+        error = float((refractive_index(found, between) - refractive_index(glass, between)).abs().max())
+        if error <= MELT_ERROR and bool((refractive_index(glass, between) > 0).all()):
+            return found
+    name, reason = glass.name or "a glass", f"a formula differs by {error:.1e}, {MELT_ERROR:.0e} at most is accepted"
+    raise NoMelt(f"{name} with index errors has no melt from {low:g} to {high:g} µm: {reason}")
+
+
+def _of_three(glass: Glass, formula: str) -> Tensor:
+    """The coefficients (3,) of a medium n = A + B/λ + C/λ^3.5: Conrady's, or those of a model glass."""
+    lines = torch.tensor(tuple(MODEL_LINES.values()), dtype=torch.float64)
+    d, blue, red, violet = n = refractive_index(glass, lines)
+    if formula == "conrady":
+        basis = torch.stack([torch.ones_like(lines), 1 / lines, lines**-3.5], -1)
+        return torch.linalg.solve(basis[:3], n[:3])
+    abbe = safe_divide(d - 1, blue - red)
+    return torch.stack([d, abbe, _off_normal_line(violet, blue, red, abbe)])
+
+
+def _extended(glass: Glass, w: Tensor, ends: tuple[float, float]) -> Glass:
+    """The formula "extended_3" for a glass between two wavelengths, µm, exact at w (W,) µm where its terms suffice."""
+    middle = (ends[0] * ends[1]) ** 0.5  # in units of which powers are alike in size
+    nodes = 0.5 * (1 - torch.cos(torch.linspace(0, math.pi, 41, dtype=torch.float64)))
+    met = len(w) == len(_EXTENDED_POWERS)  # by as many terms, without a rest for least squares
+    points = w if met else torch.cat([w, ends[0] + (ends[1] - ends[0]) * nodes])
+    n = refractive_index(glass, points)
+    scaled = torch.stack([(points / middle) ** power for power in _EXTENDED_POWERS], -1)
+    a = _meeting(scaled, n * n, len(w)) / middle ** torch.tensor(_EXTENDED_POWERS, dtype=torch.float64)
+    found = Glass(
+        glass.name, "extended_3", a, wavelength_range=ends, status="melt", listed_name=glass.listed_name,
+        records=glass.records,
+    )  # fmt: skip
+    figures = (float(nd(found)), float(abbe_number(found)))
+    if figures[0] > 0 and 0 < figures[1] < math.inf:
+        found = dataclasses.replace(found, nd_listed=figures[0], abbe_listed=figures[1])
+    return found
+
+
 def normal_line_deviation(glass: Glass) -> Tensor:
     """ΔP_gF = (n_g - n_F)/(n_F - n_C) - 0.6438 + 0.001682 V_d, the number a model glass takes; 0 without dispersion."""
-    violet, blue, red = _at_lines(glass, "gFC")
-    normal = 0.6438 - 0.001682 * abbe_number(glass)
-    return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - normal)
+    return _off_normal_line(*_at_lines(glass, "gFC"), abbe_number(glass))
+
+
+def _off_normal_line(violet: Tensor, blue: Tensor, red: Tensor, abbe: Tensor) -> Tensor:
+    return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - (0.6438 - 0.001682 * abbe))
 
 
 def listing_error(glass: Glass) -> tuple[float, float]:

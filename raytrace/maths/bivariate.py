@@ -29,6 +29,11 @@ def powers(count: int) -> list[tuple[int, int]]:
     return [(n - j, j) for n in degrees for j in range(n + 1)][:count]
 
 
+def round_power(n: int) -> dict[tuple[int, int], int]:
+    """(x² + y²)^n as factors of x^i y^j, by (i, j)."""
+    return {(2 * (n - j), 2 * j): math.comb(n, j) for j in range(n + 1)}
+
+
 def degree(count: int) -> int:
     """The least degree n whose n(n + 3)/2 terms are `count` or more."""
     return math.ceil((math.sqrt(9 + 8 * count) - 3) / 2)

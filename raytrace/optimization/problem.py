@@ -313,6 +313,12 @@ class ExpectationSettings(Protocol):
 
     def of(self, lens: Lens) -> Expectation: ...
 
+    def words(self) -> str: ...
+
+
+class NoLight(ValueError):
+    """An expectation of lenses of which no ray of a field arrives."""
+
 
 class NoProblem(ValueError):
     """An optimisation without variables, rows or light; the message says what is missing."""
@@ -353,6 +359,10 @@ class Problem:
         """The same with rays through a part of the pupil and of the field alone, and without the lens as built."""
         model = dataclasses.replace(self.model, opening=opening)
         return Problem(model, self.rows, self.conditions, **self._settings)
+
+    def with_as_built(self, term: Expectation) -> "Problem":
+        """The same with the lens as built."""
+        return Problem(self.model, self.rows, self.conditions, as_built=term, **self._settings)
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)

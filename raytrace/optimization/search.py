@@ -26,7 +26,15 @@ from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
 from raytrace.optimization.optimize import drawn_fields, opened, refuse_contradictions
-from raytrace.optimization.problem import Condition, NoProblem, Problem, conditions_in_unit, optimization_data_of
+from raytrace.optimization.problem import (
+    Condition,
+    ExpectationSettings,
+    NoLight,
+    NoProblem,
+    Problem,
+    conditions_in_unit,
+    optimization_data_of,
+)
 from raytrace.optimization.saddle_points import Insertion, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
@@ -69,6 +77,9 @@ class Searched(Result):
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
     weights; found: number of followed descents to it; after: processor seconds until the first; tasks: key of that
     one. variables: (M, n). starts, descents: numbers of starts, and of descents that were followed to their end.
+    as_built: (M, 3) the merit with the lens as built, by which the minima then are ordered, nan where a perturbed lens
+    fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused lens without errors;
+    tolerances: of which errors.
     """
 
     before: Lens
@@ -85,6 +96,8 @@ class Searched(Result):
     descents: int
     seconds: float
     stopped: str
+    as_built: Tensor | None = None
+    tolerances: str = ""
 
     @property
     def lens(self) -> Lens:
@@ -96,6 +109,9 @@ class Searched(Result):
         variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
         number = torch.arange(1, len(self.lenses) + 1)
         of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields}
+        if self.as_built is not None:
+            merit, expected, nominal = self.as_built.unbind(-1)
+            of_lens |= {"merit_as_built": merit, "expected_um": 1e3 * expected, "refocused_um": 1e3 * nominal}
         return {**of_lens, "found": self.found, "seconds": self.after, **variables}
 
     def document(self) -> dict:
@@ -108,6 +124,7 @@ class Searched(Result):
             self.before.name,
             f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             f"  found: by how many of the {self.descents} descents that were followed to their end",
+            *([f"  in the order of the merit as built: {self.tolerances}"] if self.as_built is not None else []),
             "",
         ]
         columns = self.columns()
@@ -117,6 +134,11 @@ class Searched(Result):
             if name.startswith("rms_")
         }
         shown = {Column("minimum"): columns["minimum"], Column("merit"): self.merit}
+        if self.as_built is not None:
+            merit, expected, nominal = self.as_built.unbind(-1)
+            shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
+            shown |= {Column("expected", "µm", ".2f", "RMS\nas built"): 1e3 * expected}
+            shown |= {Column("refocused", "µm", ".2f", "RMS\nno errors"): 1e3 * nominal}
         shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.found}
         return [Table(shown, title)]
 
@@ -160,7 +182,14 @@ class Searched(Result):
 
 
 def searched(
-    lens: Lens, each: Sequence[tuple[Problem, Minimum]], *, starts: int, descents: int, stopped: str, seconds: float
+    lens: Lens,
+    each: Sequence[tuple[Problem, Minimum]],
+    *,
+    starts: int,
+    descents: int,
+    stopped: str,
+    seconds: float,
+    as_built: ExpectationSettings | None = None,
 ) -> Searched:
     """The result: minima, the best first, each with its problem. Raises NoProblem without any."""
     if not each:
@@ -168,6 +197,11 @@ def searched(
             f"no lens without failing rays that meets `hold`, from {starts} starts: allow more `starts`, `seconds` or "
             "wider `bounds`, or hold less"
         )
+    terms: list[tuple[float, float, float]] = []
+    if as_built is not None:
+        terms = [_as_built(problem, one, as_built) for problem, one in each[:MOST]]
+        order = sorted(range(len(terms)), key=lambda k: (np.isnan(terms[k][0]), terms[k][0]))
+        each, terms = [each[k] for k in order], [terms[k] for k in order]
     minima, lenses, tables = each[:MOST], [], []
     for k, (problem, one) in enumerate(minima, 1):
         model = problem.model
@@ -195,7 +229,23 @@ def searched(
         descents=descents,
         stopped=stopped,
         seconds=seconds,
+        as_built=tensor(terms) if terms else None,
+        tolerances=as_built.words() if terms else "",
     )
+
+
+def _as_built(problem: Problem, one: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
+    """The merit with the lens as built, and the RMS spot radius in mm expected and without errors, nan where a
+    perturbed lens fails; the tolerances are those of the lens of the minimum."""
+    lens, x = problem.model.lens_at(one.result.x), one.result.x
+    try:
+        term = settings.of(lens)
+    except NoLight:
+        return np.nan, np.nan, np.nan
+    problem = problem.with_as_built(term)
+    with torch.no_grad():
+        spots = [float(q(lens)) ** 0.5 for q in (term.expected, term.nominal)]
+    return problem.merit(problem.evaluated(x), x), *spots
 
 
 def _spots(lens: Lens) -> Tensor:
@@ -257,6 +307,7 @@ def search(
     insert: bool | Sequence[int] | None = None,
     seconds: float | None = None,
     seed: int = 0,
+    as_built: ExpectationSettings | None = None,
     folder: str | PathLike | None = None,
     progress: Callable | None = None,
     share: Share | None = None,
@@ -266,11 +317,15 @@ def search(
     merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
     which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
-    more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. folder: keeps the minima as lens
+    more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. as_built: `AsBuilt`, the expected mean
+    square spot of the manufactured lens: the minima are those of the merit function alone, in the order of the merit
+    with this term; of each lens with the tolerances of its own surfaces. folder: keeps the minima as lens
     files, a table and figures, and the journal: called again the search resumes, with the same result as without the
     interruption. Ctrl-C ends with the minima so far.
-    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
+    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch, BadTolerance.
     """
+    if as_built is not None:
+        as_built.of(lens)  # raises BadTolerance before the search
     if folder is not None:
         check_output_folder(folder)
     prepare()
@@ -309,8 +364,9 @@ def search(
     except KeyboardInterrupt:
         stopped = "interrupted"
     result = searched(
-        lens, run.each(), starts=run.started, descents=run.followed, stopped=stopped, seconds=time.monotonic() - started
-    )
+        lens, run.each(), starts=run.started, descents=run.followed, stopped=stopped,
+        seconds=time.monotonic() - started, as_built=as_built,
+    )  # fmt: skip
     if folder is not None and not (share and share.rank):
         try:
             result.save(folder)

@@ -7,6 +7,7 @@ d = (x, y, z), and R turn about the axes of x, y and z by right-handed angles: O
 and 1. Numbers that are None are not modelled, and cost nothing.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -168,6 +169,22 @@ def pose_of(rows: Rows) -> Pose:
         _angle(xz, across),
         _angle(_negative(xy), xx),
     )
+
+
+def decentred_first(pose: Pose) -> Pose:
+    """The same passage, decentred before it is tilted; tilts as those of `pose_of`."""
+    return pose_of(rows_along([pose])) if pose.tilts_first else pose
+
+
+def tilted_first(pose: Pose) -> Pose:
+    """The same passage, tilted before it is decentred: old = Rz Ry Rx (new + d); tilts as those of `pose_of`."""
+    return pose if pose.tilts_first else undone(pose_of(rows_along([undone(pose)])))
+
+
+def without_z(pose: Pose) -> Pose | None:
+    """The pose without its decentre along z; None where that is all."""
+    numbers = (pose.x, pose.y, pose.tilt_x, pose.tilt_y, pose.tilt_z)
+    return None if all(number is None for number in numbers) else dataclasses.replace(pose, z=None)
 
 
 def _angle(sine: Number, cosine: Number) -> Tensor | None:

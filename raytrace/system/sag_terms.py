@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.bivariate import Sag, polynomial_xy, powers, shifted, zernike_to_powers
+from raytrace.maths.bivariate import Sag, degree, polynomial_xy, powers, round_power, shifted, zernike_to_powers
 from raytrace.maths.numerics import broadcast_shape, polynomial, value
 from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
@@ -31,6 +31,7 @@ from raytrace.system.poses import cos_sin
 _LEAST = 4  # points along a side of a grid: a cubic
 _FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
 _BLOCK = 128  # coefficients that are found together
+_FRINGE_DEGREE = 5  # of powers that fringe terms hold
 
 
 @value
@@ -292,8 +293,8 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     c, unit = numbers
     degrees = [sum(power) for power in powers(len(c))]
     sums = [torch.zeros_like(c[0])] * (max(degrees, default=0) + 1) if len(c) else [c.new_zeros(())]
-    for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
-        sums[degree] = sums[degree] + a
+    for power, a in zip(degrees, c.abs().unbind(0), strict=True):
+        sums[power] = sums[power] + a
     return polynomial(torch.stack(sums), radius / unit.abs())
 
 
@@ -446,6 +447,56 @@ def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor
     entries = itertools.zip_longest(given.coefficients.unbind(0), terms, fillvalue=zero)
     sums = [a if b is zero else b if a is zero else a + b for a, b in entries]
     return dataclasses.replace(given, coefficients=torch.stack(torch.broadcast_tensors(*sums)))
+
+
+def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
+    """The same as a sum of powers about the vertex, and the height () mm to be added to it.
+
+    Raises ValueError for a grid of heights, which is no such sum.
+    """
+    row = SAG_TERMS[type(sag_terms).__name__]
+    if row.powers is None:
+        raise ValueError("a grid of heights is no sum of powers")
+    given = row.powers(sag_terms)
+    if not bool(given.centre_x.any() | given.centre_y.any()):
+        return PolynomialSag(given.coefficients, given.radius), given.height
+    centre = -given.centre_x / given.radius, -given.centre_y / given.radius
+    height, terms = shifted(given.coefficients.unbind(0), *centre)
+    return PolynomialSag(torch.stack(torch.broadcast_tensors(*terms)), given.radius), given.height + height
+
+
+def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
+    """The same as a sum of fringe terms over a disc of twice the radius; None for powers of a degree above 5.
+
+    The 36 terms with n + |m| ≤ 10 hold every power to x⁵ … y⁵. Piston makes the sag at the vertex 0.
+    """
+    count = int(torch.nonzero(sag_terms.coefficients).max()) + 1 if bool(sag_terms.coefficients.any()) else 1
+    highest = degree(count)
+    if highest > _FRINGE_DEGREE:
+        return None
+    radius, size = 2 * sag_terms.radius, highest * (highest + 3) // 2
+    terms = torch.stack(_scaled(sag_terms.coefficients[:size], radius / sag_terms.radius))
+    terms = torch.cat([terms, terms.new_zeros(size - len(terms))])
+    numbers = [j for j in range(2, 37) if fringe(j)[0] <= highest]
+    matrix, constants = (terms.new_tensor(part) for part in zernike_to_powers(tuple(map(fringe, numbers))))
+    found = torch.linalg.solve(matrix, terms)
+    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers) - 1,), found)
+    zero = torch.zeros_like(radius)
+    return FringeSag(torch.cat([-(constants @ found)[None], coefficients[1:]]), radius, zero, zero)
+
+
+def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> PolynomialSag:
+    """A sum of powers with Σ_n a_n (x² + y²)^n added; coefficients: (m,) a_1, a_2, … in mm^(1-2n)."""
+    radius, highest = sag_terms.radius, 2 * len(coefficients)
+    even = {
+        power: a * radius ** (2 * n) * factor
+        for n, a in enumerate(coefficients.unbind(0), 1)
+        for power, factor in round_power(n).items()
+    }
+    order = powers(max(len(sag_terms.coefficients), highest * (highest + 3) // 2))
+    zero = torch.zeros_like(radius)
+    pairs = itertools.zip_longest(sag_terms.coefficients.unbind(0), order, fillvalue=zero)
+    return PolynomialSag(torch.stack([a + even[power] if power in even else a for a, power in pairs]), radius)
 
 
 def _scaled(coefficients: Tensor, factor: Tensor) -> list[Tensor]:

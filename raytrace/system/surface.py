@@ -7,17 +7,18 @@ Functions work in the frame of the vertex, components first, for any batch shape
 intersection with rays.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.materials.environment import Environment
 from raytrace.materials.glass import AIR, Glass
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import is_any, value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
-from raytrace.system.poses import Gap, Pose, Turn
+from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first, without_z
 from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
 from raytrace.system.shapes import EVEN, KINDS, conic_terms
 
@@ -84,6 +85,31 @@ SHAPE = ("curvature", "conic", "coefficients", "kind", "sag_terms")
 def gap_behind(surface: Surface) -> Tensor | Gap:
     """The gap to the next surface: the thickness, with the pose behind the surface if it has one."""
     return surface.thickness if surface.after is None else Gap(surface.after, surface.thickness)
+
+
+def with_z_in_thicknesses(surfaces: Sequence[Surface], numbers: Collection[int] | None = None) -> list[Surface]:
+    """The same surfaces in space, with every decentre along z in the thickness before or behind its surface.
+
+    A pose before a surface is decentred first, one behind it tilted first. An object at infinity stays there: rays then
+    start from axes that have followed the vertex of surface 1. numbers: of the surfaces whose decentres are moved, by
+    default all.
+    """
+    result = list(surfaces)
+    for k in range(len(surfaces)) if numbers is None else sorted(numbers):
+        before, after = surfaces[k].before, surfaces[k].after
+        if k and isinstance(before, Pose) and before.z is not None:
+            pose = decentred_first(before)
+            if is_any(result[k - 1].thickness.detach() < torch.inf):
+                result[k - 1] = _thicker(result[k - 1], pose.z)
+            result[k] = dataclasses.replace(result[k], before=without_z(pose))
+        if after is not None and after.z is not None:
+            pose = tilted_first(after)
+            result[k] = _thicker(dataclasses.replace(result[k], after=without_z(pose)), pose.z)
+    return result
+
+
+def _thicker(surface: Surface, z: Tensor | None) -> Surface:
+    return surface if z is None else dataclasses.replace(surface, thickness=surface.thickness + z)
 
 
 def medium_surfaces(surfaces: Sequence[Surface]) -> list[int]:

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, safe_divide, value_of
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
 from raytrace.tolerancing.grades import tolerances as tolerances_of
@@ -36,6 +37,10 @@ from raytrace.tracing.spot import image_rays, to_image
 #: Angle of the astigmatism of an irregularity, degrees, and its change: the squares and the product of cos 2θ and
 #: sin 2θ have the means of a uniform distribution.
 _ANGLES = 45.0, 22.5
+
+
+class Unlit(BadTolerance, NoLight):
+    """A sample of lenses with one through which no ray of a field passes."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,11 @@ class AsBuilt:
         if self.tolerances is not None and (self.grade or self.limits):
             raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
 
+    def words(self) -> str:
+        """The settings in words."""
+        by = self.grade or "of " + ("`limits`" if self.limits else "`tolerances`" if self.tolerances else "its file")
+        return f"{by}, weight {self.weight:g}"
+
     def of(self, lens: Lens) -> "AsBuiltTerm":
         """The term for a lens and for those that its variables lead to. Raises BadTolerance."""
         return AsBuiltTerm(self, lens)
@@ -90,12 +100,11 @@ class AsBuiltTerm:
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         self.weights = (shares[:, None] * self.sampling.weights).flatten()
         if not bool(torch.isfinite(self.expected(lens))):
-            raise BadTolerance("no ray of a field reaches the sensor of a lens of the sample; give other `fields`")
+            raise Unlit("no ray of a field reaches the sensor of a lens of the sample; give other `fields`")
 
     def words(self) -> str:
         """The term in words."""
-        by = self.settings.grade or "of " + ("`limits`" if self.settings.limits else "its file")
-        return f"{by}, {len(self.tolerances)} tolerances, weight {self.settings.weight:g}"
+        return f"{len(self.tolerances)} tolerances, {self.settings.words()}"
 
     def about(self) -> str:
         """All that the term depends on besides the lens."""

@@ -7,8 +7,10 @@ thicknesses and other numbers, with the pickups and position solves that follow 
     after′  = M_surface⁻¹ ∘ after ∘ E_element ∘ E_group           E = T⁻¹ M⁻¹ T,  T: the way through the element
 
 An element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what follows
-keeps its place: as with a coordinate break before it and one behind it. All motions are poses of surfaces, so that
-surfaces keep their numbers and the compiled trace carries the lens.
+keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that surfaces
+keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses before and
+behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such thickness:
+the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses
@@ -26,7 +28,7 @@ from raytrace.system.optimization_data import Solve
 from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, parameter_paths, with_number
 from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
 from raytrace.system.sag_terms import with_powers
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, with_z_in_thicknesses
 from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
@@ -80,11 +82,13 @@ class Perturbation:
         for row, value in pairs:
             _change(lens, surfaces, row, value, gauges)
         _follow(start, surfaces)
-        numbers = tuple(surfaces)
+        numbers = list(surfaces)
         spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
         _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
         moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
-        operands = _operands(start, numbers, moved)
+        for k, surface in enumerate(surfaces):  # a shift along z is one of thicknesses
+            numbers[k] = dataclasses.replace(numbers[k], thickness=surface.thickness)
+        operands = _operands(start, tuple(numbers), moved)
         return dataclasses.replace(start, surfaces=tuple(surfaces), operands=operands)
 
 
@@ -270,9 +274,10 @@ def _move(
             rows = rows_of_both(rows, element)
         surfaces[k] = dataclasses.replace(
             surfaces[k],
-            before=_single(front) or _pose(rows_along(front), k),
-            after=(None if behind[k] else _single(rear)) or _pose(rows, k),
+            before=_single(front) or (_pose(rows_along(front), k) if front else None),
+            after=_single(rear) if not behind[k] and len(rear) < 2 else undone(_pose(rows_back(rows), k)),
         )
+    surfaces[:] = with_z_in_thicknesses(surfaces, {*before, *behind, *of_surfaces})
     return [(first, last) for first, last, _ in ranges] + [(k, k) for k in of_surfaces]
 
 
@@ -411,6 +416,12 @@ def _check_nested(row: Tolerance, ranges: dict[tuple[int, int], Tolerance]) -> N
     """Refuse an element that holds a part of another."""
     first, end = _range(row)
     for (a, b), other in ranges.items():
+        if first == b or a == end:
+            shared, group = (b if first == b else a), (min(a, first), max(b, end))
+            message = f"its element shares the cemented surface {shared} with {a}-{b} ({other.kind}), and would move it"
+            own = (shared + 1, end) if first == b else (shared + 1, b)
+            fix = f"tolerance the cemented group {group}, or the surfaces {own} of the element behind it alone"
+            raise BadTolerance(f"{_named(row)}: {message} twice; {fix}")
         if a < first <= b < end or first < a <= end < b:
             message = f"it shares a part of surfaces {a}-{b} ({other.kind}); expected one inside the other, or apart"
             raise BadTolerance(f"{_named(row)}: {message}")

@@ -5,6 +5,7 @@ read              the system, and the lens
 configurations    multi-configuration operands, read; environments of surfaces, read and written
 optimization      variables, solves, pickups, merit function and tolerances, read and written
 tolerances        the lines of tolerances as rows
+written_form      the lens in the terms of a file: sag terms, decentres along z
 write             the system, surfaces, apertures and operands, written; the unit of the file
 archive           members of a .zar archive, unpacked
 

@@ -1,11 +1,13 @@
 """Write a lens as a .zmx file of Zemax OpticStudio: system, surfaces, merit function, configurations.
 
-Every number has the digits that bring it back exactly. Lines are made in mm. A merit function of lengths and pure
+Every number has the digits that bring it back exactly; numbers of other terms than those of a file are converted first
+(`written_form`). Lines are made in mm. A merit function of lengths and pure
 numbers depends on the unit, so a lens with one is written in the unit of its file: a number read from such a file is
 written such that reading it again gives the same number of mm; of other numbers, two of which may lie between
 neighbouring numbers of the file, the nearest one or the next.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from decimal import Context, Decimal
@@ -64,6 +66,7 @@ from raytrace.io.zemax.surfaces import (
     type_of,
     types,
 )
+from raytrace.io.zemax.written_form import in_file_terms
 from raytrace.materials.glass import Glass, abbe_number, mil_glass, nd
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Operand, count, same, with_operands
@@ -83,6 +86,7 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     more than 8 aspheric terms or 24 wavelengths, a glass whose coefficients are not those of its catalog.
     """
     body = partial(_body, file=file, catalogs=catalogs)
+    lens = dataclasses.replace(in_file_terms(lens, Place(file)), ray_aiming=_aiming(lens))
     lines = [*body(lens), *tail_lines(lens.optimization_data, Place(file)), *_operand_lines(lens, body, file)]
     text = "\n".join(lines) + "\n"
     return text.encode("ascii") if text.isascii() else b"\xff\xfe" + text.encode("utf-16-le")
@@ -114,9 +118,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
     vignetting = fields.vignetting if fields.vignetting is not None else fields.x.new_zeros(5, len(fields.x))
     weights = exact_list(lens.wavelength_weights, "weight of a wavelength", place)
     waves = zip(exact_list(lens.wavelengths, "wavelength", place), weights, strict=True)
-    kind, aiming = FIELD_KINDS.index(fields.kind), lens.ray_aiming
-    if aiming == "auto" and any(map(is_posed, lens.surfaces[: lens.stop + 1])):
-        aiming = "real"  # the rays of a lens with tilted surfaces before its stop are aimed
+    kind, aiming = FIELD_KINDS.index(fields.kind), _aiming(lens)
     notes = []
     for note in lens.notes:
         text = one_line(note, "a note", place)
@@ -145,6 +147,13 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
         f"PWAV {lens.primary_wavelength}",
     ]
+
+
+def _aiming(lens: Lens) -> str:
+    """Ray aiming: "auto" aims the rays of a lens with a tilted stop, or with tilted surfaces before it."""
+    stop = lens.surfaces[lens.stop]
+    moved = stop.is_break or stop.before is not None or any(map(is_posed, lens.surfaces[: lens.stop]))
+    return "real" if lens.ray_aiming == "auto" and moved else lens.ray_aiming
 
 
 def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
@@ -207,7 +216,8 @@ def _type(surface: Surface, place: Place) -> str:
     row = types()[kind]
     for name, quantity in _SHAPE.items():
         if getattr(surface, name) is not None and name not in row.holds:
-            raise LensFileError(f"{feature} with a {quantity}: a {kind} surface has none", place)
+            quantity = quantity if quantity.endswith("terms") else f"a {quantity}"
+            raise LensFileError(f"{feature} with {quantity}: a {kind} surface has none", place)
     if row.is_break and (not is_left_out(surface.glass) or surface.apertures or surface.after is not None):
         message = "a coordinate break with a medium, an aperture or a pose behind it"
         raise LensFileError(f"{message}; a .zmx file holds none of them: put it on a surface of its own", place)

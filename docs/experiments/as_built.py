@@ -1,0 +1,181 @@
+"""The lens as built in the merit: the expectation by samples of different kinds, and two lenses made less sensitive.
+
+    python docs/experiments/as_built.py runs/as_built --plot docs/as_built.png
+
+Figures that the folder already holds are not computed again. All expectations are root mean squares of the RMS spot
+radius in µm, of the refocused lens at precision grade.
+"""
+
+import argparse
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import raytrace as rt
+from raytrace.analysis.layout import draw_layout, on_one_scale
+from raytrace.experiments import Store
+from raytrace.optimization.optimize import drawn_fields
+from raytrace.plotting.style import new_figure, save
+from raytrace.tolerancing.as_built import AsBuiltTerm
+from raytrace.tolerancing.study import moments
+
+GRADE, SEED, TRIALS = "precision", 2026, 2000
+#: Lens, F-number, largest field in degrees; rings of the pupil in the term, and cycles of both second optimisations.
+CASES = {"Cooke triplet": ("cooke_triplet", 5.0, 6.0, 3, 100), "double Gauss": ("double_gauss", 5.6, 14.0, 2, 60)}
+
+
+def start_of(name: str, f_number: float, field: float):
+    """The shipped lens at its conditions, with merit, variables and constraints of both optimisations."""
+    lens = rt.read_lens(name)
+    length = float(rt.first_order(lens).effective_focal_length)
+    track = float(sum(surface.thickness for surface in lens.surfaces[1:-1]))
+    lens = lens.at(f_number=f_number, fields=[0, 0.7 * field, field])
+    merit = rt.DefaultMerit("spot", glass_thickness=(2, 20), air_thickness=(0.3, 30), edge=1)
+    hold = f"efl={length} total_track<={1.05 * track}"
+    return lens, {"merit": merit, "vary": "curvature thickness", "hold": hold}
+
+
+def numbers_of(lens) -> np.ndarray:
+    return np.array([[float(s.curvature or 0), float(s.thickness)] for s in lens.surfaces[1:-1]])
+
+
+def lens_of(lens, numbers: np.ndarray):
+    for k, (curvature, thickness) in enumerate(numbers, 1):
+        bent = {"curvature": curvature} if curvature else {}
+        lens = lens.replace(k, thickness=thickness, **bent)
+    return lens
+
+
+def desensitised(name: str, f_number: float, field: float, rings: int, cycles: int) -> dict[str, np.ndarray]:
+    """Curvatures and thicknesses by the optimisation without the term, and from there by as many cycles of both."""
+    lens, settings = start_of(name, f_number, field)
+    first = rt.optimize(lens, cycles=900, **settings)
+    ends = {"usual": rt.optimize(first.lens, cycles=cycles, **settings)}
+    as_built = rt.AsBuilt(GRADE, rings=rings)
+    ends["robust"] = rt.optimize(first.lens, cycles=cycles, as_built=as_built, **settings)
+    return {key: numbers_of(end.lens) for key, end in ends.items()}
+
+
+def judged(lens) -> dict[str, np.ndarray]:
+    """Monte Carlo of a seed that no optimisation has seen."""
+    built = rt.tolerance(lens, grade=GRADE, trials=TRIALS, seed=SEED)
+    return {"nominal": built.nominal.numpy(), "trials": built.trials.numpy()}
+
+
+def samples(term: AsBuiltTerm) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Errors (L, N) and weights (L,) of samples for the expectation."""
+    mean, variance = (
+        torch.tensor(part, dtype=torch.float64) for part in zip(*map(moments, term.tolerances), strict=True)
+    )
+    count, sigma, errors = len(mean), variance.sqrt(), term.errors
+    half = 0.5 * (term.tolerances.maximum - term.tolerances.minimum)
+
+    def alike(errors):
+        return errors, torch.full((len(errors),), 1 / len(errors), dtype=torch.float64)
+
+    def differences(step):
+        part, each = torch.eye(count, dtype=torch.float64) * step, 0.5 * variance / step**2
+        return torch.cat([mean[None], mean + part, mean - part]), torch.cat([1 - 2 * each.sum()[None], each, each])
+
+    drawn = rt.draw_errors(term.tolerances, len(errors), seed=7)
+    found = {"two levels, L = " + str(len(errors)): alike(errors), "two levels and their negatives": None}
+    found["two levels and their negatives"] = alike(torch.cat([errors, 2 * mean - errors]))
+    found["second order, differences of 0.05 half widths"] = differences(0.05 * half)
+    found["each error alone, ± σ"] = differences(sigma)
+    found["random"] = alike(drawn)
+    found["random, antithetic"] = alike(torch.cat([drawn, -drawn]))
+    return found
+
+
+def expectation(lens, term: AsBuiltTerm, errors: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
+    """E[q] in µm², its derivatives by curvatures and thicknesses in units of 1/150 mm and 15 mm, and the seconds."""
+    started, leaves = time.process_time(), []
+    for k in range(1, len(lens.surfaces) - 1):
+        for name, unit in (("curvature", 1 / 150), ("thickness", 15.0)):
+            number = getattr(lens.surfaces[k], name)
+            if number is not None and not (name == "curvature" and float(number) == 0):
+                leaf = (number.detach() / unit).requires_grad_()
+                lens, leaves = lens.replace(k, **{name: unit * leaf}), [*leaves, leaf]
+    found = np.zeros(1 + len(leaves))
+    for part, weight in zip(errors.split(256), weights.split(256), strict=True):
+        q = 1e6 * (weight * term.mean_squares(lens, part)).sum()
+        found += [float(q), *map(float, torch.autograd.grad(q, leaves, retain_graph=True))]
+    return np.array([*found, time.process_time() - started])
+
+
+def table_of_samples(store: Store, name: str, reference: int = 6000) -> list[str]:
+    lens = rt.read_lens(name)
+    term = rt.AsBuilt(GRADE).of(lens)
+    drawn = rt.draw_errors(term.tolerances, reference, seed=5)
+    pairs = torch.cat([drawn, -drawn])
+    cases = samples(term) | {"reference": (pairs, torch.full((len(pairs),), 1 / len(pairs), dtype=torch.float64))}
+    cases["nominal"] = torch.zeros_like(drawn[:1]), torch.ones(1, dtype=torch.float64)
+    compute = lambda key: lambda: {"found": expectation(lens, term, *cases[key])}  # noqa: E731
+    found = {key: store.arrays(f"{name}_{n}", compute(key))["found"] for n, key in enumerate(cases)}
+    most, least = found["reference"], found["nominal"]
+    lines = [
+        f"{name}: E {most[0] ** 0.5:.4f} µm by {len(pairs)} lenses, {most[-1]:.1f} s; nominal {least[0] ** 0.5:.4f}"
+    ]
+    for key in samples(term):
+        one = found[key]
+        errors = (one[0] - most[0]) / (most[0] - least[0]), np.linalg.norm((one - most)[1:-1])
+        errors = errors[0], errors[1] / np.linalg.norm((most - least)[1:-1])
+        size = len(cases[key][0])
+        lines.append(f"| {key} | {size} | {100 * errors[0]:+.2f} % | {100 * errors[1]:.1f} % | {one[-1]:.2f} s |")
+    return lines
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, help="figures computed so far")
+    parser.add_argument("--plot", type=Path, help="figure to write")
+    parser.add_argument("--only", choices=[*CASES, "samples"], help="one part")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    store = Store(arguments.folder, {"grade": GRADE, "seed": SEED, "trials": TRIALS})
+    if arguments.only in (None, "samples"):
+        for name in ("cooke_triplet", "double_gauss"):
+            print("\n".join(table_of_samples(store, name)))
+    figure = new_figure(9.0, 3.4 * len(CASES))
+    panels = figure.subplots(len(CASES), 3, width_ratios=(1, 1, 1.1))
+    for row, (title, case) in zip(panels, CASES.items(), strict=True):
+        if arguments.only not in (None, title):
+            continue
+        ends = store.arrays(title.replace(" ", "_"), lambda case=case: desensitised(*case))
+        lens = start_of(*case[:3])[0]
+        draw(row, title, {key: lens_of(lens, numbers) for key, numbers in ends.items()}, store)
+    if arguments.plot and arguments.only is None:
+        save(figure, arguments.plot)
+
+
+def draw(row, title: str, lenses: dict, store: Store) -> None:
+    """Both lenses, the histograms of their trials, and the numbers of the table."""
+    for axes, (key, lens) in zip(row, lenses.items(), strict=False):
+        found = store.arrays(f"{title}_{key}_trials".replace(" ", "_"), lambda lens=lens: judged(lens))
+        trials, nominal = found["trials"], float(found["nominal"])
+        draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
+        axes.set_title(f"{title}, {'as built in the merit' if key == 'robust' else 'nominal merit'}", fontsize=9)
+        label = f"{'as built' if key == 'robust' else 'nominal'} merit: {nominal:.2f} µm without errors"
+        row[2].hist(trials, bins=60, histtype="step", density=True, label=label)
+        bound = np.std(trials) / len(trials) ** 0.5
+        high = np.quantile(trials, 0.9)
+        print(f"{title} {key}: nominal {nominal:.3f}, mean {trials.mean():.3f} ± {bound:.3f}, 90 % below {high:.3f}")
+        rms = np.sqrt((trials**2).mean())
+        print(f"   root mean square {rms:.3f}; EFL {float(rt.first_order(lens).effective_focal_length):.4f}")
+        angles = np.abs(rt.incidence(lens).angle.numpy()).max((0, 1, 2))
+        for k, (curvature, thickness) in enumerate(numbers_of(lens), 1):
+            print(f"   {k:2d} {1 / curvature if curvature else np.inf:10.3f} {thickness:8.3f} {angles[k - 1]:6.1f}°")
+    row[2].set(xlabel="RMS spot radius as built, µm", ylabel="density")
+    row[2].legend(fontsize=7)
+    on_one_scale(row[:2])
+
+
+if __name__ == "__main__":
+    main()
