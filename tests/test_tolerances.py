@@ -855,3 +855,13 @@ def test_lines_behind_the_configurations_are_read(tmp_path):
     assert [row.kind for row in found] == ["thickness"]
     assert [(one.surface, one.parameter, one.maximum) for one in found.compensators] == [(7, "thickness", 1.0)]
     assert not found.unread
+
+
+def test_one_surface_may_move_in_several_ways_alone_and_in_its_element():
+    lens = rt.read_lens("cooke_triplet")
+    rows = [rt.Tolerance(f"element_decenter_{axis}", (k, k), -0.1, 0.1) for axis in "xy" for k in (3, 4)]
+    rows += [rt.Tolerance("element_tilt_x", (3, 4), -0.1, 0.1)]
+    moved = rt.perturbed(lens, rows, [0.1, 0.0, 0.05, 0.0, 0.1])
+    single = rt.perturbed(rt.perturbed(lens, rows[4:], [0.1]), rows[:4], [0.1, 0.0, 0.05, 0.0])
+    assert not torch.equal(rt.spot(moved).whole.centroid, rt.spot(lens).whole.centroid)
+    assert rt.spot(single).whole.valid.all()

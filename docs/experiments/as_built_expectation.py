@@ -1,8 +1,6 @@
 """The expectation of the lens as built by second order against Monte Carlo, of three lenses at three grades.
 
-    python docs/experiments/as_built_expectation.py FOLDER [--trials 100000] [--criterion rms]
-
-FOLDER keeps the finished trials (.jsonl), from which an interrupted run goes on, and expectation.csv.
+The folder keeps the finished trials (.jsonl), from which an interrupted run goes on, and expectation.csv.
 """
 
 import argparse
@@ -66,19 +64,23 @@ def row(name: str, grade: str, criterion: str, trials: int, folder: Path) -> dic
     }  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, help="for the finished trials and expectation.csv")
     parser.add_argument("--trials", type=int, default=100_000)
     parser.add_argument("--criterion", default="rms")
     parser.add_argument("--grades", nargs="+", default=GRADES)
     parser.add_argument("--lenses", nargs="+", default=LENSES)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    table = options.folder / "expectation.csv"
-    for name in options.lenses:
-        for grade in options.grades:
-            new = pd.DataFrame([row(name, grade, options.criterion, options.trials, options.folder)])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
+    chosen = parser.parse_args()
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    table = chosen.folder / "expectation.csv"
+    for name in chosen.lenses:
+        for grade in chosen.grades:
+            new = pd.DataFrame([row(name, grade, chosen.criterion, chosen.trials, chosen.folder)])
             rows = pd.concat([pd.read_csv(table), new]) if table.exists() else new
             rows = rows.drop_duplicates(["lens", "criterion", "grade"], keep="last")
             rows.to_csv(table, index=False)
