@@ -28,7 +28,7 @@ _SEVERAL = (*_FINITE, "depths", "object_distances", "distance_weights", "field_w
 
 #: Functions that take a batch of lenses; the others take one.
 BATCHED = {
-    *("first_order", "rays", "trace", "spot", "wavefront", "psf", "mtf", "perturbed", "to"),
+    *("first_order", "rays", "trace", "spot", "wavefront", "psf", "mtf", "perturbed", "to", "evaluate"),
     *("with_object_distance", "with_sensor_distance"),
 }
 

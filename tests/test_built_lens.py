@@ -41,16 +41,20 @@ def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, cente
     built._order = 2
     errors, distances = rt.draw_errors(built.tolerances, 2, seed=5), DISTANCES[:2]
     parameters = rt.Gaussian(order=2) if model == "gaussian" else rt.DRT(order=2)
+    conditions = {"fields": built.fields[:, [1]], "size": 7, "normalise": "window", "center": center}
+
+    def expected(errors, distances):
+        lenses = rt.perturbed(built.variables(), built.tolerances, errors)
+        return rt.psf(lenses, parameters, object_distances=distances, **conditions).kernel[:, 0]
+
     with torch.no_grad():
         kernels = built.kernels(distances, 1, errors)
+        assert float((kernels - expected(errors, distances)).abs().max()) < 1e-12
         for number, distance in enumerate(distances):
-            alone = rt.perturbed(built.variables(), built.tolerances, errors[number])
-            conditions = {"fields": built.fields[:, [1]], "object_distances": distance[None], "center": center}
-            found = rt.psf(alone, parameters, size=7, normalise="window", **conditions).kernel[0, 0]
-            # Kernels of one call with "drt" share the number of cells, that of the widest.
-            assert float((kernels[number] - found).abs().max()) < (1e-9 if model == "gaussian" else 1e-3)
-            one = built.kernels(distance[None], 1, errors[number])[0]
-            assert float((one - found).abs().max()) < 1e-9
+            alone = built.kernels(distance[None], 1, errors[number])
+            assert float((alone - expected(errors[number], distance[None])).abs().max()) < 1e-12
+            if model == "gaussian":  # kernels of one call with "drt" share the number of cells, that of the widest
+                assert float((kernels[number] - alone[0]).abs().max()) < 1e-12
 
 
 def test_without_errors_the_camera_as_built_is_the_nominal_one(lens):
@@ -94,7 +98,7 @@ def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
     with torch.no_grad():
         still = sensors(rt.perturbed(built.variables(), built.tolerances, errors))  # its gap has errors as well
         free = sensors(built.as_built(errors)) - still
-        assert float(free.abs().min()) > 0.05
+        assert float(free.abs().max()) > 0.1  # so that the limit below acts
         for limit in (0.0, 0.05):
             limited = Compensator(11, minimum=-limit, maximum=limit)
             built.tolerances = dataclasses.replace(built.tolerances, compensators=(limited,))

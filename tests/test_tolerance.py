@@ -165,6 +165,7 @@ def test_compensators_that_the_lens_does_not_have_or_need(triplet):
         (rt.Compensator(12), "surfaces 0 to 7"),
         (rt.Compensator(1, "colour"), "the surface does not have it"),
         (rt.Compensator(0), "does not improve the criterion"),
+        (rt.Compensator(8), "surfaces 0 to 7"),
     ):
         with pytest.raises(rt.BadTolerance, match=message):
             rt.tolerance(triplet, dataclasses.replace(rows, compensators=(one,)), trials=0)

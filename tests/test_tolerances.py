@@ -508,6 +508,14 @@ def test_a_tolerance_that_the_lens_does_not_have_is_refused(row, message, nomina
         rt.perturbed(nominal, [row], [0.0])
 
 
+def test_elements_that_share_a_cemented_surface_are_refused_with_the_fix(nominal):
+    message = (
+        r"shares the cemented surface 2 with 1-2 .* tolerance the cemented group \(1, 3\), or the surfaces \(3, 3\)"
+    )
+    with pytest.raises(rt.BadTolerance, match=message):
+        rt.perturbed(nominal, [*element(1, 2), *element(2, 3)], torch.zeros(10))
+
+
 def test_elements_that_share_a_part_are_refused(nominal):
     with pytest.raises(rt.BadTolerance, match="shares a part of surfaces 1-3"):
         rt.perturbed(nominal, [*element(1, 3), *element(2, 5)], torch.zeros(10))
@@ -831,3 +839,19 @@ def sensor_of(lens, rows):
     fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
     rays = launch(lens, points, fields=fields, wavelengths=lens.wavelengths)
     return lambda values: trace_lens(rt.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]).position[:2]
+
+
+def test_lines_behind_the_configurations_are_read(tmp_path):
+    source = Path(__file__).parents[1] / "lenses" / "cooke_triplet.zmx"
+    lines = [
+        "MNUM 1 1",
+        'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""',
+        "TOL COMP 7 0 -1 1 0 0 0",
+        "TOL TTHI 2 4 -0.02 0.02 0 0 0",
+    ]
+    file = tmp_path / "triplet.zmx"
+    file.write_text(source.read_text() + "\n".join(lines) + "\n")
+    found = rt.read_tolerances(file)
+    assert [row.kind for row in found] == ["thickness"]
+    assert [(one.surface, one.parameter, one.maximum) for one in found.compensators] == [(7, "thickness", 1.0)]
+    assert not found.unread

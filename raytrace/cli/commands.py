@@ -795,10 +795,10 @@ COMMANDS = (
     _command(
         "tolerance",
         "the lens as built: sensitivities, expectation and Monte Carlo",
-        "Change of a criterion (RMS spot radius or wavefront, MTF) by every tolerance at its limits, its mean of the "
-        "lens as built by second derivatives, and its distribution over perturbed and compensated lenses. The "
-        "tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the compensator is the "
-        "sensor distance unless the file has others.",
+        "Change of a criterion (RMS spot radius or wavefront, MTF, merit, …) by every tolerance at its limits, "
+        "its mean of the lens as built by second derivatives, and its distribution over perturbed and compensated "
+        "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the "
+        "compensator is the sensor distance unless the file has others.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
@@ -812,6 +812,8 @@ COMMANDS = (
         ),
         run=_tolerance,
         rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
+        model={"choices": ("gaussian", "drt"), "help": "PSFs of psf: gaussian (default), smooth in the errors, or drt"},
+        pixel="pixel pitch of psf (default 0.005)", size="pixels across the windows of psf (default 21)",
         limits={"metavar": "NAME=LIMIT"},
     ),
     _of_module("codesign", codesign, _codesign),

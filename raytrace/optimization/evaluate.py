@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Result, Table, rows
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
+from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import Model
 from raytrace.plotting.style import FAINT, field_colours, new_figure, number_text, styled
@@ -170,28 +171,70 @@ class MeritResult(Result):
         return figure
 
 
+@value
+class MeritsOfBatch(Result):
+    """A merit function of a batch of lenses: merit (L,), with its derivatives, and what `MeritResult` has, for each.
+
+    values, contributions: (L, R), lost: (L, R) bool, of the rows `row` (R,) that have a value, from 1.
+    """
+
+    lens: Lens
+    merit: Tensor
+    function: tuple[Row, ...]
+    row: Tensor
+    values: Tensor
+    contributions: Tensor
+    lost: Tensor
+    unit: float
+
+    COLUMNS = (Column("lens"), Column("merit", form=".10g"), Column("lost_rows"))
+
+    def columns(self) -> dict[str, Tensor]:
+        return {"lens": torch.arange(len(self.merit)), "merit": self.merit.detach(), "lost_rows": self.lost.sum(-1)}
+
+
+def _of_batch(lens: Lens, function: Merit, shown: list[int]) -> MeritsOfBatch:
+    """The merit function of each lens of a batch; shown: places of the rows that are listed."""
+    merits = MeritOfBatch(lens, function)
+    each = merits.evaluated()
+    return MeritsOfBatch(
+        lens=lens,
+        merit=safe_sqrt(merits.square()),
+        function=function.rows,
+        row=torch.tensor([k + 1 for k in shown], dtype=torch.int64),
+        values=torch.as_tensor(np.stack([one.values[shown] for one in each])),
+        contributions=torch.as_tensor(np.stack([one.contributions(shown) for one in each])),
+        lost=torch.as_tensor(np.stack([one.lost[shown] for one in each])),
+        unit=function.unit,
+    )
+
+
 def evaluate(
     lens: Lens,
     *,
     merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
     configuration: int | None = None,
     each: bool = False,
-) -> MeritResult:
-    """The merit of a lens and the values of the rows of its merit function.
+) -> MeritResult | MeritsOfBatch:
+    """The merit of a lens, or of each lens of a batch, and the values of the rows of its merit function.
 
     merit: `Merit`, `DefaultMerit`, rows, or a kind of default one ("spot", "wavefront", "angular", "mtf"); by default
-    the file's. configuration: its rows alone. each: list every row in the text. Raises BadMerit, UnknownOperand.
+    the file's. configuration: its rows alone. each: list every row in the text. Of a batch the merit (L,) has
+    derivatives by every number of the lenses. Raises BadMerit, UnknownOperand.
     """
-    function = merit_for(lens, merit, configuration and [configuration])
-    warn_of_filling(lens, field_points(None, like=lens))
+    function = merit_for(lens if lens.count is None else lens[0], merit, configuration and [configuration])
+    if lens.count is None:
+        warn_of_filling(lens, field_points(None, like=lens))
     of_rows = configurations_of(function, lens.current_configuration)
     if configuration is not None:
         function = function.with_weights({k: 0.0 for k, at in enumerate(of_rows, 1) if at != configuration})
-    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluation = Evaluation(Model(lens), function.rows, **options)
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
+    if lens.count is not None:
+        return _of_batch(lens, function, shown)
+    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
+    evaluation = Evaluation(Model(lens), function.rows, **options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
     return MeritResult(
         lens=lens,

@@ -568,10 +568,16 @@ class Evaluation:
                 skip(line, f"{line.row.operand} takes {value}")
         return referred, skipped
 
-    def __call__(self, variables: np.ndarray, *, derivatives: bool = False, shown: bool = True) -> Evaluated:
-        """All rows at variables; derivatives: with the Jacobian; shown: also operands without a row that counts."""
-        count = len(variables)
-        x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
+    def __call__(
+        self, variables: np.ndarray, *, derivatives: bool = False, shown: bool = True, by: Sequence[int] | None = None
+    ) -> Evaluated:
+        """All rows at variables; derivatives: with the Jacobian, by some of the variables or, without `by`, all.
+
+        shown: also operands without a row that counts.
+        """
+        each = np.eye(len(variables))[slice(None) if by is None else list(by)]
+        count = len(each)
+        x = Dual(np.asarray(variables, dtype=float), each) if derivatives else np.asarray(variables, float)
         values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
         numbers, sides = {}, []
         states = {configuration: self.model.views[configuration - 1].state(x) for configuration, _ in self.planners}

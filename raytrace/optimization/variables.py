@@ -69,6 +69,9 @@ APERTURE: Address = (0, "aperture")
 #: Numbers of the medium behind a surface, where it is a model glass or a constant index.
 GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
 
+#: Name of a coefficient of the dispersion formula of any other medium, counted from 1; of no variable syntax.
+GLASS_NUMBER = "glass_coefficient_"
+
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
 
@@ -104,6 +107,8 @@ class UnknownNumber(ValueError):
 
 def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
     """Where a surface holds a number. Raises UnknownNumber."""
+    if quantity.startswith(GLASS_NUMBER):
+        return ParameterPath(("glass", "coefficients"), int(quantity.removeprefix(GLASS_NUMBER)) - 1)
     known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
     if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
         entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
@@ -673,7 +678,7 @@ class View:
         """What moves of the media, by the surface that tells them."""
         found: dict[int, list[Address]] = {}
         for surface, quantity in self.moved:
-            if quantity in GLASS:
+            if quantity in GLASS or quantity.startswith(GLASS_NUMBER):
                 found.setdefault(surface, []).append((surface, quantity))
         return found
 
@@ -723,7 +728,8 @@ class View:
             powers = [vertex_curvature(s).reshape(()) for s in lens.surfaces if s.curvature is not None or s.is_plane]
             phases = [power_of(s.phase, lens.wavelengths)[1].sum() for s in lens.surfaces if s.phase is not None]
             plain = "curvature", "thickness", *GLASS
-            others = [n for (_, quantity), n in numbers.items() if quantity not in plain]
+            named = [(quantity, n) for (_, quantity), n in numbers.items() if not quantity.startswith(GLASS_NUMBER)]
+            others = [n for quantity, n in named if quantity not in plain]
             total = sum([p for p in (*powers, *phases) if p.requires_grad], torch.zeros((), dtype=torch.float64))
             if not others or not total.requires_grad:
                 return True

@@ -5,7 +5,7 @@ elements        elements and cemented groups of a lens, found from its media and
 perturbation    `perturbed`: the lens with an error for each row, one lens or many
 sampling        `draw_errors`: random errors, the same for a trial in any batch
 files           `read_tolerances`: the rows of a .zmx file
-criteria        RMS spot radius, RMS wavefront, MTF: of a batch of lenses
+criteria        RMS spot radius, RMS wavefront, MTF, merit, change of the PSF, boresight: of a batch of lenses
 study           `tolerance`: sensitivities, expectation by second order, Monte Carlo
 as_built        `AsBuilt`: the expectation as a term of a merit function, with exact derivatives
 grades          `tolerances`: rows of published grades and of limits

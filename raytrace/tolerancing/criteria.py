@@ -7,18 +7,24 @@ trace.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.analysis.sheared_batch import ShearedPupils
 from raytrace.maths.numerics import safe_divide, value
-from raytrace.system.lens import Lens
+from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
+from raytrace.optimization.merit_of_batch import MeritOfBatch
+from raytrace.psf_models.models import DRT, Gaussian, psf
+from raytrace.system.lens import Lens, aligned
+from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
 from raytrace.tracing.focus import spot_parabola
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import image_rays, spot_of_points
+from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import wavefront_of, without
 from raytrace.words import did_you_mean
 
@@ -40,7 +46,8 @@ class Criterion:
     quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
     with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
     where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
-    derivatives. settings: what q depends on beyond lens, fields and pupil.
+    derivatives. settings: what q depends on beyond lens, fields and pupil. angle: radians of a unit, 0 for no angle.
+    allows_idle: whether compensators without effect on q stay at 0; else they are refused.
     """
 
     name: str
@@ -53,6 +60,8 @@ class Criterion:
     scale: float = 0.0
     together: int = 256
     settings: tuple = ()
+    angle: float = 0.0
+    allows_idle: bool = False
 
 
 def _spots(lens: Lens, sampling: Sampling) -> tuple[Rays, Tensor]:
@@ -102,18 +111,93 @@ def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
     return Criterion(name, "", quantity, value=missing, quantity_of=missing, sign=-1, scale=1.0, together=32)
 
 
+def _psf_change(lens: Lens, sampling: Sampling, model: str, pixel: float | None, size) -> Criterion:
+    """RMS difference of PSFs from the nominal lens's, relative to that PSF, over the fields."""
+    kinds = {"gaussian": Gaussian, "drt": DRT}
+    if model not in kinds:
+        raise ValueError(f"model {model!r}: expected one of {', '.join(kinds)}{did_you_mean(model, kinds)}")
+    options = {"fields": sampling.fields, "pixel": pixel, "size": size}
+
+    with torch.no_grad():
+        order = psf(lens, model, **options).order
+        nominal = psf(lens, kinds[model](order=order), **options).kernel
+    energy = nominal.square().sum((-2, -1))
+
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        kernel = psf(lenses, kinds[model](order=order), **options).kernel
+        change = (kernel - nominal).square().sum((-2, -1)) / energy
+        return (sampling.field_weights * change).sum(-1)
+
+    settings = (model, order, pixel, size)
+    return Criterion("change of the PSF", "", quantity, scale=1.0, settings=settings, together=32)
+
+
+def _boresight(lens: Lens, sampling: Sampling) -> Criterion:
+    """Distance on the sensor from the nominal chief ray of the axial field, at the primary wavelength."""
+
+    def place(lenses: Lens) -> Tensor:
+        axis, bare = lenses.wavelengths.new_zeros(2, 1), without_apertures(lenses)
+        rays = image_rays(bare, axis, fields=axis, wavelengths=lenses.primary[None])
+        return torch.where(rays.valid, rays.position[:2], torch.nan)[..., 0, 0, 0]
+
+    with torch.no_grad():
+        nominal = place(lens)
+        focal_length = float(first_order(lens).effective_focal_length)
+
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        return 1e6 * (place(lenses) - nominal.reshape(2, 1)).square().sum(0).expand(lenses.count or 1)
+
+    angle = 1e-3 / abs(focal_length) if math.isfinite(focal_length) else 0.0
+    return Criterion("boresight error", "µm", quantity, scale=1.0, angle=angle, allows_idle=True)
+
+
+def _merit(lens: Lens, merit) -> Criterion:
+    """A merit function, of the file or as `optimize` takes it; q is its square."""
+    function = merit_for(lens, merit) if merit is None or isinstance(merit, Merit) else None
+
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        # a default merit function has the rays of the symmetry that the lens with errors has
+        return MeritOfBatch(lenses, function or merit_for(aligned(lenses, 0, exactly=True)[0], merit)).square()
+
+    rows = merit_for(lens, merit)
+    return Criterion("merit function", "", quantity, settings=(repr(rows.rows), rows.unit))
+
+
 #: Criteria of every lens by name, and those that are made of the nominal lens.
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
 }
-NAMES = (*CRITERIA, "mtf@F")
+NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
 
 
-def criterion_of(word: str, lens: Lens, sampling: Sampling) -> Criterion:
-    """The criterion of a word, "rms" or "mtf@30", for lenses near a nominal one. Raises ValueError."""
+def criterion_of(
+    word: str,
+    lens: Lens,
+    sampling: Sampling,
+    *,
+    model: str = "gaussian",
+    pixel: float | None = None,
+    size: int | tuple[int, int] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
+) -> Criterion:
+    """The criterion of a word, "rms" or "mtf@30", for lenses near a nominal one.
+
+    model, pixel, size: of "psf"; merit: of "merit". Raises ValueError for other words and options, BadMerit for a lens
+    without a merit function.
+    """
+    if word != "merit" and merit is not None:
+        raise ValueError(f"criterion {word!r}: `merit` belongs to the criterion merit; leave it out")
+    if word != "psf" and (model, pixel, size) != ("gaussian", None, None):
+        raise ValueError(f"criterion {word!r}: `model`, `pixel` and `size` belong to the criterion psf; leave them out")
     if word in CRITERIA:
         return CRITERIA[word]
+    if word == "merit":
+        return _merit(lens, merit)
+    if word == "psf":
+        return _psf_change(lens, sampling, model, pixel, size)
+    if word == "boresight":
+        return _boresight(lens, sampling)
     name, mark, number = word.partition("@")
     if name == "mtf":
         try:

@@ -416,6 +416,12 @@ def _check_nested(row: Tolerance, ranges: dict[tuple[int, int], Tolerance]) -> N
     """Refuse an element that holds a part of another."""
     first, end = _range(row)
     for (a, b), other in ranges.items():
+        if first == b or a == end:
+            shared, group = (b if first == b else a), (min(a, first), max(b, end))
+            message = f"its element shares the cemented surface {shared} with {a}-{b} ({other.kind}), and would move it"
+            own = (shared + 1, end) if first == b else (shared + 1, b)
+            fix = f"tolerance the cemented group {group}, or the surfaces {own} of the element behind it alone"
+            raise BadTolerance(f"{_named(row)}: {message} twice; {fix}")
         if a < first <= b < end or first < a <= end < b:
             message = f"it shares a part of surfaces {a}-{b} ({other.kind}); expected one inside the other, or apart"
             raise BadTolerance(f"{_named(row)}: {message}")

@@ -29,11 +29,13 @@ from raytrace.io import write_lens
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.sampling import gauss_rings
+from raytrace.optimization.merit import DefaultMerit, Merit
 from raytrace.plotting.style import GREY, INK, new_figure, styled
 from raytrace.shards import Share, total
 from raytrace.stores import Kind, Records, listed, number, record, whole
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, aligned, field_points
+from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
@@ -138,7 +140,7 @@ class Study:
             q[moving] = torch.where(better, q_trial, q[moving])
             at[moving] = start = torch.where(better[:, None], trial, start)
             slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
-            full = torch.linalg.solve(curvature, before[..., None])[..., 0]
+            full = torch.linalg.solve(curvature, before[..., None])[..., 0] * self.acting
             trial = torch.clamp(start - full / scale[moving], self.least, self.most)
             gain[moving] = (0.5 * (before * (start - trial)).sum(-1)).abs()
             going = gain[moving] > _SETTLED * (q[moving] + least)
@@ -164,23 +166,27 @@ class Study:
             moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
             q, slopes = self.slope_of_compensators(zero, moved)
             found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
-            self._curvature = 0.5 * (found + found.T)
-            self._refuse_idle(torch.diagonal(self._curvature), q)
+            found = 0.5 * (found + found.T)
+            self.acting = self._acting(torch.diagonal(found), q)
+            both = self.acting[:, None] & self.acting
+            self._curvature = torch.where(both, found, torch.eye(count).to(found))
         return self._curvature
 
-    def _refuse_idle(self, curvatures: Tensor, q: Tensor) -> None:
-        """Refuse compensators without effect on q, and those that the nominal lens is no minimum of."""
+    def _acting(self, curvatures: Tensor, q: Tensor) -> Tensor:
+        """Which compensators (C,) act on q; those without effect are refused, unless the criterion allows them.
+
+        Refused are also those that the nominal lens is no minimum of.
+        """
         effect = 0.5 * curvatures * (_REACH * self.scale_of_compensators()) ** 2
-        least = _NO_EFFECT * (float(q.min()) + self.criterion.scale)
+        least, name = _NO_EFFECT * (float(q.min()) + self.criterion.scale), self.criterion.name
         for one, gain in zip(self.compensators, effect.tolist(), strict=True):
-            if abs(gain) <= least:
-                what = f"it has no effect on the {self.criterion.name}"
-                raise BadTolerance(f"compensator {one}: it does not improve the criterion: {what}; leave it out")
-            if not gain > 0:
-                message = (
-                    f"the {self.criterion.name} has no optimum near the nominal lens; focus the lens first (rt.focus)"
-                )
-                raise BadTolerance(f"compensator {one}: {message}, or optimise it")
+            if abs(gain) <= least and not self.criterion.allows_idle:
+                what = f"it does not improve the criterion: it has no effect on the {name}"
+                raise BadTolerance(f"compensator {one}: {what}; leave it out")
+            if gain < -least:
+                what = f"the {name} has no optimum near the nominal lens"
+                raise BadTolerance(f"compensator {one}: {what}; focus the lens first (rt.focus), or optimise it")
+        return effect.abs() > least
 
     def scale_of_compensators(self) -> Tensor:
         """Steps (C,) of the differences by the compensators."""
@@ -201,8 +207,11 @@ class Study:
         whole = 0.5 * (whole + whole.T)
         H = whole[:count, :count]
         if others:
-            mixed = whole[:count, count:]
-            H = H - mixed @ torch.linalg.solve(whole[count:, count:], mixed.T)
+            self.nominal_curvature()
+        if others and bool(self.acting.any()):
+            acting = whole[:, count:][:, self.acting]
+            mixed = acting[:count]
+            H = H - mixed @ torch.linalg.solve(acting[count:][self.acting], mixed.T)
         return float(q[-1]), slope[:count], H
 
 
@@ -255,7 +264,7 @@ def moments(row: Tolerance) -> tuple[float, float]:
 class Toleranced(Result):
     """The lens as built.
 
-    better: "smaller" or "larger", which values of the criterion are better.
+    better: "smaller" or "larger", which values of the criterion are better; angle: radians of its unit, 0 for no angle.
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
     of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
     second order; slope: (N,) its derivative times the half width.
@@ -286,6 +295,7 @@ class Toleranced(Result):
     changes: Tensor
     seed: int = 0
     unsettled: int = 0
+    angle: float = 0.0
     goal: float | None = None
     share: float = 0.9
     given: object = None
@@ -451,6 +461,11 @@ class Toleranced(Result):
             + (f", root mean square {root:.6g}" if root is not None else "")
             + f"; estimated by RSS {found['estimated']:.6g}"
         )
+        if self.angle:
+            numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
+            numbers |= {"90 % within": found["percent_90"]} if len(self.trials) else {}
+            listed = ", ".join(f"{word} {1e3 * self.angle * number:.4g}" for word, number in numbers.items())
+            about.append(f"as an angle, divided by the focal length, mrad: {listed}")
         if len(self.trials):
             about.append(
                 f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
@@ -460,6 +475,9 @@ class Toleranced(Result):
             )
             for k, one in enumerate(self.tolerances.compensators):
                 c = self.changes[:, k]
+                if not bool(c.any()):
+                    about.append(f"compensator {one}: it stays, as it has no effect")
+                    continue
                 about.append(
                     f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
                     f"σ {float(c.std()):.4g}"
@@ -510,14 +528,15 @@ class Toleranced(Result):
         ordered = torch.sort(shown).values
         curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
         curve.set(ylabel="yield, %", ylim=(0, 100))
-        left.legend(fontsize=8, loc="center right")
+        side = "right" if self.sign > 0 else "left"
+        left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)
         labels = [self.tolerances.labels[k] for k in order.tolist()]
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
         right.set(xlabel=", ".join(filter(None, ("change of the criterion", self.unit))))
-        right.legend(fontsize=8, loc="lower right")
+        right.legend(fontsize=8, loc=f"lower {side}")
         return figure
 
 
@@ -542,6 +561,10 @@ def tolerance(
     fields: Tensor | Sequence | None = None,
     rings: int = 4,
     arms: int = 6,
+    model: Literal["gaussian", "drt"] = "gaussian",
+    pixel: float | None = None,
+    size: int | tuple[int, int] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
     checkpoint: str | PathLike | None = None,
     share: Share | None = None,
     progress: Callable | None = None,
@@ -555,8 +578,10 @@ def tolerance(
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
         centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
-        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields. The compensators of every lens
-        bring it to its best.
+        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; "psf", the change of the
+        PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the chief
+        ray; "boresight", the distance in µm by which the chief ray of the axial field misses its nominal place on the
+        sensor; "merit", a merit function. The compensators of every lens bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
@@ -567,6 +592,9 @@ def tolerance(
         symmetric, mirrored along y.
     rings: of the pupil, Gaussian quadrature, 4 by default.
     arms: of the pupil, 6 by default.
+    model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
+        0.005 by default, and number of pixels across, 21 by default.
+    merit: of "merit", as `optimize` takes it; by default that of the file.
     checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
@@ -583,7 +611,7 @@ def tolerance(
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     sampling, given = sampling_of(lens, fields, rings, arms), tolerances
-    chosen = criterion_of(criterion, lens, sampling)
+    chosen = criterion_of(criterion, lens, sampling, model=model, pixel=pixel, size=size, merit=merit)
     study = Study(lens, tolerances, chosen, sampling)
     if study.compensators:
         study.nominal_curvature()  # refuses those without effect
@@ -615,6 +643,7 @@ def tolerance(
         expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
         unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
         given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
+        angle=chosen.angle,
     )  # fmt: skip
 
 

@@ -54,6 +54,7 @@ from raytrace.io.zemax.surfaces import (
     SIZE,
     SWITCH,
     TEXT,
+    TOLERANCES,
     Sections,
     SurfaceType,
     ValueRow,
@@ -228,7 +229,8 @@ def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens
     count = head.integer(0, "number of configurations", 1)
     if not 1 <= count <= MOST_CONFIGURATIONS:
         raise LensFileError(f"MNUM is {count}, expected 1 to {MOST_CONFIGURATIONS} configurations", head.place)
-    tail = [record for record in sections.tail if record.place.line > head.place.line]
+    behind = [record for record in sections.tail if record.place.line > head.place.line]
+    tail = [record for record in behind if record.keyword not in TOLERANCES]
     groups = _grouped(_cells(tail, count, report), count, report)
     stated = head.integer(1, "active configuration", 0) if count > 1 else 1
     is_stated = 1 <= stated <= count

@@ -48,6 +48,7 @@ from raytrace.io.zemax.surfaces import (
     INVERSE,
     SYSTEM_IGNORED,
     TAIL_REASON,
+    TOLERANCES,
     Numbers,
     Sections,
     SurfaceType,
@@ -339,7 +340,8 @@ def read(
     kept = tuple(solve for solve in solves if not _is_followed(solve))
     for solve in kept:
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
-    merit, lines = merit_rows(tail, report), [record for record in tail if record.keyword in _TOLERANCES]
+    lines = [record for record in sections.tail if record.keyword in TOLERANCES]  # also behind the configurations
+    merit = merit_rows(tail, report)
     for record in lines:
         report.met(record.keyword, READ, record.place)
     states_none = all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in lines)
@@ -399,7 +401,7 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------
 
-_TOLERANCES, _NO_TOLERANCE = ("TOL", "TCMM"), "TOFF"
+_NO_TOLERANCE = "TOFF"
 _TEXT = "BLNK"
 _OPERAND = re.compile(r"[A-Z][A-Z0-9]{3}")
 
@@ -413,7 +415,7 @@ def merit_rows(lines: Iterable[Record], report: Draft, *, before_target: int = 0
     rows, unknown = [], {}
     for record in lines:
         word = record.keyword
-        if word in _TOLERANCES:
+        if word in TOLERANCES:
             continue
         if word == _TEXT:
             rows.append(Row(word, text=record.text.strip()))
@@ -457,7 +459,7 @@ def read_merit(path: str | PathLike) -> tuple[Row, ...]:
         hint = "is it a merit function file of OpticStudio (.MF)?"
         raise LensFileError(f"no operand of a merit function in {len(lines)} lines; {hint}", Place(name))
     for record in lines:
-        if record.keyword not in (*_TOLERANCES, _TEXT) and record.keyword not in DIMENSION and not _is_row(record):
+        if record.keyword not in (*TOLERANCES, _TEXT) and record.keyword not in DIMENSION and not _is_row(record):
             raise LensFileError(f"{record.keyword[:40]} is no line of a merit function", record.place)
     return tuple(dataclasses.replace(row, further=row.further[2:]) for row in rows)
 

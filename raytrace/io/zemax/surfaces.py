@@ -187,6 +187,10 @@ def glass_source(block: Block) -> int | None:
     return source if source < block.place.surface else None
 
 
+#: Lines of tolerances: an operand, and the comment on it.
+TOLERANCES = ("TOL", "TCMM")
+
+
 class Sections(NamedTuple):
     """A file sorted: the system, one block per surface, and the lines after them, multi-configuration operands last."""
 
