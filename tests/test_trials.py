@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 import torch
-from problems import number
+from problems import number, vector
 
 import raytrace as rt
 from raytrace.cli import main
@@ -155,10 +155,6 @@ def test_the_pose_behind_a_coordinate_break_joins_its_own(tmp_path):
 # -- sag terms --------------------------------------------------------------------------------------------------------
 
 X, Y = torch.tensor([[0.0, 1.5, -2.0, 3.0], [0.0, -0.5, 2.5, 1.0]], dtype=torch.float64)
-
-
-def vector(*numbers):
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 SAGS = {
