@@ -222,8 +222,6 @@ def test_damaged_files_of_every_type_give_a_lens_or_a_clear_error(examples):
             "a DGRATING surface has none",
         ),
         ({"curvature": number(0.1), "phase": rt.IdealLens(number(0.1), number(0.1))}, "a PARAXIAL surface has none"),
-        ({"before": rt.Pose(z=number(1.0))}, "a decentre along z"),
-        ({"is_break": True, "after": rt.Pose(x=number(1.0))}, "holds none of them"),
         ({"is_break": True, "glass": rt.MIRROR}, "holds none of them"),
         ({"before": rt.Pose(x=number([1.0, 2.0]))}, "a file holds one lens"),
         ({"before": rt.Pose(tilt_x=number(math.nan))}, "tilt or decentre is nan"),
