@@ -104,8 +104,8 @@ PUBLIC = {
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
     "read_tolerances": "tolerancing.files",
-    "Toleranced": "tolerancing.study",
-    "tolerance": "tolerancing.study",
+    "Toleranced": "tolerancing.toleranced",
+    "tolerance": "tolerancing.toleranced",
     "tolerances": "tolerancing.grades",
     # images and analyses
     "Memo": "tracing.scene",

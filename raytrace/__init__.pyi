@@ -115,8 +115,8 @@ from raytrace.tolerancing.files import read_tolerances as read_tolerances
 from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
-from raytrace.tolerancing.study import Toleranced as Toleranced
-from raytrace.tolerancing.study import tolerance as tolerance
+from raytrace.tolerancing.toleranced import Toleranced as Toleranced
+from raytrace.tolerancing.toleranced import tolerance as tolerance
 from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance
 from raytrace.tolerancing.tolerances import Tolerances as Tolerances
 from raytrace.tracing.base_ray import BaseRay as BaseRay

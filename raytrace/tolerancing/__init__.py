@@ -6,7 +6,10 @@ perturbation    `perturbed`: the lens with an error for each row, one lens or ma
 sampling        `draw_errors`: random errors, the same for a trial in any batch
 files           `read_tolerances`: the rows of a .zmx file
 criteria        RMS spot radius, RMS wavefront, MTF, merit, change of the PSF, boresight: of a batch of lenses
-study           `tolerance`: sensitivities, expectation by second order, Monte Carlo
+study           `Study`: a criterion as a function of errors and compensators, its best compensators, its second order
+tightening      limits by inverse sensitivity, and those of a yield at least total tightness
+monte_carlo     the criterion of random lenses, resumable
+toleranced      `tolerance` and its result: sensitivities, expectation, trials, table and figure
 as_built        `AsBuilt`: the expectation as a term of a merit function, with exact derivatives
 grades          `tolerances`: rows of published grades and of limits
 

@@ -1,4 +1,4 @@
-"""Tolerancing: sensitivities, the expectation of the lens as built, and its distribution by Monte Carlo.
+"""Study: a criterion of a lens as a function of errors and compensators, its best compensators, and its second order.
 
 The criterion of a lens with errors e and compensators c is a function f(q), the root of a mean square q or what is
 missing of the MTF; the lens as built has the compensators that minimise q. Of one trial they come from Newton's method
@@ -15,45 +15,30 @@ Source of the expansion: Rimmer, Appl. Opt. 9, 533 (1970).
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from os import PathLike
-from pathlib import Path
-from typing import Literal
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from scipy.special import ndtr
 from torch import Tensor
 
-from raytrace.io import write_lens
-from raytrace.maths.numerics import safe_divide, value
-from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
-from raytrace.optimization.merit import DefaultMerit, Merit
-from raytrace.plotting.style import GREY, INK, new_figure, styled
-from raytrace.shards import Share, total
-from raytrace.stores import Kind, Records, listed, number, record, whole
-from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, aligned, field_points
-from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, criterion_of
-from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
+from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_CHUNK = 1024  # lenses traced at once
+#: Lenses traced at once.
+CHUNK = 1024
 _MODEL = 2**13  # draws of the second-order model
-#: Percentages of the table of percentiles.
-PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 
 
 class Study:
@@ -153,7 +138,7 @@ class Study:
     def harm(self, errors: Tensor) -> Tensor:
         """How much worse the criterion (L,) of compensated lenses is than that of the nominal one."""
         zero = self.half.new_zeros(1, errors.shape[1])
-        found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(_CHUNK))]
+        found = [self.compensated(part)[0] for part in (zero, *errors.to(self.half).split(CHUNK))]
         nominal, *others = (self.criterion.value(q) for q in found)
         return self.criterion.sign * (torch.cat(others) - nominal)
 
@@ -260,413 +245,6 @@ def moments(row: Tolerance) -> tuple[float, float]:
     return middle, half * half * {"uniform": 1 / 3, "parabolic": 3 / 5, "end_points": 1.0}[row.distribution]
 
 
-@value
-class Toleranced(Result):
-    """The lens as built.
-
-    better: "smaller" or "larger", which values of the criterion are better; angle: radians of its unit, 0 for no angle.
-    nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
-    of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
-    second order; slope: (N,) its derivative times the half width.
-    estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
-    second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
-    second-order model. trials: (T,) the criterion of the perturbed and compensated lenses, nan where no ray arrives;
-    changes: (T, C) of the compensators.
-    unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
-    goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
-    before their limits were tightened, or None.
-    """
-
-    lens: Lens
-    tolerances: object
-    criterion: str
-    unit: str
-    nominal: Tensor
-    minimum: Tensor
-    maximum: Tensor
-    second_minimum: Tensor
-    second_maximum: Tensor
-    slope: Tensor
-    estimated: Tensor
-    expected: Tensor
-    expected_square: Tensor
-    predicted: Tensor
-    trials: Tensor
-    changes: Tensor
-    seed: int = 0
-    unsettled: int = 0
-    angle: float = 0.0
-    goal: float | None = None
-    share: float = 0.9
-    given: object = None
-    better: str = "smaller"
-
-    COLUMNS = property(
-        lambda self: (
-            Column("tolerance", form="<"),
-            Column("minimum", form=".5g"),
-            Column("maximum", form=".5g"),
-            Column("change_minimum", self.unit, ".5f", "change\nat min."),
-            Column("change_maximum", self.unit, ".5f", "change\nat max."),
-            Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
-            Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
-            Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
-            Column("share", "%", ".4g"),
-            Column("trials", self.unit, ".5f"),
-            Column("predicted", self.unit, ".5f", "2nd order"),
-            Column("difference", "%", "+.2f"),
-        )
-    )
-
-    @property
-    def title(self) -> str:
-        """The criterion and its unit."""
-        return f"{self.criterion}, {self.unit}" if self.unit else self.criterion
-
-    @property
-    def sign(self) -> int:
-        """1 where smaller values of the criterion are better, else -1."""
-        return -1 if self.better == "larger" else 1
-
-    @property
-    def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change to the worse first."""
-        return torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
-
-    def percentile(self, percent: float) -> Tensor:
-        """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
-        ordered = torch.nan_to_num(self.sign * self.trials, nan=torch.inf)
-        return self.sign * torch.quantile(ordered, percent / 100, interpolation="higher")
-
-    def yield_at(self, limit: float) -> float:
-        """Share of the trials whose criterion is a number or better: at most it, or at least it of the MTF."""
-        return float((self.sign * self.trials <= self.sign * limit).double().mean())
-
-    def table_of_shares(self) -> dict[str, Tensor]:
-        """The criterion that shares of the trials meet or surpass, the same by second order, and the difference."""
-        shares = sorted({*PERCENTILES, 100 * self.share})
-        traced = torch.stack([self.percentile(p) for p in shares])
-        predicted = self.sign * torch.quantile(self.sign * self.predicted, traced.new_tensor(shares) / 100)
-        off = 100 * (predicted / traced - 1)
-        return {"share": traced.new_tensor(shares), "trials": traced, "predicted": predicted, "difference": off}
-
-    def tightened(self) -> list[tuple[str, float]]:
-        """The tolerances whose limits were tightened, with the factor, the most tightened first."""
-        if self.given is None:
-            return []
-        pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
-        found = [(label, _factor(new, old)) for new, old, label in pairs]
-        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
-
-    def at_limit(self, number: int) -> int:
-        """How many trials have a compensator, by its number from 0, at one of its limits."""
-        one, moved = self.tolerances.compensators[number], self.changes[:, number]
-        return int(((moved <= one.minimum) | (moved >= one.maximum)).sum())
-
-    def trial(self, number: int) -> Lens:
-        """The lens of a trial, by its number from 0: perturbed, its compensators moved; a note has its criterion.
-
-        Its numbers are those that were fabricated: it has no variables, solves and tolerances. Raises ValueError for a
-        trial that was not traced.
-        """
-        if not 0 <= number < len(self.trials):
-            raise ValueError(f"trial {number}: expected 0 to {len(self.trials) - 1}, as {len(self.trials)} were traced")
-        errors = draw_errors(self.tolerances, 1, self.seed, first=number)[0]
-        lens = Perturbation(self.lens, self.tolerances)(errors)
-        lens = with_changes(lens, self.tolerances.compensators, self.changes[number])
-        figure = float(self.trials[number])
-        stated = "no light" if math.isnan(figure) else f"{self.criterion} {figure:.6g} {self.unit}".rstrip()
-        data = lens.optimization_data
-        data = data and dataclasses.replace(data, variables=(), solves=(), kept=(), tolerances=())
-        notes = (*lens.notes, f"As built: trial {number} of seed {self.seed}, {stated}")
-        return dataclasses.replace(lens, notes=notes, optimization_data=data)
-
-    @property
-    def typical(self) -> int:
-        """The number of the trial nearest to the median of those that light arrives in."""
-        good = self._arrived()
-        return int((good - good[good.isfinite()].median()).abs().nan_to_num(torch.inf).argmin())
-
-    @property
-    def worst_trial(self) -> int:
-        """The number of the trial with the worst criterion of those that light arrives in."""
-        return int((self.sign * self._arrived()).nan_to_num(-torch.inf).argmax())
-
-    @property
-    def best_trial(self) -> int:
-        """The number of the trial with the best criterion."""
-        return int((self.sign * self._arrived()).nan_to_num(torch.inf).argmin())
-
-    def _arrived(self) -> Tensor:
-        """The trials. Raises ValueError where light arrives in none."""
-        if not bool(self.trials.isfinite().any()):
-            reason = "no light arrives in any trial" if len(self.trials) else "no trials; give `trials` above 0"
-            raise ValueError(f"no typical trial and no worst one: {reason}")
-        return self.trials
-
-    def save_trials(self, folder: str | PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
-        """Write the lenses of three trials: typical.zmx, worst.zmx and best.zmx, which replace those of another study.
-
-        Glasses with index errors are in catalogs beside them, as worst-melts.agf. The folder is made. catalogs: the
-        glass catalogs (.agf) that the lens was read with. Raises ValueError without trials, LensFileError for a lens
-        that a .zmx file cannot hold.
-        """
-        lenses = [self.trial(k) for k in (self.typical, self.worst_trial, self.best_trial)]
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, lens in zip(("typical", "worst", "best"), lenses, strict=True):
-            write_lens(lens, folder / f"{name}.zmx", catalogs=catalogs)
-
-    def columns(self) -> dict[str, Tensor]:
-        order = self.worst
-        return {
-            "tolerance": order,
-            "minimum": self.tolerances.minimum[order],
-            "maximum": self.tolerances.maximum[order],
-            "unit": order,
-            "change_minimum": self.minimum[order],
-            "change_maximum": self.maximum[order],
-            "second_minimum": self.second_minimum[order],
-            "second_maximum": self.second_maximum[order],
-            "slope": self.slope[order],
-        }
-
-    def words(self) -> dict[str, Sequence[str]]:
-        return {"tolerance": self.tolerances.labels, "unit": [row.unit for row in self.tolerances]}
-
-    def summary(self) -> dict[str, float]:
-        """Figures of the lens as built, in the unit of the criterion."""
-        found = {
-            "nominal": float(self.nominal),
-            "estimated": float(self.estimated),
-            "expected": float(self.expected),
-        }
-        if self.better == "smaller":
-            found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
-        if len(self.trials):
-            good = self.trials[~self.trials.isnan()]
-            found |= {"mean": float(good.mean()), "sigma": float(good.std())}
-            found |= {"best": float((good * self.sign).min()) * self.sign}
-            found |= {"worst": float((good * self.sign).max()) * self.sign, "failed": int(self.trials.isnan().sum())}
-            found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
-        if self.goal is not None:
-            reached = self.sign * self.predicted <= self.sign * self.goal
-            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
-            if len(self.trials):
-                found["yield"] = self.yield_at(self.goal)
-        return found
-
-    def tables(self) -> list[Table]:
-        found = self.summary()
-        about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
-        root = found.get("expected_root_mean_square")
-        about.append(
-            f"as built, expected by second order: mean {found['expected']:.6g}"
-            + (f", root mean square {root:.6g}" if root is not None else "")
-            + f"; estimated by RSS {found['estimated']:.6g}"
-        )
-        if self.angle:
-            numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
-            numbers |= {"90 % within": found["percent_90"]} if len(self.trials) else {}
-            listed = ", ".join(f"{word} {1e3 * self.angle * number:.4g}" for word, number in numbers.items())
-            about.append(f"as an angle, divided by the focal length, mrad: {listed}")
-        if len(self.trials):
-            about.append(
-                f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
-                f"best {found['best']:.6g}, worst {found['worst']:.6g}"
-                + f"; {found['failed']} without light"
-                * (found["failed"] > 0)
-            )
-            for k, one in enumerate(self.tolerances.compensators):
-                c = self.changes[:, k]
-                if not bool(c.any()):
-                    about.append(f"compensator {one}: it stays, as it has no effect")
-                    continue
-                about.append(
-                    f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
-                    f"σ {float(c.std()):.4g}"
-                    + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
-                )
-        if self.goal is not None:
-            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
-            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
-            bound = "at most" if self.sign > 0 else "at least"
-            about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
-        if self.given is not None:
-            drawn = self.tightened()
-            listed = ", ".join(f"{label} × {factor:.3g}" for label, factor in drawn[:6])
-            about.append(
-                f"limits tightened of {len(drawn)} of {len(self.tolerances)} tolerances{': ' * bool(drawn)}{listed}"
-            )
-        if self.unsettled:
-            about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about)]
-        if len(self.trials):
-            bound = "within" if self.sign > 0 else "above"
-            found.append(
-                Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
-            )
-        return found
-
-    def document(self) -> dict:
-        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
-
-    @styled
-    def draw(self):
-        """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
-        figure = new_figure(9.0, 4.2)
-        left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
-        shown = self.trials[~self.trials.isnan()] if len(self.trials) else self.predicted
-        tail = torch.quantile(self.sign * shown, 0.998) * self.sign
-        ends = ((self.sign * shown).min() * self.sign, self.nominal, tail)
-        span = (float(min(ends)), float(max(ends)))
-        bins = np.linspace(*span, 41)
-        if len(self.trials):
-            left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(self.trials):,} trials")
-        density, _ = np.histogram(self.predicted.numpy(), bins=bins, density=True)
-        left.stairs(density, bins, color=INK, linewidth=1.2, label="second order")
-        left.axvline(float(self.nominal), color=GREY, linestyle=":", label="nominal")
-        left.axvline(float(self.expected), color="#d62728", label="expected")
-        left.set(xlabel=self.title, ylabel="density", xlim=span)
-        curve = left.twinx()
-        ordered = torch.sort(shown).values
-        curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
-        curve.set(ylabel="yield, %", ylim=(0, 100))
-        side = "right" if self.sign > 0 else "left"
-        left.legend(fontsize=8, loc=f"center {side}")
-        order = self.worst[:12].flip(0)
-        labels = [self.tolerances.labels[k] for k in order.tolist()]
-        right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
-        right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
-        right.set_yticks(range(len(order)), labels, fontsize=7.5)
-        right.set(xlabel=", ".join(filter(None, ("change of the criterion", self.unit))))
-        right.legend(fontsize=8, loc=f"lower {side}")
-        return figure
-
-
-def _factor(new: Tolerance, old: Tolerance) -> float:
-    """How much narrower the limits of a row are."""
-    wide = old.maximum - old.minimum
-    return (new.maximum - new.minimum) / wide if wide else 1.0
-
-
-def tolerance(
-    lens: Lens,
-    tolerances: Tolerances | None = None,
-    *,
-    grade: Literal["commercial", "precision", "high"] | None = None,
-    limits: str | Sequence[str] = "",
-    criterion: str = "rms",
-    trials: int = 1000,
-    seed: int = 0,
-    increment: float | None = None,
-    goal: float | None = None,
-    yield_: float | None = None,
-    fields: Tensor | Sequence | None = None,
-    rings: int = 4,
-    arms: int = 6,
-    model: Literal["gaussian", "drt"] = "gaussian",
-    pixel: float | None = None,
-    size: int | tuple[int, int] | None = None,
-    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
-    checkpoint: str | PathLike | None = None,
-    share: Share | None = None,
-    progress: Callable | None = None,
-) -> Toleranced:
-    """The lens as built: sensitivities, expectation by second order and Monte Carlo.
-
-    tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`
-        and `limits`.
-    grade: tolerances of published grades instead of the file's, see `tolerances`.
-    limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
-        the file or the grade, and "index=0" leaves one out.
-    criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
-        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
-        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; "psf", the change of the
-        PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the chief
-        ray; "boresight", the distance in µm by which the chief ray of the axial field misses its nominal place on the
-        sensor; "merit", a merit function. The compensators of every lens bring it to its best.
-    trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
-    increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
-        more than this, in its unit. Tighter limits stay.
-    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
-    yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
-        least total tightness until this share reaches the goal, by second order.
-    fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
-        symmetric, mirrored along y.
-    rings: of the pupil, Gaussian quadrature, 4 by default.
-    arms: of the pupil, 6 by default.
-    model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
-        0.005 by default, and number of pixels across, 21 by default.
-    merit: of "merit", as `optimize` takes it; by default that of the file.
-    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
-    share: of this process (`shards.share()`), if all processes of a job call alike.
-    progress: (count, unit) -> a progress bar.
-    Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
-    """
-    if trials < 0:
-        raise ValueError(f"trials {trials}: expected 0 or more")
-    if tolerances is None:
-        tolerances = tolerances_of_grade(lens, limits, grade=grade)
-    elif grade or limits:
-        raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
-    if not len(tolerances):
-        raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
-    if yield_ is not None and not 0 < yield_ < 1:
-        raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
-    sampling, given = sampling_of(lens, fields, rings, arms), tolerances
-    chosen = criterion_of(criterion, lens, sampling, model=model, pixel=pixel, size=size, merit=merit)
-    study = Study(lens, tolerances, chosen, sampling)
-    if study.compensators:
-        study.nominal_curvature()  # refuses those without effect
-    with torch.no_grad():
-        nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
-        if not bool(nominal_quantity.isfinite().all()):
-            raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
-        nominal = chosen.value(nominal_quantity[0])
-        if increment is not None:
-            tolerances = limited_to_change(tolerances, study.harm, increment)
-            study = Study(lens, tolerances, chosen, sampling)
-        model = study.second_order()
-        if goal is not None and yield_ is not None:
-            tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
-            study = Study(lens, tolerances, chosen, sampling)
-        low, high = _at_limits(study)
-        changes = [chosen.value(q) - nominal for q in (low, high)]
-        seconds = [
-            _second_order_change(chosen, model, limits.to(study.half))
-            for limits in (tolerances.minimum, tolerances.maximum)
-        ]
-        predicted, expected, mean_square = second_order_draws(tolerances, chosen, *model, seed)
-        values, moved = _monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
-    return Toleranced(
-        lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
-        minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
-        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=expected,
-        expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
-        unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
-        given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
-        angle=chosen.angle,
-    )  # fmt: skip
-
-
-def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
-    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
-    q0, g, H = model
-    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
-    return criterion.value(found) - criterion.value(found.new_tensor(q0))
-
-
-def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
-    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
-    if q0 <= 1e-12 * criterion.scale:
-        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
-    with torch.enable_grad():
-        q = g.new_tensor(q0).requires_grad_()
-        return g * torch.autograd.grad(criterion.value(q), q)[0]
-
-
 def sampling_of(lens: Lens, fields, rings: int, arms: int) -> Sampling:
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
@@ -676,14 +254,6 @@ def sampling_of(lens: Lens, fields, rings: int, arms: int) -> Sampling:
         new = [k for k in range(points.shape[1]) if not bool((points == mirrored[:, k, None]).all(0).any())]
         points, weights = torch.cat([points, mirrored[:, new]], 1), torch.cat([weights, weights[new]])
     return Sampling(points, weights / weights.sum(), *gauss_rings(rings, arms, **like))
-
-
-def _at_limits(study: Study) -> tuple[Tensor, Tensor]:
-    """q (N,) of the lenses with one error at its minimum, and at its maximum, compensated."""
-    low, high = study.tolerances.minimum.to(study.half), study.tolerances.maximum.to(study.half)
-    errors = torch.cat([torch.diag(low), torch.diag(high)])
-    found = torch.cat([study.compensated(part)[0] for part in errors.split(_CHUNK)])
-    return found[: len(low)], found[len(low) :]
 
 
 def second_order_draws(
@@ -700,56 +270,3 @@ def second_order_draws(
     found = criterion.value(drawn.clamp_min(0))
     off = drawn - drawn.mean()
     return found, found.mean() - safe_divide((off * found).sum(), (off * off).sum()) * (drawn.mean() - exact), exact
-
-
-_JOURNAL = Kind(
-    damaged=BadTolerance,
-    advice="give a new name for `checkpoint`",
-    other=BadTolerance,
-    refusal="{path} holds the trials of another study: {difference}; give a new name for `checkpoint`",
-)
-_TRIALS = record({"first": whole(), "rows": listed(listed(number(infinite=True)))})
-
-
-class _Trials:
-    """Finished trials in a file: rows of the criterion and the compensators, by the number of their first trial."""
-
-    def __init__(self, path: str | PathLike, study: Study, seed: int):
-        rows = [dataclasses.astuple(row) for row in (*study.tolerances, *study.compensators)]
-        about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
-        about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
-        about |= {"fields and pupil": digest(study.sampling)}
-        about |= {"settings": digest(repr(study.criterion.settings))} if study.criterion.settings else {}
-        self.store = Records(path, about, _JOURNAL, _TRIALS)
-        self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
-
-    def put(self, first: int, rows: Tensor) -> None:
-        # JSON has no nan: a trial without light is infinite
-        self.store.append({"first": first, "rows": torch.nan_to_num(rows, nan=math.inf).tolist()})
-
-
-def _monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
-    """The criterion (T,) of the trials, and the changes (T, C) of their compensators."""
-    count, others = len(study.tolerances), len(study.compensators)
-    found = study.half.new_zeros(trials, 1 + others)
-    chunks = [range(first, min(first + _CHUNK, trials)) for first in range(0, trials, _CHUNK)]
-    mine = (share or Share()).of(range(len(chunks)))
-    stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
-    bar = progress(trials, "lens") if progress and trials else None
-    for k in mine:
-        part = chunks[k]
-        rows = stored.found.get(part.start) if stored else None
-        if rows is None or len(rows) != len(part):
-            errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
-            q, changes = study.compensated(errors.reshape(len(part), count))
-            rows = torch.cat([study.criterion.value(q)[:, None], changes], -1)
-            if stored:
-                stored.put(part.start, rows)
-        found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
-        if bar is not None:
-            bar.update(len(part))
-    if bar is not None:
-        bar.close()
-    if share is not None and share.processes > 1:
-        found = total(found)
-    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 1:]

@@ -1,0 +1,67 @@
+"""Monte Carlo: the criterion of perturbed and compensated lenses, each seeded by its number; a file of the finished."""
+
+import dataclasses
+import math
+from os import PathLike
+
+import torch
+from torch import Tensor
+
+from raytrace.shards import Share, total
+from raytrace.stores import Kind, Records, listed, number, record, whole
+from raytrace.system.identity import digest, identity
+from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.study import CHUNK, Study
+from raytrace.tolerancing.tolerances import BadTolerance
+
+_JOURNAL = Kind(
+    damaged=BadTolerance,
+    advice="give a new name for `checkpoint`",
+    other=BadTolerance,
+    refusal="{path} holds the trials of another study: {difference}; give a new name for `checkpoint`",
+)
+_TRIALS = record({"first": whole(), "rows": listed(listed(number(infinite=True)))})
+
+
+class _Trials:
+    """Finished trials in a file: rows of the criterion and the compensators, by the number of their first trial."""
+
+    def __init__(self, path: str | PathLike, study: Study, seed: int):
+        rows = [dataclasses.astuple(row) for row in (*study.tolerances, *study.compensators)]
+        about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
+        about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
+        about |= {"fields and pupil": digest(study.sampling)}
+        about |= {"settings": digest(repr(study.criterion.settings))} if study.criterion.settings else {}
+        self.store = Records(path, about, _JOURNAL, _TRIALS)
+        self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
+
+    def put(self, first: int, rows: Tensor) -> None:
+        # JSON has no nan: a trial without light is infinite
+        self.store.append({"first": first, "rows": torch.nan_to_num(rows, nan=math.inf).tolist()})
+
+
+def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
+    """The criterion (T,) of the trials, and the changes (T, C) of their compensators."""
+    count, others = len(study.tolerances), len(study.compensators)
+    found = study.half.new_zeros(trials, 1 + others)
+    chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
+    mine = (share or Share()).of(range(len(chunks)))
+    stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
+    bar = progress(trials, "lens") if progress and trials else None
+    for k in mine:
+        part = chunks[k]
+        rows = stored.found.get(part.start) if stored else None
+        if rows is None or len(rows) != len(part):
+            errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
+            q, changes = study.compensated(errors.reshape(len(part), count))
+            rows = torch.cat([study.criterion.value(q)[:, None], changes], -1)
+            if stored:
+                stored.put(part.start, rows)
+        found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
+        if bar is not None:
+            bar.update(len(part))
+    if bar is not None:
+        bar.close()
+    if share is not None and share.processes > 1:
+        found = total(found)
+    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 1:]
