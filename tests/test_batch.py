@@ -72,11 +72,20 @@ VERBS = {
 LONG = ("wavefront", "zernike", "strehl", "psf wave", "psf fourier")
 
 
+#: Accuracy relative to the peak: dark pixels are small differences of waves, and all lenses of a batch have the Fourier
+#: transform of the widest blur, whose error at order 1 this is.
+OF_THE_PEAK = {"psf wave": 2e-9, "psf fourier": 2e-3}
+
+
 def compare(verb, name, ray_aiming):
     lenses = perturbed(name, ray_aiming=ray_aiming, posed=verb not in ("psf paraxial", "psf fourier"))
     assert lenses.count == 3
     together = VERBS[verb](lenses)
     each = torch.stack([VERBS[verb](lenses[k]) for k in range(3)])
+    if verb in OF_THE_PEAK:
+        peak = each.amax((-1, -2), keepdim=True)
+        assert float(((together - each).abs() / peak).max()) < OF_THE_PEAK[verb]
+        return
     torch.testing.assert_close(together, each, rtol=1e-9, atol=1e-11)
 
 
