@@ -23,7 +23,7 @@ from raytrace.imaging.codesign import Batches, absolute_error, camera, errors_as
 from raytrace.imaging.pictures import Pictures, digest, files, read, split
 from raytrace.imaging.training import Run, load_state, read_json, read_state
 from raytrace.io import as_lens
-from raytrace.plotting.style import FIELD_COLOURS, GREY, new_figure
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure
 from raytrace.settings import CodesignSettings
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -40,19 +40,6 @@ BUILDS = {
     "precision, fixed sensor": ("precision", "none"),
 }
 MEASURES = {"l1": "mean L¹", "psnr": "PSNR, dB"}
-COLUMNS = (
-    "build",
-    "psf",
-    "training",
-    "seed",
-    "steps",
-    "seconds",
-    "l1",
-    "psnr",
-    "l1_spread",
-    "psnr_spread",
-    "psnr_least",
-)
 _CHECK = 6  # cameras of the test with DRT PSFs
 
 
@@ -155,20 +142,31 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def figure(rows: list[dict]):
-    """Difference of PSNR of every seed, with the mean and its interval, by build."""
-    builds = [b for b in BUILDS if paired(rows, b, "gaussian", "psnr")]
-    drawn = new_figure(6.4, 3.2)
-    for panel, (measure, label) in zip(drawn.subplots(1, 2), MEASURES.items(), strict=True):
-        for number, build in enumerate(builds):
-            values = paired(rows, build, "gaussian", measure)
+def figure(differences: dict[str, dict[str, list[float]]]):
+    """Differences of measures, of every seed and with the mean and its interval, by build."""
+    drawn = new_figure(7.0, 3.2)
+    panels = drawn.subplots(1, 2)
+    for panel, measure in zip(panels, ("psnr", "l1"), strict=True):
+        builds = differences[measure]
+        for number, (values, colour) in enumerate(zip(builds.values(), FIELD_COLOURS, strict=False)):
+            words = (None, None) if number else ("a seed", "mean, 95 % interval")
+            panel.plot([number - 0.15] * len(values), values, "o", ms=3.5, color=GREY, label=words[0])
             mean, width = interval(values)
-            panel.plot([number - 0.15] * len(values), values, "o", ms=3.5, color=GREY)
-            panel.errorbar(number + 0.1, mean, width, fmt="s", capsize=4, ms=5, color=FIELD_COLOURS[number])
-        panel.axhline(0, color=GREY, linewidth=0.8, linestyle=":")
+            panel.errorbar(number + 0.1, mean, width, fmt="s", capsize=4, ms=5, color=colour, label=words[1])
+        panel.axhline(0, color=INK, linewidth=0.8, linestyle=":")
         panel.set_xticks(range(len(builds)), [b.replace(", ", ",\n") for b in builds], fontsize=8)
-        panel.set(xlim=(-0.5, len(builds) - 0.5), ylabel=f"as-built less nominal training: {label}")
+        panel.set(xlim=(-0.5, len(builds) - 0.5), ylabel=f"difference of {MEASURES[measure]}")
+    panels[0].legend(fontsize=8)
     return drawn
+
+
+def save(rows: list[dict], drawn, stem: Path) -> None:
+    """The rows as stem.csv and the figure as stem.png."""
+    with open(stem.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*rows[0]], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    drawn.savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -218,11 +216,9 @@ def main(words: list[str] | None = None) -> None:
         rows = _rows(lens, of_test, spent, chosen)
         print(table(rows), flush=True)
     if chosen.docs:
-        with open(chosen.docs / "codesign_as_built.csv", "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-        figure(rows).savefig(chosen.docs / "codesign_as_built.png", dpi=150, bbox_inches="tight")
+        builds = [build for build in chosen.builds if paired(rows, build, "gaussian", "psnr")]
+        differences = {m: {b: paired(rows, b, "gaussian", m) for b in builds} for m in MEASURES}
+        save(rows, figure(differences), chosen.docs / "codesign_as_built_network")
 
 
 def file_name(words: str) -> str:

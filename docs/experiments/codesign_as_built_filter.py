@@ -9,13 +9,12 @@ second call computes what is missing.
 """
 
 import argparse
-import csv
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 import torch
-from codesign_as_built import BASE, BUILDS, MEASURES, file_name, interval
+from codesign_as_built import BASE, BUILDS, MEASURES, figure, file_name, interval, save
 from torch import Tensor
 
 from raytrace.files import write_json
@@ -27,7 +26,6 @@ from raytrace.imaging.pictures import Pictures, files, read, split
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, restore
 from raytrace.imaging.training import read_json
 from raytrace.io import as_lens
-from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure
 from raytrace.system.lens import Lens
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tracing.compiled import prepare
@@ -37,7 +35,6 @@ SETTINGS = dataclasses.replace(BASE, start="paraxial", vary="sensor", hold="", p
 _LENSES, _DISTANCES, _PATCHES = 24, 8, 8  # of a training, of each lens there, and of each lens of the test
 _SENSORS = np.linspace(-0.45, -0.09, 7)  # mm from the paraxial image at 25 m, where the error is computed
 _UNSEEN = 2**62
-COLUMNS = ("build", "seed", "training", "tested on", "sensor_mm", "l1", "psnr", "psnr_spread", "psnr_least")
 
 
 def kernels_of(built: Camera, errors: Tensor | None) -> Tensor:
@@ -128,26 +125,15 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def figure(rows: list[dict]):
-    """As-built less nominal training on perturbed cameras: every seed, the mean and its interval, by build."""
-    builds, drawn = [*dict.fromkeys(row["build"] for row in rows)], new_figure(7.0, 3.2)
-    panels = drawn.subplots(1, 2)
-    for panel, (measure, label) in zip(panels, {"psnr": MEASURES["psnr"], "l1": MEASURES["l1"]}.items(), strict=True):
-        for number, build in enumerate(builds):
-            pair = [column(rows, build, training, "perturbed", measure) for training in ("nominal", "as built")]
-            values = pair[1] - pair[0]
-            mean, width = interval(list(values))
-            panel.plot(
-                [number - 0.15] * len(values), values, "o", ms=3.5, color=GREY, label=None if number else "a seed"
-            )
-            words = None if number else "mean, 95 % interval"
-            colour = FIELD_COLOURS[number]
-            panel.errorbar(number + 0.1, mean, width, fmt="s", capsize=4, ms=5, color=colour, label=words)
-        panel.axhline(0, color=INK, linewidth=0.8, linestyle=":")
-        panel.set_xticks(range(len(builds)), [b.replace(", ", ",\n") for b in builds], fontsize=8)
-        panel.set(xlim=(-0.5, len(builds) - 0.5), ylabel=f"difference of {label}")
-    panels[0].legend(fontsize=8)
-    return drawn
+def differences(rows: list[dict]) -> dict[str, dict[str, list[float]]]:
+    """As-built less nominal training on perturbed cameras, of every seed, by measure and build."""
+    builds = [*dict.fromkeys(row["build"] for row in rows)]
+
+    def of(build: str, measure: str) -> list[float]:
+        nominal, built = (column(rows, build, training, "perturbed", measure) for training in ("nominal", "as built"))
+        return list(built - nominal)
+
+    return {measure: {build: of(build, measure) for build in builds} for measure in MEASURES}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -177,11 +163,7 @@ def main(words: list[str] | None = None) -> None:
             rows += read_json(path)["rows"]
         print(table(rows), flush=True)
     if chosen.docs:
-        with open(chosen.docs / "codesign_as_built.csv", "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-        figure(rows).savefig(chosen.docs / "codesign_as_built.png", dpi=150, bbox_inches="tight")
+        save(rows, figure(differences(rows)), chosen.docs / "codesign_as_built")
 
 
 if __name__ == "__main__":

@@ -12,13 +12,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import Lens, aligned, with_sensor_distance
 from raytrace.system.tolerance_data import Compensator
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
-from raytrace.tracing.focus import along_normal, spot_parabola
+from raytrace.tracing.focus import along_normal, shift_to_focus, spot_parabola
 from raytrace.tracing.spot import image_rays
 
 _RINGS, _ARMS = 4, 6  # of the pupil, as of `tolerance`
@@ -58,6 +57,6 @@ def _best_focus(lens: Lens, fields: Tensor) -> Tensor:
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     covariance, variance = ((shares * torch.nan_to_num(part)).sum((-2, -1)) for part in (covariance, variance))
     along = along_normal(lens)
-    return -safe_divide(covariance, variance) / (
+    return shift_to_focus(covariance, variance) / (
         along.reshape(covariance.shape) if isinstance(along, Tensor) else along
     )

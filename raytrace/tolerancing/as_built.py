@@ -30,7 +30,7 @@ from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 from raytrace.tracing.compiled import Task, forward, is_expressible, prepare, push, task_of
-from raytrace.tracing.focus import focus_moments
+from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.spot import image_rays, to_image
 
@@ -149,7 +149,7 @@ class AsBuiltTerm:
         share = safe_divide(weights, weights.sum(-1, keepdim=True))
         moments = focus_moments(Rays(position.flatten(-2), along, valid), self.weights)
         covariance, variance = ((fields * part).sum(-1) for part in moments)
-        shift = torch.clamp(-safe_divide(covariance, variance), *self.limits)[:, None, None]
+        shift = torch.clamp(shift_to_focus(covariance, variance), *self.limits)[:, None, None]
         moved = torch.where(valid, points + shift * safe_divide(along[:2], along[2].expand_as(along[:2])), 0.0)
         offsets = torch.where(valid, moved - (share * moved).sum(-1, keepdim=True), 0.0)
         return (fields[:, None] * share).sqrt() * offsets
@@ -241,8 +241,7 @@ def design(tolerances: Tolerances) -> Tensor:
     """Errors (L, N) of the sample in the rows' units, float64."""
     mean, variance = (np.array(part) for part in zip(*map(moments, tolerances), strict=True))
     signs = hadamard(len(tolerances) + 1)[:, 1 : len(tolerances) + 1]
-    half = np.array([row.maximum if row.group else np.nan for row in tolerances])
-    errors = mean + signs * np.where(np.isnan(half), np.sqrt(variance), half)
+    errors = mean + signs * np.sqrt(variance)
     for n, row in enumerate(tolerances):
         if row.kind == "irregularity_angle" and (row.minimum, row.maximum) == (-90, 90):
             errors[:, n] = _ANGLES[0] + _ANGLES[1] * signs[:, n]

@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.sheared_batch import ShearedPupils
-from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.numerics import value
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
-from raytrace.tracing.focus import spot_parabola
+from raytrace.tracing.focus import shift_to_focus, spot_parabola
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import image_rays, spot_of_points
@@ -220,5 +220,5 @@ def at_best_focus(
 ) -> tuple[Tensor, Tensor]:
     """The least of q₀ + 2 s q₁ + s² q₂ between limits of s, and s; (L,) each, differentiable."""
     q0, q1, q2 = parabola
-    shift = torch.clamp(-safe_divide(q1, q2), least, most)
+    shift = torch.clamp(shift_to_focus(q1, q2), least, most)
     return q0 + shift * (2 * q1 + shift * q2), shift

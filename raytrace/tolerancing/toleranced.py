@@ -25,7 +25,7 @@ from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.study import CHUNK, Study, sampling_of, second_order_draws, with_changes
+from raytrace.tolerancing.study import Study, sampling_of, second_order_draws, with_changes
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
@@ -404,8 +404,8 @@ def tolerance(
         if goal is not None and yield_ is not None:
             tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
             study = Study(lens, tolerances, chosen, sampling)
-        low, high = _at_limits(study)
-        changes = [chosen.value(q) - nominal for q in (low, high)]
+        limits_alone = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
+        changes = (chosen.sign * study.harm(limits_alone)).chunk(2)
         seconds = [
             _second_order_change(chosen, model, limits.to(study.half))
             for limits in (tolerances.minimum, tolerances.maximum)
@@ -438,11 +438,3 @@ def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
     with torch.enable_grad():
         q = g.new_tensor(q0).requires_grad_()
         return g * torch.autograd.grad(criterion.value(q), q)[0]
-
-
-def _at_limits(study: Study) -> tuple[Tensor, Tensor]:
-    """q (N,) of the lenses with one error at its minimum, and at its maximum, compensated."""
-    low, high = study.tolerances.minimum.to(study.half), study.tolerances.maximum.to(study.half)
-    errors = torch.cat([torch.diag(low), torch.diag(high)])
-    found = torch.cat([study.compensated(part)[0] for part in errors.split(CHUNK)])
-    return found[: len(low)], found[len(low) :]

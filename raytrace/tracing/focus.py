@@ -58,6 +58,11 @@ def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
     return spot_of(rays, weights, empty=empty).mean_square_radius, *focus_moments(rays, weights)
 
 
+def shift_to_focus(covariance: Tensor, variance: Tensor) -> Tensor:
+    """s = -Q1/Q2 (...) mm along the normal of the sensor, where Q0 + 2 s Q1 + s² Q2 is least; 0 where Q2 is 0."""
+    return -safe_divide(covariance, variance)
+
+
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
     """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm along its own normal.
 
@@ -85,8 +90,8 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
         )
     if empty == "error" and not bool(variance > 0):
         raise EmptySpot("no sensor distance is best: the rays are parallel, or there is only one")
-    shift = safe_divide(covariance, variance) / along_normal(lens)
-    return torch.where(variance > 0, lens.surfaces[-2].thickness - shift, torch.nan)
+    shift = shift_to_focus(covariance, variance) / along_normal(lens)
+    return torch.where(variance > 0, lens.surfaces[-2].thickness + shift, torch.nan)
 
 
 def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
