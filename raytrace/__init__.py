@@ -167,6 +167,7 @@ PUBLIC = {
     "PhaseVariables": "imaging",
     "RedNet": "imaging",
     "Run": "imaging.training",
+    "Sensor": "imaging.sensor",
     "Variables": "imaging",
     "train": "imaging.training",
 }

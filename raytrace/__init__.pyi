@@ -41,6 +41,7 @@ from raytrace.imaging.restoration import power_spectrum as power_spectrum
 from raytrace.imaging.restoration import psnr as psnr
 from raytrace.imaging.restoration import restore as restore
 from raytrace.imaging.restoration import wiener as wiener
+from raytrace.imaging.sensor import Sensor as Sensor
 from raytrace.imaging.training import Run as Run
 from raytrace.imaging.training import train as train
 from raytrace.io import LensFileError as LensFileError
