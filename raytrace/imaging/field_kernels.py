@@ -56,6 +56,10 @@ class FieldKernels:
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor; where no chief ray arrives, a point."""
+        parts = [dataclasses.replace(self, object_distances=distance) for distance in self.object_distances.split(1)]
+        return torch.cat([part._of_one_distance(points) for part in parts], 1)
+
+    def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
         if not is_round_about_axis(self.lens):
@@ -150,26 +154,32 @@ def window_size(
     with torch.no_grad():
         fields = sensor.fields(lens, points)
         fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
-        batch = scene(lens, fields, object_distances, lens.wavelengths)
-        rule = with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0]
-        rays = trace_scene(batch, rule)
-        chief = chief_landing(batch)
-        origin = chief if not lateral_colour else chief[..., lens.primary_wavelength - 1, None]
-        offset = torch.where(rays.valid, rays.position[:2] - origin[..., None], torch.nan)
-        reach = offset.abs().nan_to_num(0.0).max()
-        if model != "drt":  # the tails of a Gaussian
-            mean = offset.nanmean(-1, keepdim=True)
-            sigma = (offset - mean).square().nanmean(-1).sqrt()
-            reach = torch.maximum(reach, (mean[..., 0].abs() + _SIGMAS * sigma).nan_to_num(0.0).max())
+        how = {"tails": model != "drt", "lateral_colour": lateral_colour}
+        reach = max(_reach(lens, fields, distance, **how) for distance in object_distances.split(1))
         if MODELS[model].waves:
-            reach = reach + _RINGS * 1e-3 * lens.wavelengths.max() * axial_f_number(lens)
-    size = 2 * math.ceil(float(reach) / sensor.pitch + 0.5) + 1
+            reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
+    size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
     if size > _LARGEST:
         raise WindowTooLarge(
-            f"the blur reaches {1e3 * float(reach):.0f} µm, {size} pixels of {1e3 * sensor.pitch:g} µm across, more than "
+            f"the blur reaches {1e3 * reach:.0f} µm, {size} pixels of {1e3 * sensor.pitch:g} µm across, more than "
             f"{_LARGEST}: focus the lens, as by rt.focus(lens).lens, or take larger pixels"
         )
     return size
+
+
+def _reach(lens: Lens, fields: Tensor, distance: Tensor, *, tails: bool, lateral_colour: bool) -> float:
+    """Largest distance in x or y, mm, of light from the origin of its kernel; tails: of Gaussians, too."""
+    batch = scene(lens, fields, distance, lens.wavelengths)
+    rays = trace_scene(batch, with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0])
+    chief = chief_landing(batch)
+    origin = chief[..., lens.primary_wavelength - 1, None] if lateral_colour else chief
+    offset = torch.where(rays.valid, rays.position[:2] - origin[..., None], torch.nan)
+    reach = offset.abs().nan_to_num(0.0).max()
+    if tails:
+        mean = offset.nanmean(-1, keepdim=True)
+        sigma = (offset - mean).square().nanmean(-1).sqrt()
+        reach = torch.maximum(reach, (mean[..., 0].abs() + _SIGMAS * sigma).nan_to_num(0.0).max())
+    return float(reach)
 
 
 def order_of(

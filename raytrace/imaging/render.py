@@ -35,9 +35,12 @@ from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level
 
 _MOST_NODES = 65  # along the longer side
-_DEGREE = 9  # of the polynomials of the distortion
-_FIT = 17  # places along a side at which it is fitted
-_RADII = 33  # of the illumination of a round lens
+_DEGREE = 13  # of the polynomials of the distortion of other lenses
+_FIT = 25  # places along a side at which these are fitted
+_LIT = 33  # radii at which the illumination of a round lens is computed
+_RADII = 257  # at which the chief rays of a round lens are traced
+_COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
+_ROUNDS = 4
 _PLANES = 8
 
 
@@ -45,13 +48,15 @@ _PLANES = 8
 class Optics:
     """A lens in front of a sensor, prepared for pictures: what `optics` computes once for many of them.
 
-    kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; illumination: (H, W) or None; ideal: (2, H, W),
+    kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of a
+    white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ|; order: of the model.
     """
 
     sensor: Sensor
     kernels: Tensor
+    flux: Tensor
     illumination: Tensor | None
     ideal: Tensor | None
     planes: Tensor
@@ -68,60 +73,65 @@ class Optics:
         progress: Callable[[int], object] | None = None,
     ) -> Tensor:
         """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm, see `render`."""
-        picture = self._checked(picture)
+        picture = checked_picture(picture, self.sensor)
+        if depth is None and len(self.planes) > 1:
+            raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
+        inverse = None if depth is None else 1 / checked_depth(depth, picture)
         if self.ideal is not None:
             picture = resampled(picture, self.ideal, boundary)
+            if inverse is not None:
+                inverse = resampled(inverse[..., None, :, :], self.ideal, boundary)[..., 0, :, :]
         how = {"boundary": boundary, "tol": 0.3 * self.tol, "progress": progress}
-        shade = 1.0 if self.illumination is None else self.illumination.to(picture.dtype)
-        if depth is None:
-            if len(self.planes) > 1:
-                raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
-            return varying_blur(shade * picture, self.kernels[:, :, 0], **how)
-        inverse = 1 / self._checked_depth(depth, picture)
-        if self.ideal is not None:
-            inverse = resampled(inverse[..., None, :, :], self.ideal, boundary)[..., 0, :, :]
-        masks = depth_masks(inverse, self.planes.to(inverse.dtype))
+        flux = [enlarged(part, picture) for part in self.flux]
+        if inverse is None:
+            return varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how)
+        shade = 1.0 if self.illumination is None else self.illumination.to(picture)
+        masks = depth_masks(inverse, self.planes.to(inverse))
 
         def layers():
             for d, mask in enumerate(masks.unbind(-3)):
-                mask = mask[..., None, :, :]
-                parts = shade * mask * picture, mask.expand_as(picture)
-                yield tuple(varying_blur(part, self.kernels[:, :, d], **how) for part in parts)
+                cover = flux[d] * mask[..., None, :, :]
+                yield tuple(
+                    varying_blur(part, self.kernels[:, :, d], **how) for part in (cover * picture, cover / shade)
+                )
 
         return occlusion(layers())
 
-    def _checked(self, picture: Tensor) -> Tensor:
-        picture = as_picture(picture)
-        columns, rows = self.sensor.pixels
-        channels = self.kernels.shape[3]
-        picture = picture[None] if picture.dim() == 2 else picture
-        if picture.shape[-2:] != (rows, columns):
-            raise ValueError(
-                f"a picture of {picture.shape[-1]} × {picture.shape[-2]} pixels on a sensor of {columns} × {rows}: resize "
-                "it, or give the sensor its number of pixels"
-            )
-        if picture.shape[-3] not in (1, channels):
-            raise ValueError(
-                f"a picture of {picture.shape[-3]} channels on a sensor of {channels}: expected (..., {channels}, rows, "
-                "columns)"
-            )
-        if not bool(torch.isfinite(picture).all()):
-            count = int((~torch.isfinite(picture)).sum())
-            raise ValueError(f"{count} numbers of the picture are not finite: expected light in every pixel")
-        return picture.expand(*picture.shape[:-3], channels, rows, columns)
 
-    def _checked_depth(self, depth: Tensor, picture: Tensor) -> Tensor:
-        depth = torch.as_tensor(depth, dtype=picture.dtype, device=picture.device)
-        if depth.shape[-2:] != picture.shape[-2:]:
-            raise ValueError(
-                f"a depth map of shape {tuple(depth.shape)} and a picture of {tuple(picture.shape)}: expected the distance "
-                "of every pixel"
-            )
-        if bool(depth.isnan().any()) or bool((depth <= 0).any()):
-            raise ValueError(
-                "a depth map with nan, zero or negative numbers: expected distances in mm from surface 1, inf allowed"
-            )
-        return depth
+def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
+    """Pictures (..., C, H, W) of the channels of the sensor. Raises ValueError for others."""
+    picture = as_picture(picture)
+    (columns, rows), channels = sensor.pixels, len(sensor.channels)
+    picture = picture[None] if picture.dim() == 2 else picture
+    if picture.dim() < 2 or picture.shape[-2:] != (rows, columns):
+        raise ValueError(
+            f"a picture of {picture.shape[-1]} × {picture.shape[-2]} pixels on a sensor of {columns} × {rows}: resize "
+            "it, or give the sensor its number of pixels"
+        )
+    if picture.shape[-3] not in (1, channels):
+        raise ValueError(
+            f"a picture of {picture.shape[-3]} channels on a sensor of {channels}: expected (..., {channels}, rows, "
+            "columns)"
+        )
+    if not bool(torch.isfinite(picture).all()):
+        count = int((~torch.isfinite(picture)).sum())
+        raise ValueError(f"{count} numbers of the picture are not finite: expected light in every pixel")
+    return picture.expand(*picture.shape[:-3], channels, rows, columns)
+
+
+def checked_depth(depth: Tensor, picture: Tensor) -> Tensor:
+    """Distances (..., H, W) mm of the pixels of pictures (..., C, H, W). Raises ValueError for others."""
+    depth = torch.as_tensor(depth, dtype=picture.dtype, device=picture.device)
+    if depth.shape[-2:] != picture.shape[-2:]:
+        raise ValueError(
+            f"a depth map of shape {tuple(depth.shape)} and a picture of {tuple(picture.shape)}: expected the distance "
+            "of every pixel"
+        )
+    if bool(depth.isnan().any()) or bool((depth <= 0).any()):
+        raise ValueError(
+            "a depth map with nan, zero or negative numbers: expected distances above 0 in mm from surface 1, inf allowed"
+        )
+    return depth
 
 
 def optics(
@@ -159,7 +169,7 @@ def optics(
     grid, error = _grid(kernels, sensor, nodes, 0.5 * tol, like)
     shade = _illumination(lens, sensor, like) if illumination else None
     ideal = _ideal(lens, sensor, like) if distortion else None
-    return Optics(sensor, grid, shade, ideal, planes, error, order, tol)
+    return Optics(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
 
 
 def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
@@ -205,16 +215,53 @@ def _grid(
     return grid, error
 
 
+def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tensor:
+    """Light v (D, C, H′, W′) of the points of a white scene, whose image is the relative illumination E.
+
+    Kernels that vary shift light from place to place: Σ_r′ h(r - r′; r′) is not 1 everywhere, but a white scene is as
+    bright as its exit pupil is large, whatever the aberrations. v: the fixed point of v + E - A v, A the blur, from E
+    on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
+    """
+    columns, rows = sensor.pixels
+    factor = max(1, 2 * math.ceil(max(rows, columns) / _COARSE / 2) - 1)
+    coarse = _pooled(kernels, factor)
+    size = math.ceil(rows / factor), math.ceil(columns / factor)
+    white = kernels.new_ones(kernels.shape[3], rows, columns) if illumination is None else illumination.to(kernels)
+    white = torch.nn.functional.adaptive_avg_pool2d(white.expand(kernels.shape[3], rows, columns), size)
+    flux = []
+    for kernel in coarse.unbind(2):
+        light = white
+        for _ in range(_ROUNDS):
+            light = light + white - varying_blur(light, kernel)
+        flux.append(light)
+    return torch.stack(flux)
+
+
+def _pooled(kernels: Tensor, factor: int) -> Tensor:
+    """Kernels (..., h, w) on pixels so many times larger, an odd number, whose middle stays in the middle."""
+    if factor == 1:
+        return kernels
+    size = [2 * math.ceil((n - factor) / 2 / factor) + 1 for n in kernels.shape[-2:]]
+    down, right = ((n * factor - old) // 2 for n, old in zip(size, kernels.shape[-2:], strict=True))
+    padded = torch.nn.functional.pad(kernels, (right, right, down, down))
+    return padded.unflatten(-1, (size[1], factor)).unflatten(-3, (size[0], factor)).sum((-3, -1))
+
+
+def enlarged(light: Tensor, picture: Tensor) -> Tensor:
+    """Numbers (C, H′, W′) on larger pixels at those of pictures (..., C, H, W), bilinear."""
+    if light.shape[-2:] == picture.shape[-2:]:
+        return light.to(picture)
+    how = {"size": picture.shape[-2:], "mode": "bilinear", "align_corners": False}
+    return torch.nn.functional.interpolate(light.to(picture)[None], **how)[0]
+
+
 def _illumination(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives."""
     points = _every_pixel(sensor, like)
     if is_round_about_axis(lens):
-        radii = torch.linspace(0, 1, _RADII, dtype=like.dtype, device=like.device) * _half_diagonal(points)
+        radii = _radii(points, _LIT)
         curve = _illumination_at(lens, sensor, torch.stack([torch.zeros_like(radii), radii]))
-        place = torch.hypot(*points) * ((_RADII - 1) / radii[-1])
-        left = place.floor().clamp_max(_RADII - 2).long()
-        part = place - left
-        return (1 - part) * curve[left] + part * curve[left + 1]
+        return _along(radii, curve, points)
     grid = _illumination_at(lens, sensor, _places(sensor, _FIT, _FIT, like)).reshape(_FIT, _FIT)
     across, along = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
     return along.T @ grid @ across
@@ -230,18 +277,16 @@ def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
 def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
-    Polynomials of degree 9 through the paraxial images of 17 × 17 chief rays. The scale is that of chief rays near the
-    axis, on the sensor as it stands.
+    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, linear between 257 radii;
+    else polynomials of degree 13 through 25 × 25 chief rays.
     """
+    if is_round_about_axis(lens):
+        every = _every_pixel(sensor, like)
+        radii = _radii(every, _RADII)
+        image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(radii[1:]), radii[1:]]))[1] / radii[1:]
+        return sensor.pixel_of(_along(radii, torch.cat([torch.ones_like(image[:1]), image]), every) * every)
     points = _places(sensor, _FIT, _FIT, like)
-    near = 1e-3 * _half_diagonal(points) * torch.eye(2, dtype=like.dtype, device=like.device)
-    fields = sensor.fields(lens, torch.cat([points, near], 1))
-    arrives = ~fields.isnan().any(0)
-    extents = object_field(lens, fields.nan_to_num(0.0), first_order(lens))[0]
-    scale = near @ torch.linalg.inv(extents[:, -2:])  # mm of the image per unit of the object
-    ideal = scale @ extents[:, :-2]
-    shift = sensor.pixel_of(ideal) - sensor.pixel_of(points)
-    shift = torch.where(arrives[:-2], shift, 0.0)
+    shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
     columns, rows = sensor.pixels
     row, column = (_chebyshev(count, _FIT, like) for count in (rows, columns))
     # Least squares by the pseudoinverse along either axis.
@@ -253,16 +298,35 @@ def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     return torch.stack([at[1], at[0]]) + shift
 
 
+def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+    """Paraxial images (2, N) mm of the objects whose chief rays meet the sensor at (2, N) mm; there itself if none."""
+    near = 1e-4 * points.abs().max() * torch.eye(2, dtype=points.dtype, device=points.device)
+    fields = sensor.fields(lens, torch.cat([points, near], 1))
+    extents = object_field(lens, fields.nan_to_num(0.0), first_order(lens))[0]
+    scale = near @ torch.linalg.inv(extents[:, -2:])  # mm of the image per unit of the object
+    return torch.where(fields[:, :-2].isnan().any(0), points, scale @ extents[:, :-2])
+
+
+def _radii(points: Tensor, count: int) -> Tensor:
+    """Radii (count,) mm from the axis to the farthest of points (2, ...)."""
+    steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
+    return steps * torch.hypot(*points.flatten(1)).max()
+
+
+def _along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
+    """A function (R,) of equally spaced radii (R,) at points (2, ...), linear in between."""
+    place = torch.hypot(*points) / radii[1]
+    left = place.floor().clamp_max(len(radii) - 2).long()
+    part = place - left
+    return (1 - part) * curve[left] + part * curve[left + 1]
+
+
 def _chebyshev(count: int, places: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """T_j at `places` from edge to edge of `count` pixels, (places, J), and at the pixels, (count, J)."""
     fitted = torch.linspace(-1, 1, places, dtype=like.dtype, device=like.device)
     pixels = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (2 / count) - 1
     orders = torch.arange(_DEGREE + 1, dtype=like.dtype, device=like.device)
     return tuple(torch.cos(torch.acos(x.clamp(-1, 1))[:, None] * orders) for x in (fitted, pixels))
-
-
-def _half_diagonal(points: Tensor) -> Tensor:
-    return torch.hypot(*points.flatten(1)).max()
 
 
 def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
@@ -274,11 +338,14 @@ def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
 
 
 def resampled(picture: Tensor, places: Tensor, boundary: str) -> Tensor:
-    """Pictures (..., C, H, W) at columns and rows (2, H, W), by cubic convolution (Keys 1981).
+    """Pictures (..., C, H, W) at columns and rows (2, H, W), by cubic convolution (Keys 1981) that is exact of ramps.
 
     boundary: "reflect" repeats the border pixel in a mirror, others continue by 0.
     """
     rows, columns = picture.shape[-2:]
+    # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: u is solved for the place.
+    part = places - places.floor()
+    places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
     size = places.new_tensor([columns, rows])[:, None, None]
     grid = ((2 * places + 1) / size - 1).movedim(0, -1).to(picture.dtype)
     stack = picture.reshape(1, -1, rows, columns)
@@ -318,10 +385,9 @@ def render(
     light = linearised(picture)
     light = light[None] if light.dim() == 2 else light
     sensor = default_sensor(lens, light) if sensor is None else sensor
-    distances = None
+    light, distances = checked_picture(light, sensor), None
     if depth is not None:
-        depth = torch.as_tensor(depth, dtype=torch.float64)
-        distances = 1 / plane_distances(depth, planes)
+        distances = 1 / plane_distances(checked_depth(depth, light.double()), planes)
     ready = optics(
         lens, sensor, model=model, object_distances=distances, tol=tol, distortion=distortion,
         lateral_colour=lateral_colour, illumination=illumination,
