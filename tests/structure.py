@@ -23,6 +23,8 @@ from raytrace.tracing.trace import cross
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Packages that no other imports: measurements.
 APART = ("bench",)
+#: Of every function that `shared` decorates: its call is that of its caller.
+_DECORATION = media.__code__
 
 
 def lines_of_packages() -> Counter[str]:
@@ -92,7 +94,7 @@ def walked(run: Callable[[], object]) -> tuple[set[str], set[tuple[str, str]]]:
             return
         files.add(name)
         caller = frame.f_back
-        while caller and inside(caller) is None:
+        while caller and (inside(caller) is None or caller.f_code is _DECORATION):
             caller = caller.f_back
         if caller and _floor(name) > _floor(inside(caller)):
             upward.add((inside(caller), name))

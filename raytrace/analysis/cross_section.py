@@ -19,7 +19,7 @@ from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, is_posed, sag_at
 from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
-from raytrace.tracing.trace import lens_steps
+from raytrace.tracing.trace import lens_steps, points_on_surfaces
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
 
@@ -265,6 +265,12 @@ def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_st
     """Where rays meet every surface, each (3, F, P) mm; how each of them ends, and where if it is lost."""
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelength.reshape(1))
     placed, corners, alive = frames(lens), [_start(lens, rays, z_start)], rays.valid
+    points = points_on_surfaces(lens, rays, wavelength)
+    if points is not None:  # no ray is lost
+        for k, here in enumerate(points.unbind(1), start=1):
+            corners.append(corners[-1] if lens.surfaces[k].is_break else array(placed[k].outside(here))[:, :, 0, :])
+        endings = [[("ok", len(lens.surfaces) - 1)] * pupil.shape[1] for _ in range(fields.shape[1])]
+        return corners, endings, {}
     position, direction = rays.position, rays.direction
     endings = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
     ends: dict[tuple[int, int], np.ndarray] = {}

@@ -238,9 +238,11 @@ def _drawn(
         right, up = _extent(lens, places, radii)
         first, last = right
         distance = float(lens.surfaces[0].thickness)
-        size = max(last - first, up[1] - up[0]) if cross_section.is_bent(lens) else last - first
+        bent = cross_section.is_bent(lens)
+        size = max(last - first, up[1] - up[0]) if bent else last - first
         near = math.isfinite(distance) and 0 < distance <= _NEAR * size
-        start = -distance if near else _front(places, radii, lens) - _LEAD * size
+        front = _front(places, radii, lens) if bent else first
+        start = -distance if near else front - _LEAD * size
         dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
         points = fan(rays, view[0], dtype=dtype, device=device)[0]
         how = {"fields": fields, "z_start": start, "view": view}
@@ -259,7 +261,7 @@ def _drawn(
     largest, (low, high) = max(radii[1:-1]), _ray_heights(paths)
     rim = radii[lens.stop] + 0.18 * largest
     heights = min(low, -largest, -half, -rim), max(high, largest, half, rim)
-    return _Drawn(places, cross_section.is_bent(lens), (min(first, start), last), heights)
+    return _Drawn(places, bent, (min(first, start), last), heights)
 
 
 def _framed(axes, drawn: Sequence[_Drawn]) -> None:
@@ -283,9 +285,7 @@ def _extent(lens: Lens, places: list[cross_section.Section], radii: list[float])
 
 
 def _front(places: list[cross_section.Section], radii: list[float], lens: Lens) -> float:
-    """The leftmost point of the first surface, mm; of all surfaces if the axis is straight."""
-    if not cross_section.is_bent(lens):
-        return _extent(lens, places, radii)[0][0]
+    """The leftmost point of the first surface of a lens whose axis bends, mm."""
     height = np.array([-radii[1], radii[1]])
     return float(min(0.0, *places[1].at(cross_section.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 

@@ -443,20 +443,20 @@ def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, rays: Rays, rule:
     result = []
     for along in (1, 0):
         offset = torch.where(rays.valid, hits[along] - mean[along][..., None], 0.0)
-        otf = [(phase * energy).sum(-1) / light for phase in _phasors(frequencies, offset)]
-        result.append(modulation(torch.stack(otf, -1), frequencies, shift[along], weights))
+        otf = torch.stack([wave.sum(-1) for wave in _phasors(frequencies, offset, energy)], -1) / light[..., None]
+        result.append(modulation(otf, frequencies, shift[along], weights))
     return tuple(result)
 
 
-def _phasors(frequencies: Tensor, offset: Tensor) -> Iterator[Tensor]:
-    """e^{-2πi ν y} of offsets y for every frequency ν; of equally spaced ones from 0, each the one before times one."""
+def _phasors(frequencies: Tensor, offset: Tensor, weight: Tensor) -> Iterator[Tensor]:
+    """w e^{-2πi ν y} of offsets y for every frequency ν; of equally spaced ones from 0, each the last one times one."""
     step = frequencies[-1] / max(len(frequencies) - 1, 1)
     equal = step * torch.arange(len(frequencies), dtype=step.dtype, device=step.device)
     if len(frequencies) < 3 or not torch.allclose(frequencies, equal, rtol=1e-13, atol=0.0):
-        yield from (phasor(-frequency * offset) for frequency in frequencies)
+        yield from (weight * phasor(-frequency * offset) for frequency in frequencies)
         return
     turn = phasor(-step * offset)
-    phase = torch.ones_like(turn)
+    phase = weight.to(turn.dtype)
     for _ in frequencies:
         yield phase
         phase = phase * turn

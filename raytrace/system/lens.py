@@ -1,9 +1,12 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
+import contextlib
 import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -50,6 +53,48 @@ APERTURE_KINDS = {
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",
 }
+
+# -- results that several analyses of a lens share ---------------------------------------------------------------------
+
+P, T = ParamSpec("P"), TypeVar("T")
+_found: ContextVar[dict | None] = ContextVar("found", default=None)
+
+
+@contextlib.contextmanager
+def computed_once() -> Iterator[None]:
+    """Within: indices, first-order data and stop radius of every lens are computed once, where no gradient is recorded.
+
+    No number of a lens may be changed in place meanwhile.
+    """
+    token = _found.set({})
+    try:
+        yield
+    finally:
+        _found.reset(token)
+
+
+def shared(compute: Callable[P, T]) -> Callable[P, T]:
+    """A function of a lens, and of wavelengths, whose result the analyses within `computed_once` share."""
+
+    @functools.wraps(compute)
+    def result(*arguments: P.args, **options: P.kwargs) -> T:
+        found = _found.get()
+        if found is None or options or torch.is_grad_enabled():
+            return compute(*arguments, **options)
+        key = compute, *map(_key, arguments)
+        if key not in found:  # the arguments are stored, too: as long as they live their identity is their own
+            found[key] = compute(*arguments), arguments
+        return found[key][0]
+
+    return result
+
+
+def _key(argument: object) -> object:
+    """A lens by its identity, wavelengths by their values."""
+    if isinstance(argument, Tensor):
+        return argument.dtype, argument.device, *argument.shape, *argument.flatten().tolist()
+    return id(argument)
+
 
 # -- batches of lenses -------------------------------------------------------------------------------------------------
 # Behind the axes that a number has by itself (the terms of an asphere, say) the axis of the lenses follows. `aligned`
@@ -572,6 +617,7 @@ def unknown_changes(lens: Lens) -> dict[int, str]:
     return dict(found.values())
 
 
+@shared
 def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
     """n (...) of the medium behind a surface at wavelengths (...) µm, relative to the lens's air; a mirror has none."""
     surface, air = lens.surfaces[number], lens.environment
@@ -580,6 +626,7 @@ def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
     return index_in(surface.glass, wavelength, air or _reference(wavelength), surface.environment)
 
 
+@shared
 def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     """Refractive index behind every surface, object first; positive also behind a mirror.
 

@@ -45,6 +45,7 @@ from raytrace.system.lens import (
     field_points,
     index_behind,
     name_of_field,
+    shared,
     wavelengths_of,
 )
 from raytrace.system.rays import Rays, start
@@ -252,6 +253,7 @@ def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
     return dataclasses.replace(lens, ray_aiming=ray_aiming)
 
 
+@shared
 def stop_radius(lens: Lens) -> Tensor:
     """Radius in mm of the stop: where the axial ray through the edge of the entrance pupil meets it.
 
@@ -372,6 +374,7 @@ def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
     return torch.where(same.any(0), lens.fields.vignetting[:, same.to(torch.int64).argmax(0)], between)
 
 
+@shared
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
     """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...)."""
     listed = torch.stack([lens.fields.x, lens.fields.y]).reshape(2, -1, *(1,) * (field.dim() - 1))

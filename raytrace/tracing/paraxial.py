@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
 from raytrace.maths.result import flat
-from raytrace.system.lens import Lens, aligned, is_round_about_axis, media
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, shared
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
 
@@ -225,6 +225,7 @@ def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
     return Gaussian(*matrices[-1], matrices[stop][:2], (B, D), n[0], n[-1])
 
 
+@shared
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     """First-order data; wavelength: (...) µm, the primary one by default. Source: Welford, Aberrations, ch. 3.
 

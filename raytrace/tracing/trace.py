@@ -31,6 +31,7 @@ from raytrace.tracing.compiled import (
     forward,
     is_expressible,
     push,
+    rows_of,
     task_of,
     trace_compiled,
     uses_compiled,
@@ -235,6 +236,22 @@ def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
 def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]:
     """The crossings of rays before surface 1 with every surface after the object; wavelength: (...) µm."""
     return steps(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
+
+
+def points_on_surfaces(lens: Lens, rays: Rays, wavelength: Tensor) -> Tensor | None:
+    """Points (3, K, ...) mm of rays before surface 1 on the K surfaces after the object, each in its own axes.
+
+    By the compiled trace, without gradients; None where it does not carry these rays, or where one is lost.
+    """
+    surfaces = sequence_of(lens)
+    if not all(map(is_expressible, surfaces)):
+        return None
+    task = task_of(surfaces, rays, indices=media(lens, wavelength), wavelength=wavelength)
+    if task is None or not _is_compiled(surfaces, task):
+        return None
+    no_changes = task.inputs[3].new_empty(0, *task.inputs[3].shape)
+    behind = push(task, no_changes, everywhere=True)
+    return behind.position[:, rows_of(task.structure, surfaces)] if bool(behind.valid.all()) else None
 
 
 def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:

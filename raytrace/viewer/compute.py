@@ -25,7 +25,7 @@ from raytrace.maths.result import masked, plain
 from raytrace.maths.sampling import hexapolar
 from raytrace.plotting import style
 from raytrace.system.configurations import count
-from raytrace.system.lens import Lens, field_label, field_points
+from raytrace.system.lens import Lens, computed_once, field_label, field_points, shared
 from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import warn_of_defects
@@ -33,6 +33,8 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
 from raytrace.viewer.state import State, shown_fields, word_of
+
+_detached = shared(detached)
 
 #: Rays of a fan and of a field in the layout, rings of dots, fields of a curve, frequencies of the MTF.
 FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
@@ -175,17 +177,17 @@ def first_order_of(lens: Lens) -> list[dict]:
 
 def refresh(state: State) -> dict:
     """All numbers that follow an edit. Analyses that the lens does not have are None, with reasons in `problems`."""
-    with torch.no_grad(), warnings.catch_warnings():
+    with torch.no_grad(), computed_once(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # `remarks` has them
         analyses, problems = _analyses(state.lens, state.frequency)
         stored = _analyses(state.stored, state.frequency)[0] if state.compare else None
-    shown = {"prescription": prescription(state), "analyses": analyses, "stored": stored}
+        shown = {"prescription": prescription(state), "analyses": analyses, "stored": stored}
     return {**shown, "problems": problems, "message": state.message}
 
 
 def _simple(lens: Lens) -> Lens:
     """The lens as plain numbers; vignetting factors that are all 0 are not modelled."""
-    lens = detached(lens)
+    lens = _detached(lens)
     if lens.fields.vignetting is None or bool(lens.fields.vignetting.any()):
         return lens
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
@@ -230,7 +232,12 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 def mtf_of_field(state: State, field: int) -> dict:
     """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
     found = {"field": field, "mtf": None}
-    with torch.no_grad(), warnings.catch_warnings(), suppress(ValueError, RuntimeError):  # as `refresh` reports
+    with (
+        torch.no_grad(),
+        computed_once(),
+        warnings.catch_warnings(),
+        suppress(ValueError, RuntimeError),
+    ):  # as `refresh` reports
         warnings.simplefilter("ignore")
         lens = _simple(state.lens)
         fields = shown_fields(lens)
@@ -242,8 +249,8 @@ def mtf_of_field(state: State, field: int) -> dict:
 
 def remarks(state: State) -> list[str]:
     """The warnings of the analyses: rays that miss the stop, surfaces and gaps that cannot be made."""
-    lens = detached(state.lens)
-    with torch.no_grad(), warnings.catch_warnings(record=True) as caught:
+    lens = _detached(state.lens)
+    with torch.no_grad(), computed_once(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         warn_of_filling(lens, field_points(None, like=lens))
         warn_of_defects(lens)
@@ -255,7 +262,7 @@ def remarks(state: State) -> list[str]:
 
 def prescription(state: State) -> dict:
     """The table of the lens and its conditions."""
-    lens = detached(state.lens)
+    lens = _detached(state.lens)
     data = lens.optimization_data
     follows = {word_of(one) for one in (data.solves if data else ())}
     rows, last = [], len(lens.surfaces) - 1
