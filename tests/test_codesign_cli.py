@@ -1,10 +1,13 @@
 """`raytrace codesign`: runs that resume, comparisons and their page, and errors of one line."""
 
+import contextlib
 import csv
 import functools
+import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +18,7 @@ from PIL import Image
 from scripts import script
 
 import raytrace
+from raytrace import cli
 from raytrace.cli import codesign_run
 from raytrace.cli.progress import Lines
 from raytrace.imaging.codesign import lens_at_start
@@ -27,6 +31,7 @@ from raytrace.tracing.paraxial import paraxial_image_distance
 study = script("codesign_study")
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
 SMALL = tuple(_LITTLE.split(" "))
+PARAXIAL = (*SMALL, "--model", "paraxial")
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +70,24 @@ def interrupt(monkeypatch, name: str, step: int):
     monkeypatch.setattr(codesign_run, "run_model", interrupted)
 
 
+@pytest.fixture(scope="module")
+def finished(pictures, tmp_path_factory):
+    """A finished run of PARAXIAL on these pictures with its figure: folder, standard output, standard error."""
+    folder = tmp_path_factory.mktemp("finished")
+    out, err = io.StringIO(), io.StringIO()
+    words = ("--data", str(pictures), *PARAXIAL, "-o", "one", "--json", "--plot", "loss.png")
+    with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(["codesign", "double_gauss", *words])
+    assert code == 0, err.getvalue()
+    return folder, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture
+def one(finished, tmp_path):
+    """A copy of the folder of that run."""
+    return shutil.copytree(finished[0] / "one", tmp_path / "one")
+
+
 @pytest.fixture
 def compare(capsys, tmp_path, monkeypatch):
     """Run the script of a study in an empty folder: standard output, standard error."""
@@ -80,9 +103,8 @@ def compare(capsys, tmp_path, monkeypatch):
 # ---------------------------------------------------------------- one model
 
 
-def test_a_run_reports_its_results(run, pictures):
-    code, out, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--json")
-    assert code == 0, err
+def test_a_run_reports_its_results(run, pictures, finished, one):
+    _, out, err = finished
     document, kept = json.loads(out), read("one/outcome.json")
     assert {key: document[key] for key in kept} == kept
     assert (document["model"], document["settings"]["width"], document["settings"]["patch"]) == ("paraxial", 4, 16)
@@ -90,7 +112,7 @@ def test_a_run_reports_its_results(run, pictures):
     for step in ("joint", "refine"):
         assert [int(row["step"]) for row in rows(f"one/{step}/log.csv")] == list(range(8))
     assert re.search(r"paraxial, seed 0, joint, epoch 1 of 1: loss 0\.\d+, sensor 57\.8\d+ mm, focus 2\d\.\d m\n", err)
-    code, text, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--resume")
+    code, text, err = run("double_gauss", "--data", pictures, *PARAXIAL, "-o", "one", "--resume")
     assert code == 0
     assert "finished before, nothing to train" in err
     assert f"after step 2, with DRT PSFs      {kept['l1_drt']:.5f}" in text
@@ -156,10 +178,8 @@ def test_wrong_tolerances_of_a_run_are_refused(run, pictures, words, message):
     assert not Path("none").exists()
 
 
-def test_other_pictures_are_another_run(run, pictures):
-    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")
-    assert run(*command)[0] == 0
-    code, _, err = run(*command, "--limit", "9")
+def test_other_pictures_are_another_run(run, pictures, one):
+    code, _, err = run("double_gauss", "--data", pictures, *PARAXIAL, "-o", "one", "--limit", "9")
     assert code == 1
     assert re.fullmatch(r"raytrace: error: one/joint holds another run: pictures was '10, .*', now '9, .*\n", err)
 
@@ -279,13 +299,12 @@ def test_progress_counts_the_batches_of_a_test(run, pictures, monkeypatch):
     assert any(text.startswith("refine, loss 0.") for text in words)
 
 
-def test_the_figure_has_the_curves_of_training_and_of_the_closed_form(run, pictures):
-    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")
-    for options in ((), ("--loss", "spectral")):
-        code, _, err = run(*command, *options, "--plot", "loss.png")
-        assert code == 0, err
-        assert Path("loss.png").read_bytes().startswith(b"\x89PNG")
-        Path("loss.png").unlink()
+def test_the_figure_has_the_curves_of_training_and_of_the_closed_form(run, pictures, finished):
+    command = ("double_gauss", "--data", pictures, *PARAXIAL, "--loss", "spectral", "-o", "one", "--plot", "loss.png")
+    code, _, err = run(*command)
+    assert code == 0, err
+    for folder in (finished[0], Path()):
+        assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_spectral_prints_its_course(run, pictures):

@@ -176,7 +176,7 @@ def test_other_numbers_answer_no(changed, no):
     [
         ({"settled": {**SEEN.settled, "fourier": 0.6}}, "The focus is near"),
         ({"blur": {**SEEN.blur, "fourier": (0.05, 0.001, 0.002, 0.009)}}, "The simple lenses' blur"),
-        ({"blur": {**SEEN.blur, "gaussian": (0.03, 0.004, 0.002, 0.009)}}, "… that of Gaussian DRT's is larger"),
+        ({"blur": {**SEEN.blur, "gaussian": (0.03, 0.004, 0.002, 0.009)}}, "… that of Gaussian DRT is larger"),
         ({"blur": {**SEEN.blur, "gaussian": (0.045, 0.020, 0.020, 0.030)}}, "… but smaller overall"),
         ({"blur": {**SEEN.blur, "gaussian": (0.050, 0.001, 0.001, 0.011)}}, "… and varies less"),
     ],

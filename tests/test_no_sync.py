@@ -198,6 +198,21 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
     assert not bool(found[0][0].all())
 
 
+@pytest.mark.parametrize("kind", ["even asphere", "toroidal"])
+def test_roots_by_every_step_are_those_of_the_search_that_ends_early(kind, monkeypatch):
+    """Of rays in all directions, most of which cross the surface several times or miss it."""
+    generator = torch.Generator().manual_seed(1)
+    foot, direction = torch.randn(2, 3, 300, dtype=torch.float64, generator=generator)
+    direction = direction / torch.linalg.vector_norm(direction, dim=0)
+    of_surface = [torch.tensor(x, dtype=torch.float64) for x in (0.1, 0.3, (0.0, 1e-4, -2e-6))]
+    early = search.search(5 * foot, direction, *of_surface, kind, [], "", 6.0)
+    monkeypatch.setattr(search, "_reads_are_free", lambda tensor: False)
+    late = search.search(5 * foot, direction, *of_surface, kind, [], "", 6.0)
+    assert torch.equal(early[0], late[0])
+    assert torch.equal(early[1], late[1])
+    assert 100 < int(early[1].sum()) < 250
+
+
 @pytest.mark.slow  # 5 s for every step on a device without numbers; that no step reads one is shown above
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}

@@ -115,17 +115,23 @@ def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarr
 
 
 def _cover_by_disc(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -> None:
-    """Every disc, the topmost first, covers the bare pixels inside it."""
-    size, places = len(picture), np.arange(len(picture))
-    for radius, x, y, shade in zip(*(values.tolist() for values in discs), strict=True):
-        rows = slice(max(0, int(y - radius)), min(size, int(y + radius) + 2))
-        columns = slice(max(0, int(x - radius)), min(size, int(x + radius) + 2))
-        bare_here = bare[rows, columns]
-        if bare_here.any():
-            covered = (places[columns] - x) ** 2 + ((places[rows] - y) ** 2)[:, None] <= radius * radius
-            covered &= bare_here
-            picture[rows, columns][covered] = shade
-            bare_here &= ~covered
+    """Every disc, the topmost first, covers the bare pixels inside it; the pixels of 128 discs are computed at once."""
+    size, picture, bare = len(picture), picture.reshape(-1), bare.reshape(-1)
+    for radius, x, y, shade in zip(*(np.split(values, 32) for values in discs), strict=True):
+        left, top = (np.maximum(0, (at - radius).astype(int)) for at in (x, y))
+        right, bottom = (np.minimum(size, (at + radius).astype(int) + 2) for at in (x, y))
+        width = right - left
+        count = width * (bottom - top)
+        disc = np.repeat(np.arange(len(radius)), count)
+        row, column = np.divmod(np.arange(len(disc)) - np.repeat(np.cumsum(count) - count, count), width[disc])
+        row, column = row + top[disc], column + left[disc]
+        pixel = row * size + column
+        covered = ((column - x[disc]) ** 2 + (row - y[disc]) ** 2 <= (radius * radius)[disc]) & bare[pixel]
+        pixel = pixel[covered][::-1]
+        picture[pixel] = shade[disc[covered][::-1]]  # of several shades of a pixel the last, the topmost disc's, stays
+        bare[pixel] = False
+        if not bare.any():
+            break
 
 
 def _cover_by_pixel(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -> None:

@@ -278,6 +278,7 @@ _NEWTON_STEPS = 24
 _BISECTIONS = 64
 _SAMPLES = 96
 _CANDIDATES = 4  # sign changes and edges of the domain that are examined on one ray
+_AT_ONCE = 32768  # points that are examined in one call
 _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 
 # `torch.library.custom_op` would load the compiler at its first call.
@@ -521,23 +522,30 @@ def _bracketed(rays: _Rays):
     """
     first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
     width = (last - first) / _SAMPLES
-    sides = [_side(rays, first + i * width) for i in range(_SAMPLES + 1)]
-    before, behind = (torch.stack(side) for side in zip(*sides, strict=True))
+    before, behind = _sides(rays, first + torch.arange(_SAMPLES + 1, device=first.device)[:, None] * width)
     leaves = before[:-1] & ~before[1:]
     steps = (leaves | ~(before[:-1] | behind[:-1]) & behind[1:]) & possible  # that may contain a crossing
-    found, t = torch.zeros_like(possible), first
-    for _ in range(_CANDIDATES):
-        few = (steps.any(0) & ~found).nonzero()[:, 0] if _reads_are_free(t) else torch.arange(len(t), device=t.device)
-        if _reads_are_free(t) and not len(few):
-            break
-        at = steps[:, few].to(torch.uint8).argmax(0)  # the first of them
-        right = first[few] + (at + 1) * width[few]
-        t_few, is_crossing = _bisected(rays.of(few), right - width[few], right, leaves[at, few])
-        is_crossing = is_crossing & steps[at, few] & ~found[few]
-        steps[at, few] = False
-        t = t.index_put((few,), torch.where(is_crossing, t_few, t[few]))
-        found = found.index_put((few,), found[few] | is_crossing)
-    return t, found
+    number = steps.cumsum(0)  # of a step, from 1, among those of its ray
+    if _reads_are_free(first):
+        at, ray = (steps & (number <= _CANDIDATES)).nonzero(as_tuple=True)
+        if not len(at):
+            return first, torch.zeros_like(possible)
+        exists = torch.ones_like(ray, dtype=torch.bool)
+    else:
+        each = torch.stack([steps & (number == i) for i in range(1, _CANDIDATES + 1)])
+        at, exists = each.to(torch.uint8).argmax(1).flatten(), each.any(1).flatten()
+        ray = torch.arange(len(first), device=first.device).repeat(_CANDIDATES)
+    right = first[ray] + (at + 1) * width[ray]
+    ends = ray, right - width[ray], right, leaves[at, ray]
+    chunks = zip(*(end.split(max(_AT_ONCE, len(first))) for end in ends), strict=True)
+    found = [_bisected(rays.of(few), *ends_of_few) for few, *ends_of_few in chunks]
+    t, is_crossing = (torch.cat(parts) for parts in zip(*found, strict=True))
+    none = _CANDIDATES + 1
+    number = torch.where(is_crossing & exists, number[at, ray], none)
+    least = torch.full_like(first, none, dtype=number.dtype).scatter_reduce(0, ray, number, "amin")
+    is_first = (number < none) & (number == least[ray])  # one of a ray
+    t = torch.zeros_like(first).scatter_add(0, ray, torch.where(is_first, t, 0.0))
+    return torch.where(least < none, t, first), least < none
 
 
 def _bisected(rays: _Rays, left: Tensor, right: Tensor, leaves: Tensor) -> tuple[Tensor, Tensor]:
@@ -552,6 +560,15 @@ def _bisected(rays: _Rays, left: Tensor, right: Tensor, leaves: Tensor) -> tuple
     t_polished, small, forward, _ = _newton(rays, t)
     stayed = small & forward & ((t_polished - t).abs() <= width.abs())
     return torch.where(stayed, t_polished, t), stayed | _is_small(*_residual(rays, t))
+
+
+def _sides(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
+    """`_side` of points t (m, n) of each ray, of some 30,000 at once: of few rays, the calls cost more than numbers."""
+    count = t.shape[1]
+    ray = torch.arange(count, device=t.device)
+    chunks = t.split(max(1, _AT_ONCE // max(count, 1)))
+    sides = [_side(rays.of(ray.repeat(len(chunk))), chunk.flatten()) for chunk in chunks]
+    return tuple(torch.cat(side).reshape(t.shape) for side in zip(*sides, strict=True))
 
 
 def _side(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
