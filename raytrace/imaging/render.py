@@ -3,9 +3,9 @@
     sensor = rt.Sensor(size=(24, 16), pixels=(1200, 800), response="rgb")
     image = rt.render(lens, picture, sensor=sensor).image
 
-A picture is the image of an ideal lens of the same focal length. The real lens moves every point of it from its paraxial
-image to the landing of its chief ray (distortion), multiplies it by the relative illumination, and spreads it by the
-kernel of its place and colour:
+A picture is the image of an ideal lens of the same focal length. The real lens moves every point of it to the landing
+of its chief ray (distortion), multiplies it by the relative illumination, and spreads it by the kernel of its place and
+colour:
 
     y(r) = Σ_r′ h(r - r′; r′) E(r′) x(p(r′))
 
@@ -48,8 +48,8 @@ _PLANES = 8
 class Optics:
     """A lens in front of a sensor, prepared for pictures: what `optics` computes once for many of them.
 
-    kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of a
-    white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
+    kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
+    a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ|; order: of the model.
     """
@@ -129,7 +129,8 @@ def checked_depth(depth: Tensor, picture: Tensor) -> Tensor:
         )
     if bool(depth.isnan().any()) or bool((depth <= 0).any()):
         raise ValueError(
-            "a depth map with nan, zero or negative numbers: expected distances above 0 in mm from surface 1, inf allowed"
+            "a depth map with nan, zero or negative numbers: expected distances above 0 in mm from surface 1; inf is "
+            "allowed"
         )
     return depth
 
@@ -150,8 +151,8 @@ def optics(
 ) -> Optics:
     """Prepare a lens and its sensor for `Optics.__call__`; arguments as for `render`.
 
-    object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as
-    many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
+    object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of
+    as many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
     """
     if model not in MODELS:
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
@@ -277,8 +278,8 @@ def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
 def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
-    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, linear between 257 radii;
-    else polynomials of degree 13 through 25 × 25 chief rays.
+    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, linear between 257
+    radii; else polynomials of degree 13 through 25 × 25 chief rays.
     """
     if is_round_about_axis(lens):
         every = _every_pixel(sensor, like)
@@ -343,7 +344,7 @@ def resampled(picture: Tensor, places: Tensor, boundary: str) -> Tensor:
     boundary: "reflect" repeats the border pixel in a mirror, others continue by 0.
     """
     rows, columns = picture.shape[-2:]
-    # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: u is solved for the place.
+    # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: solved for u.
     part = places - places.floor()
     places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
     size = places.new_tensor([columns, rows])[:, None, None]
@@ -452,7 +453,7 @@ class Rendering(Result):
         columns, rows = ready.sensor.pixels
         m, n, depths = ready.kernels.shape[:3]
         lines = [
-            f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, channels {', '.join(ready.sensor.channels)}",
+            f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, {', '.join(ready.sensor.channels)}",
             f"kernels of {ready.kernels.shape[-1]} × {ready.kernels.shape[-2]} pixels at {m} × {n} places"
             + (f" and {depths} depths" if depths > 1 else ""),
         ]

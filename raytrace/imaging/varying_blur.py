@@ -18,7 +18,7 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from raytrace.imaging.image import EXTENSIONS, as_picture, extend
+from raytrace.imaging.image import as_picture, extend
 
 _RANKS = 40  # at most
 
@@ -33,10 +33,11 @@ def varying_blur(
 ) -> Tensor:
     """Images (..., C, H, W) of pictures (..., C, H, W); kernels: (m, n, C, h, w) of odd h and w, at nodes of a grid.
 
-    The nodes are equally spaced from the upper to the lower and from the left to the right edge of the picture; a single
-    row or column of nodes is the same everywhere. boundary: one of `EXTENSIONS`, how the picture continues beyond its
-    edge. tol: allowed error of low rank, Σ |h - ĥ| / Σ |h| of every kernel; 0: patches alone. Low rank is used where no
-    gradient is recorded and where it needs fewer operations. progress: called with the number of convolutions done.
+    The nodes are equally spaced from the upper to the lower edge of the picture and from the left to the right one; a
+    single row or column of nodes is the same everywhere. boundary: one of `image.EXTENSIONS`, how the picture continues
+    beyond its edge. tol: allowed error of low rank, Σ |h - ĥ| / Σ |h| of every kernel; 0: patches alone. Low rank is
+    used where no gradient is recorded and where it needs fewer operations. progress: called with the number of
+    convolutions done.
     Raises ValueError for other shapes.
     """
     picture = as_picture(picture)
@@ -69,7 +70,7 @@ def _check(picture: Tensor, kernels: Tensor) -> tuple[int, int]:
 
 
 def bilinear(count: int, reach: int, nodes: int, *, like: Tensor) -> Tensor:
-    """Weights (nodes, reach + count + reach) of nodes from edge to edge of `count` pixels, which `reach` more surround."""
+    """Weights (nodes, reach + count + reach) of nodes from edge to edge of `count` pixels between `reach` more."""
     if nodes == 1:
         return like.new_ones(1, count + 2 * reach)
     place = (torch.arange(-reach, count + reach, dtype=like.dtype, device=like.device) + 0.5) * ((nodes - 1) / count)
@@ -86,7 +87,7 @@ def _spans(weights: Tensor) -> list[tuple[int, int]]:
 def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress) -> Tensor:
     h, w = kernels.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
-    bands, done = [], 0
+    bands = []
     for k, (top, bottom) in enumerate(_spans(weights[0])):
         band = 0.0
         for n, (left, right) in enumerate(_spans(weights[1])):
