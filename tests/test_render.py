@@ -11,8 +11,9 @@ import torch
 import raytrace as rt
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge
 from raytrace.imaging.image import blur, blur_layers, depth_masks
-from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, resampled
+from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, render_patches, resampled
 from raytrace.imaging.varying_blur import bilinear, varying_blur
+from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 
 COLUMNS, ROWS = 48, 32
 SENSOR = rt.Sensor(size=(2.4, 1.6), pixels=(COLUMNS, ROWS), response="rgb")  # 50 µm
@@ -363,3 +364,30 @@ def test_optics_is_a_value(triplet):
     system = ready(triplet, nodes=(2, 2))
     assert isinstance(system, Optics)
     assert np.isnan(system.error)  # of a grid that was asked for nothing is estimated
+
+
+# -- patches
+
+
+def test_patches_have_the_kernels_of_their_places(triplet):
+    patches, points = random(2, 3, 20, 20), torch.tensor([[0.0, -3.0], [2.0, 4.0]], dtype=torch.float64)
+    weights = FIELD.weights(triplet.wavelengths)
+    kernels = FieldKernels(triplet, FIELD, "gaussian", 4, 7, triplet.surfaces[0].thickness.reshape(1), weights)
+    how = {"sensor": FIELD, "size": 7, "order": 4}
+    found = render_patches(triplet, patches, points, **how)
+    torch.testing.assert_close(found, blur(patches, kernels.at(points)[:, 0]), rtol=0, atol=1e-12)
+    shaded = render_patches(triplet, patches, points, **how, illumination=True)
+    wanted = rt.relative_illumination(triplet, fields=FIELD.fields(triplet, points)).illumination
+    torch.testing.assert_close(shaded, wanted[:, None, None, None] * found, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("deviation", [1.0, 1.3, 2.5])
+def test_wide_gaussians_are_those_of_the_quadrature(deviation):
+    pixels = rt.grid(1.0, 31)
+    for angle in (0.0, 0.4, math.pi / 4):
+        c, s, wide = math.cos(angle), math.sin(angle), 1.7 * deviation
+        rows = [c * c * deviation**2 + s * s * wide**2, c * s * (deviation**2 - wide**2)]
+        covariance = torch.tensor([*rows, s * s * deviation**2 + c * c * wide**2], dtype=torch.float64)
+        centroid = torch.tensor([0.3, -0.2], dtype=torch.float64)
+        close = wide_gaussian_pixels(pixels, centroid, covariance)
+        assert float((close - gaussian_pixels(pixels, centroid, covariance)).abs().sum()) < 1e-4 / deviation**5

@@ -19,7 +19,7 @@ from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.sampling import gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, model_of, psf
-from raytrace.psf_models.gaussian import gaussian_pixels
+from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import chief_landing, scene, trace_scene
@@ -104,22 +104,26 @@ class FieldKernels:
     def _turned(self, points: Tensor) -> Tensor:
         """Gaussians of the moments along a radius, turned to the azimuth of every place."""
         radius = safe_sqrt((points * points).sum(0))
-        largest = radius.detach().amax().clamp_min(self.sensor.pitch)
-        nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
-        place = radius * ((self.nodes - 1) / largest)
-        # Linear: vignetting factors are, too, with a kink on the axis.
-        left = place.detach().floor().clamp_max(self.nodes - 2).long()
-        part = (place - left)[:, None]
-        moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
+        units, which = torch.unique((radius / self.sensor.pitch * 1e6).round(), return_inverse=True)
+        if len(units) <= self.nodes:
+            moments = [moment[:, which] for moment in self._moments(units * (1e-6 * self.sensor.pitch))]
+        else:  # linear between radii: vignetting factors are, too, with a kink on the axis
+            largest = radius.amax()
+            nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
+            place = radius * ((self.nodes - 1) / largest)
+            left = place.floor().clamp_max(self.nodes - 2).long()
+            part = (place - left)[:, None]
+            moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        parts = []
+        parts, narrowest = [], torch.minimum(*moments[1:]).min()
         for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
             shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
             x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
             pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
             covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-            kernels = gaussian_pixels(window, torch.stack([x * shift, y * shift]), covariance)
+            pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
+            kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
             kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
             parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
         return torch.cat(parts)
