@@ -114,7 +114,7 @@ def test_wrong_shapes_are_refused(picture, kernels, message):
 def test_kernels_are_those_of_psf_at_their_places(triplet, model):
     """On an octant, its mirror images and off the grid, in the orientation of an upright picture."""
     points = torch.tensor([[0.0, 3.0, -3.0, 5.0, -2.0], [4.0, 1.0, -1.0, 5.0, -6.0]], dtype=torch.float64)
-    lens = triplet.at(fields=[11.9])  # without vignetting factors
+    lens = triplet.at(fields=[11.9])  # without vignetting factors, which move the chief ray of a PSF
     weights = FIELD.weights(lens.wavelengths)
     kernels = FieldKernels(lens, FIELD, model, 6, 9, lens.surfaces[0].thickness.reshape(1), weights, nodes=257)
     found = kernels.at(points)
@@ -129,6 +129,20 @@ def test_kernels_are_those_of_psf_at_their_places(triplet, model):
         wanted = torch.einsum("cw,wij->cij", weights, alone).flip(-1)
         # The Gaussians are interpolated between radii; turned rays fall in other pixels of the same histogram.
         assert float((found[k, 0] - wanted).abs().sum((-2, -1)).max()) < {"gaussian": 1e-5, "drt": 0.02}[model]
+
+
+def test_kernels_lie_where_the_light_does(triplet):
+    """About the chief ray through the centre of the pupil, whose landing the distortion is of."""
+    point = torch.tensor([[0.0], [8.0]], dtype=torch.float64)
+    fields = FIELD.fields(triplet, point)
+    centroid = rt.psf(triplet, rt.Gaussian(order=4), fields=fields, wavelengths=[triplet.primary]).centroid[1, 0, 0]
+    grey = dataclasses.replace(FIELD, response=None)
+    lens = triplet.at(wavelengths=[float(triplet.primary)])
+    for model in ("gaussian", "drt"):
+        kernels = FieldKernels(lens, grey, model, 4, 21, lens.surfaces[0].thickness.reshape(1), torch.ones(1, 1))
+        kernel = kernels.at(point)[0, 0, 0]
+        rows = (torch.arange(21, dtype=torch.float64) - 10) * FIELD.pitch
+        assert float((kernel.sum(-1) * rows).sum()) == pytest.approx(float(centroid - 8.0), abs=3e-3)
 
 
 def test_a_kernel_off_the_meridian_is_the_turned_one(triplet):

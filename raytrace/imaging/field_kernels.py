@@ -20,7 +20,7 @@ from raytrace.maths.sampling import gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
-from raytrace.system.lens import Lens, is_round_about_axis
+from raytrace.system.lens import Lens, is_round_about_axis, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import chief_landing, scene, trace_scene
 
@@ -87,16 +87,14 @@ class FieldKernels:
         """By the PSF model, field by field."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(self.sensor.pitch), self.size)}
-        how = {"fields": fields, "object_distances": self.object_distances, "normalise": "window"}
-        model = model_of(self.model, order=self.order)
-        if self.lateral_colour:
-            kernels = psf(self.lens, model, **how, **about, per_wavelength=True).kernel
-        else:
-            alone = [
-                self.lens.at(wavelengths=self.lens.wavelengths[w : w + 1]) for w in range(len(self.lens.wavelengths))
-            ]
-            kernels = torch.stack([psf(lens, model, **how, **about).kernel for lens in alone], 2)
+        about = {"fields": fields, "object_distances": self.object_distances, "normalise": "window", "center": "axis"}
+        model, wavelengths = model_of(self.model, order=self.order), self.lens.wavelengths
+        groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
+        kernels = []
+        for some, origin in zip(groups, self._origin(fields).unbind(-1), strict=True):
+            window = make_grid(points.new_tensor(self.sensor.pitch), self.size, origin[:, None])
+            kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=some, per_wavelength=True).kernel)
+        kernels = torch.cat(kernels, 2)
         kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
         kept = arrives[:, None, None, None, None] & ~kernels.isnan()
         return torch.where(kept, kernels, _point(kernels))
@@ -137,11 +135,17 @@ class FieldKernels:
         spots = psf(
             self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
         )
-        wavelengths = self.lens.primary[None] if self.lateral_colour else self.lens.wavelengths
-        chief = chief_landing(scene(self.lens, fields, self.object_distances, wavelengths))[1]
-        moments = spots.centroid[1] - chief, spots.covariance[0], spots.covariance[2]
+        moments = spots.centroid[1] - self._origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
         return tuple(torch.where(known, moment, 0.0) for moment in moments)
+
+    def _origin(self, fields: Tensor) -> Tensor:
+        """Where chief rays of fields (2, N) meet the sensor, (2, N, 1) mm, or of every wavelength, (2, N, W).
+
+        They pass the centre of the pupil; vignetting factors are left out.
+        """
+        lens = with_object_distance(self.lens, self.object_distances[0])
+        return self.sensor.landing(lens, fields, lens.primary[None] if self.lateral_colour else lens.wavelengths)
 
 
 def _point(kernels: Tensor) -> Tensor:
