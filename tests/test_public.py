@@ -326,7 +326,7 @@ NEEDED = {"tolerance": {"limits": "radius=0.1%", "trials": 20}}
 
 @pytest.mark.parametrize(
     "command",
-    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name == "compare" else ()) for c in OF_A_LENS],
+    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in ("compare", "psf") else ()) for c in OF_A_LENS],
 )
 def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
     """As JSON by the function itself; as text the result already computed."""
