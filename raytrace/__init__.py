@@ -169,6 +169,7 @@ PUBLIC = {
     "Run": "imaging.training",
     "Sensor": "imaging.sensor",
     "Variables": "imaging",
+    "render": "imaging.render",
     "train": "imaging.training",
 }
 
