@@ -167,7 +167,9 @@ PUBLIC = {
     "PhaseVariables": "imaging",
     "RedNet": "imaging",
     "Run": "imaging.training",
+    "Sensor": "imaging.sensor",
     "Variables": "imaging",
+    "render": "imaging.render",
     "train": "imaging.training",
 }
 

@@ -61,7 +61,7 @@ SHOWN_BY = {
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn")
+DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn", "colour")
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -231,14 +231,14 @@ def test_physics_stays_in_torch(name):
 
 
 #: Distributions by the module that they install, where the names differ.
-DISTRIBUTIONS = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
+DISTRIBUTIONS = {"PIL": "pillow", "colour": "colour-science", "mpl_toolkits": "matplotlib"}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed; those of the viewer are its extra."""
+    """But for those of `bench`, which measures what is installed; viewer and measured cameras have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extra = project["optional-dependencies"]["view"]
-    declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extra)}
+    extras = [name for extra in ("view", "colour") for name in project["optional-dependencies"][extra]]
+    declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
     library = (path for name, path in MODULES.items() if package_of(name) != "bench")
     roots = {name.split(".")[0] for path in library for name in imports(path)}
     others = roots - set(sys.stdlib_module_names) - {package_of(name) for name in MODULES} - {"raytrace"}

@@ -5,6 +5,7 @@
 | camera          | lens, sensor and network as one module                                                  |
 | variables       | of lenses and phase elements, thickness limits                                          |
 | image           | convolution with PSFs, layered scenes; noise and quantisation of the sensor             |
+| sensor          | pixels and their field points, Bayer mosaic, capture; spectral_response: of its channels |
 | restoration     | linear filters (Wiener) and their errors in closed form                                 |
 | network         | RED-Net                                                                                 |
 | pictures        | folders of photographs, dead-leaves images                                              |

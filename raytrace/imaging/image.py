@@ -8,6 +8,7 @@ shift, and so does origin="grid".
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -192,10 +193,18 @@ def blur_layers(
         return light.sum(-4)
     # Coverage by normalised kernels: a kernel of energy below 1 darkens its layer without making it transparent.
     cover = blur(layers, safe_divide(kernels, kernels.sum((-2, -1), keepdim=True)), boundary=boundary)
-    total, covered = light[..., 0, :, :, :], cover[..., 0, :, :, :]
-    for near_light, near_cover in zip(light.unbind(-4)[1:], cover.unbind(-4)[1:], strict=True):
-        total = (1 - near_cover) * total + near_light
-        covered = (1 - near_cover) * covered + near_cover
+    return occlusion(zip(light.unbind(-4), cover.unbind(-4), strict=True))
+
+
+def occlusion(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
+    """The image (..., C, H, W) of layers from far to near, of which each is its light and its coverage (..., C, H, W).
+
+    The formula is that of `blur_layers`.
+    """
+    total = covered = None
+    for light, cover in layers:
+        total = light if total is None else (1 - cover) * total + light
+        covered = cover if covered is None else (1 - cover) * covered + cover
     # Where nothing covers, the FFT leaves ±1e-16: neither light nor a division by it.
     floor = 1e3 * torch.finfo(covered.dtype).eps
     return safe_divide(total, torch.where(covered > floor, covered, 0.0))

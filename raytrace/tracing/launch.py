@@ -207,18 +207,31 @@ def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    scale = field_scale(
-        kind,
-        at_infinity=at_infinity,
+    scale = _paraxial_scale(lens, paraxial)
+    if kind != "angle":
+        return _scaled(field, scale)
+    slope = torch.tan(torch.deg2rad(field))
+    return slope if at_infinity else _scaled(slope, scale)
+
+
+def field_of_object(lens: Lens, extent: Tensor, paraxial: FirstOrder) -> Tensor:
+    """Field points (2, ...) of slopes, or object heights in mm, (2, ...): the inverse of `paraxial_field`."""
+    kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
+    if kind != "object_height" and not (kind == "angle" and at_infinity):
+        extent = _scaled(extent, 1 / _paraxial_scale(lens, paraxial))
+    return torch.rad2deg(torch.atan(extent)) if kind == "angle" else extent
+
+
+def _paraxial_scale(lens: Lens, paraxial: FirstOrder) -> Tensor | float:
+    """`field_scale` of the kind of field of a lens."""
+    return field_scale(
+        lens.fields.kind,
+        at_infinity=is_at_infinity(lens),
         distance=lens.surfaces[0].thickness,
         entrance_pupil=paraxial.entrance_pupil_position,
         power=paraxial.power / index_behind(lens, 0, lens.primary),
         magnification=paraxial.magnification,
     )
-    if kind != "angle":
-        return _scaled(field, scale)
-    slope = torch.tan(torch.deg2rad(field))
-    return slope if at_infinity else _scaled(slope, scale)
 
 
 def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:

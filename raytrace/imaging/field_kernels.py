@@ -1,0 +1,195 @@
+"""PSFs of a lens over the sensor, for pictures that are seen upright.
+
+Rows of a kernel grow towards +y of the sensor and columns towards -x, as the rows and columns of an upright picture do.
+A kernel has its origin where the chief ray of the primary wavelength meets the sensor, and sums to 1: the light that
+arrives is the relative illumination, an image of its own.
+
+Of a rotationally symmetric lens and the Gaussian model, centroids and covariances along one radius are turned to every
+place. Kernels of the other models are computed in one octant and mirrored to the others.
+"""
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace.imaging.sensor import Sensor
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.sampling import gauss_rings, with_rim
+from raytrace.maths.sampling import grid as make_grid
+from raytrace.psf_models import MODELS, model_of, psf
+from raytrace.psf_models.gaussian import gaussian_pixels
+from raytrace.system.lens import Lens, is_round_about_axis
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.scene import chief_landing, scene, trace_scene
+
+_SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
+_RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
+_LARGEST = 401  # pixels of a window
+_TOGETHER = 48  # fields of a call of `psf`
+
+
+class WindowTooLarge(ValueError):
+    """A blur of more pixels than a window has."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldKernels:
+    """Kernels at places of the sensor.
+
+    model, order: of the PSF; size: of the window, an odd number of pixels; object_distances: (D,) mm; weights: (C, W),
+    the share of every wavelength of the lens in a channel; lateral_colour: whether the light of other wavelengths lies
+    where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
+    traced.
+    """
+
+    lens: Lens
+    sensor: Sensor
+    model: str
+    order: int
+    size: int
+    object_distances: Tensor
+    weights: Tensor
+    lateral_colour: bool = True
+    nodes: int = 33
+
+    def at(self, points: Tensor) -> Tensor:
+        """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor; where no chief ray arrives, a point."""
+        parts = [dataclasses.replace(self, object_distances=distance) for distance in self.object_distances.split(1)]
+        return torch.cat([part._of_one_distance(points) for part in parts], 1)
+
+    def _of_one_distance(self, points: Tensor) -> Tensor:
+        if not MODELS[self.model].traces:  # first-order models image all fields alike
+            return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
+        if not is_round_about_axis(self.lens):
+            return self._in_parts(points)
+        compute = self._turned if self.model == "gaussian" else self._in_parts
+        octant = torch.stack([points.abs().amin(0), points.abs().amax(0)])
+        places, which = torch.unique((octant / self.sensor.pitch * 1e6).round(), dim=1, return_inverse=True)
+        if self.model == "gaussian" and places.shape[1] == points.shape[1]:  # no place is the image of another
+            return compute(points)
+        first = torch.full_like(places[0], points.shape[1], dtype=torch.int64)
+        first = first.scatter_reduce(0, which, torch.arange(points.shape[1], device=which.device), "amin")
+        kernels = compute(octant[:, first])[which].flip(-1)  # columns towards +x
+        for mask, move in (
+            (points[0].abs() > points[1].abs(), lambda kernel: kernel.transpose(-1, -2)),
+            (points[0] < 0, lambda kernel: kernel.flip(-1)),
+            (points[1] < 0, lambda kernel: kernel.flip(-2)),
+        ):
+            kernels = torch.where(mask[:, None, None, None, None], move(kernels), kernels)
+        return kernels.flip(-1)
+
+    def _in_parts(self, points: Tensor) -> Tensor:
+        return torch.cat([self._computed(part) for part in points.split(_TOGETHER, 1)])
+
+    def _computed(self, points: Tensor) -> Tensor:
+        """By the PSF model, field by field."""
+        fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
+        arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
+        about = {"center": "chief", "grid": make_grid(points.new_tensor(self.sensor.pitch), self.size)}
+        how = {"fields": fields, "object_distances": self.object_distances, "normalise": "window"}
+        model = model_of(self.model, order=self.order)
+        if self.lateral_colour:
+            kernels = psf(self.lens, model, **how, **about, per_wavelength=True).kernel
+        else:
+            alone = [
+                self.lens.at(wavelengths=self.lens.wavelengths[w : w + 1]) for w in range(len(self.lens.wavelengths))
+            ]
+            kernels = torch.stack([psf(lens, model, **how, **about).kernel for lens in alone], 2)
+        kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
+        kept = arrives[:, None, None, None, None] & ~kernels.isnan()
+        return torch.where(kept, kernels, _point(kernels))
+
+    def _turned(self, points: Tensor) -> Tensor:
+        """Gaussians of the moments along a radius, turned to the azimuth of every place."""
+        radius = safe_sqrt((points * points).sum(0))
+        largest = radius.detach().amax().clamp_min(self.sensor.pitch)
+        nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
+        place = radius * ((self.nodes - 1) / largest)
+        # Linear: vignetting factors are, too, with a kink on the axis.
+        left = place.detach().floor().clamp_max(self.nodes - 2).long()
+        part = (place - left)[:, None]
+        moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
+        unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
+        window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
+        parts = []
+        for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
+            shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
+            x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
+            pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
+            covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
+            kernels = gaussian_pixels(window, torch.stack([x * shift, y * shift]), covariance)
+            kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
+            parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
+        return torch.cat(parts)
+
+    def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Centroid from the origin, mm, sagittal and tangential variance, mm², (D, K, W) at radii (K,) along +y."""
+        points = torch.stack([torch.zeros_like(radii), radii])
+        fields = self.sensor.fields(self.lens, points)
+        arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
+        about = {"fields": fields, "object_distances": self.object_distances, "per_wavelength": True}
+        spots = psf(
+            self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
+        )
+        wavelengths = self.lens.primary[None] if self.lateral_colour else self.lens.wavelengths
+        chief = chief_landing(scene(self.lens, fields, self.object_distances, wavelengths))[1]
+        moments = spots.centroid[1] - chief, spots.covariance[0], spots.covariance[2]
+        known = arrives[:, None] & ~spots.centroid[1].isnan()
+        return tuple(torch.where(known, moment, 0.0) for moment in moments)
+
+
+def _point(kernels: Tensor) -> Tensor:
+    """All light in the middle pixel."""
+    point = torch.zeros_like(kernels[0])
+    point[..., point.shape[-2] // 2, point.shape[-1] // 2] = 1
+    return point
+
+
+def window_size(
+    lens: Lens, sensor: Sensor, model: str, points: Tensor, object_distances: Tensor, *, lateral_colour: bool = True
+) -> int:
+    """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge."""
+    with torch.no_grad():
+        fields = sensor.fields(lens, points)
+        fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
+        how = {"tails": model != "drt", "lateral_colour": lateral_colour}
+        reach = max(_reach(lens, fields, distance, **how) for distance in object_distances.split(1))
+        if MODELS[model].waves:
+            reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
+    size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
+    if size > _LARGEST:
+        raise WindowTooLarge(
+            f"the blur reaches {1e3 * reach:.0f} µm, {size} pixels of {1e3 * sensor.pitch:g} µm across, more than "
+            f"{_LARGEST}: focus the lens, as by rt.focus(lens).lens, or take larger pixels"
+        )
+    return size
+
+
+def _reach(lens: Lens, fields: Tensor, distance: Tensor, *, tails: bool, lateral_colour: bool) -> float:
+    """Largest distance in x or y, mm, of light from the origin of its kernel; tails: of Gaussians, too."""
+    batch = scene(lens, fields, distance, lens.wavelengths)
+    rays = trace_scene(batch, with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0])
+    chief = chief_landing(batch)
+    origin = chief[..., lens.primary_wavelength - 1, None] if lateral_colour else chief
+    offset = torch.where(rays.valid, rays.position[:2] - origin[..., None], torch.nan)
+    reach = offset.abs().nan_to_num(0.0).max()
+    if tails:
+        mean = offset.nanmean(-1, keepdim=True)
+        sigma = (offset - mean).square().nanmean(-1).sqrt()
+        reach = torch.maximum(reach, (mean[..., 0].abs() + _SIGMAS * sigma).nan_to_num(0.0).max())
+    return float(reach)
+
+
+def order_of(
+    lens: Lens, sensor: Sensor, model: str, points: Tensor, object_distances: Tensor, size: int, tol: float
+) -> int:
+    """The order of the model that meets the tolerance at places (2, N) mm of the sensor."""
+    if not MODELS[model].traces and len(MODELS[model].orders) == 1:
+        return MODELS[model].orders[0]
+    with torch.no_grad():
+        fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
+        fields = fields[:, ~fields.isnan().any(0)]
+        about = {"center": "chief", "grid": make_grid(points.new_tensor(sensor.pitch), size)}
+        return psf(lens, model, fields=fields, object_distances=object_distances, **about, tol=tol).order

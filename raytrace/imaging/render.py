@@ -1,0 +1,514 @@
+"""Pictures that a lens projects onto a sensor: blur over the whole field, distortion, illumination, colour, depth.
+
+    sensor = rt.Sensor(size=(24, 16), pixels=(1200, 800), response="rgb")
+    image = rt.render(lens, picture, sensor=sensor).image
+
+A picture is the image of an ideal lens of the same focal length. The real lens moves every point of it to the landing
+of its chief ray (distortion), multiplies it by the relative illumination, and spreads it by the kernel of its place and
+colour:
+
+    y(r) = Σ_r′ h(r - r′; r′) E(r′) x(p(r′))
+
+p(r′): the paraxial image of the object whose chief ray meets the sensor at r′; E: relative illumination; h: of sum 1.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.analysis.illumination import relative_illumination
+from raytrace.imaging.field_kernels import FieldKernels, order_of, window_size
+from raytrace.imaging.image import as_picture, depth_masks, occlusion
+from raytrace.imaging.sensor import Sensor
+from raytrace.imaging.varying_blur import bilinear, varying_blur
+from raytrace.maths.result import Result, plain
+from raytrace.plotting.style import array, new_figure, styled
+from raytrace.psf_models import MODELS, NotConverged
+from raytrace.system.lens import Lens, field_points, is_round_about_axis
+from raytrace.tracing.launch import object_field
+from raytrace.tracing.paraxial import first_order
+from raytrace.words import calling_level
+
+_MOST_NODES = 65  # along the longer side
+_DEGREE = 13  # of the polynomials of the distortion of other lenses
+_FIT = 25  # places along a side at which these are fitted
+_LIT = 33  # radii at which the illumination of a round lens is computed
+_RADII = 257  # at which the chief rays of a round lens are traced
+_COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
+_ROUNDS = 4
+_PLANES = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Optics:
+    """A lens in front of a sensor, prepared for pictures: what `optics` computes once for many of them.
+
+    kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
+    a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
+    column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
+    distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ|; order: of the model.
+    """
+
+    sensor: Sensor
+    kernels: Tensor
+    flux: Tensor
+    illumination: Tensor | None
+    ideal: Tensor | None
+    planes: Tensor
+    error: float
+    order: int
+    tol: float
+
+    def __call__(
+        self,
+        picture: Tensor,
+        depth: Tensor | None = None,
+        *,
+        boundary: str = "reflect",
+        progress: Callable[[int], object] | None = None,
+    ) -> Tensor:
+        """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm, see `render`."""
+        picture = checked_picture(picture, self.sensor)
+        if depth is None and len(self.planes) > 1:
+            raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
+        inverse = None if depth is None else 1 / checked_depth(depth, picture)
+        if self.ideal is not None:
+            picture = resampled(picture, self.ideal, boundary)
+            if inverse is not None:
+                inverse = resampled(inverse[..., None, :, :], self.ideal, boundary)[..., 0, :, :]
+        how = {"boundary": boundary, "tol": 0.3 * self.tol, "progress": progress}
+        flux = [enlarged(part, picture) for part in self.flux]
+        if inverse is None:
+            return varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how)
+        shade = 1.0 if self.illumination is None else self.illumination.to(picture)
+        masks = depth_masks(inverse, self.planes.to(inverse))
+
+        def layers():
+            for d, mask in enumerate(masks.unbind(-3)):
+                cover = flux[d] * mask[..., None, :, :]
+                yield tuple(
+                    varying_blur(part, self.kernels[:, :, d], **how) for part in (cover * picture, cover / shade)
+                )
+
+        return occlusion(layers())
+
+
+def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
+    """Pictures (..., C, H, W) of the channels of the sensor. Raises ValueError for others."""
+    picture = as_picture(picture)
+    (columns, rows), channels = sensor.pixels, len(sensor.channels)
+    picture = picture[None] if picture.dim() == 2 else picture
+    if picture.dim() < 2 or picture.shape[-2:] != (rows, columns):
+        raise ValueError(
+            f"a picture of {picture.shape[-1]} × {picture.shape[-2]} pixels on a sensor of {columns} × {rows}: resize "
+            "it, or give the sensor its number of pixels"
+        )
+    if picture.shape[-3] not in (1, channels):
+        raise ValueError(
+            f"a picture of {picture.shape[-3]} channels on a sensor of {channels}: expected (..., {channels}, rows, "
+            "columns)"
+        )
+    if not bool(torch.isfinite(picture).all()):
+        count = int((~torch.isfinite(picture)).sum())
+        raise ValueError(f"{count} numbers of the picture are not finite: expected light in every pixel")
+    return picture.expand(*picture.shape[:-3], channels, rows, columns)
+
+
+def checked_depth(depth: Tensor, picture: Tensor) -> Tensor:
+    """Distances (..., H, W) mm of the pixels of pictures (..., C, H, W). Raises ValueError for others."""
+    depth = torch.as_tensor(depth, dtype=picture.dtype, device=picture.device)
+    if depth.shape[-2:] != picture.shape[-2:]:
+        raise ValueError(
+            f"a depth map of shape {tuple(depth.shape)} and a picture of {tuple(picture.shape)}: expected the distance "
+            "of every pixel"
+        )
+    if bool(depth.isnan().any()) or bool((depth <= 0).any()):
+        raise ValueError(
+            "a depth map with nan, zero or negative numbers: expected distances above 0 in mm from surface 1; inf is "
+            "allowed"
+        )
+    return depth
+
+
+def optics(
+    lens: Lens,
+    sensor: Sensor,
+    *,
+    model: str = "gaussian",
+    object_distances: Tensor | None = None,
+    tol: float = 1e-2,
+    distortion: bool = True,
+    lateral_colour: bool = True,
+    illumination: bool = True,
+    nodes: tuple[int, int] | None = None,
+    order: int | None = None,
+    size: int | None = None,
+) -> Optics:
+    """Prepare a lens and its sensor for `Optics.__call__`; arguments as for `render`.
+
+    object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of
+    as many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
+    """
+    if model not in MODELS:
+        raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    like = lens.surfaces[-2].thickness
+    distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
+    distances = distances.to(like).reshape(-1)
+    planes, nearer = (1 / distances).sort()
+    distances = distances[nearer]
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
+    corners = _places(sensor, 5, 5, like)
+    chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour)
+    if order is None:
+        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, 0.3 * tol)
+    kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
+    grid, error = _grid(kernels, sensor, nodes, 0.5 * tol, like)
+    shade = _illumination(lens, sensor, like) if illumination else None
+    ideal = _ideal(lens, sensor, like) if distortion else None
+    return Optics(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
+
+
+def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
+    """Places (2, m·n) mm of a grid from edge to edge of the sensor; shift: by a part of a cell."""
+    columns, rows = sensor.pixels
+    lines = []
+    for count, nodes in ((rows, m), (columns, n)):
+        steps = torch.arange(nodes - (shift > 0), dtype=like.dtype, device=like.device) + shift
+        lines.append(steps * (count / max(nodes - 1, 1)) - 0.5 if nodes > 1 else steps.new_tensor([0.5 * (count - 1)]))
+    row, column = torch.meshgrid(*lines, indexing="ij")
+    return sensor.points(column.flatten(), row.flatten())
+
+
+def _grid(
+    kernels: FieldKernels, sensor: Sensor, nodes: tuple[int, int] | None, tol: float, like: Tensor
+) -> tuple[Tensor, float]:
+    """Kernels (m, n, D, C, h, w) at as many nodes as the tolerance needs, and the error of their interpolation.
+
+    The error is that in the middle of a cell, where four kernels are averaged, the mean over the cells.
+    """
+    if nodes is not None:
+        return kernels.at(_places(sensor, *nodes, like)).unflatten(0, nodes), math.nan
+    columns, rows = sensor.pixels
+    longer = max(columns, rows)
+    count = 3
+    with torch.no_grad():
+        at = kernels.at
+        while True:
+            m, n = (max(2, round((count - 1) * side / longer) + 1) for side in (rows, columns))
+            grid = at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+            mean = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+            middle = at(_places(sensor, m, n, like, 0.5)).unflatten(0, (m - 1, n - 1))
+            error = float((mean - middle).abs().sum((-2, -1)).amax((2, 3)).mean())
+            if error <= tol or count >= _MOST_NODES:
+                break
+            # The error of linear interpolation falls with the square of the cell.
+            count = min(_MOST_NODES, max(count + 2, math.ceil(1.1 * (count - 1) * math.sqrt(error / tol)) + 1))
+    if error > tol:
+        message = f"the kernels between {m} × {n} nodes have an estimated error of {error:.1e}, above {tol:.1e}"
+        warnings.warn(message, NotConverged, stacklevel=calling_level())
+    if torch.is_grad_enabled():
+        grid = at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+    return grid, error
+
+
+def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tensor:
+    """Light v (D, C, H′, W′) of the points of a white scene, whose image is the relative illumination E.
+
+    Kernels that vary shift light from place to place: Σ_r′ h(r - r′; r′) is not 1 everywhere, but a white scene is as
+    bright as its exit pupil is large, whatever the aberrations. v: the fixed point of v + E - A v, A the blur, from E
+    on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
+    """
+    columns, rows = sensor.pixels
+    factor = max(1, 2 * math.ceil(max(rows, columns) / _COARSE / 2) - 1)
+    coarse = _pooled(kernels, factor)
+    size = math.ceil(rows / factor), math.ceil(columns / factor)
+    white = kernels.new_ones(kernels.shape[3], rows, columns) if illumination is None else illumination.to(kernels)
+    white = torch.nn.functional.adaptive_avg_pool2d(white.expand(kernels.shape[3], rows, columns), size)
+    flux = []
+    for kernel in coarse.unbind(2):
+        light = white
+        for _ in range(_ROUNDS):
+            light = light + white - varying_blur(light, kernel)
+        flux.append(light)
+    return torch.stack(flux)
+
+
+def _pooled(kernels: Tensor, factor: int) -> Tensor:
+    """Kernels (..., h, w) on pixels so many times larger, an odd number, whose middle stays in the middle."""
+    if factor == 1:
+        return kernels
+    size = [2 * math.ceil((n - factor) / 2 / factor) + 1 for n in kernels.shape[-2:]]
+    down, right = ((n * factor - old) // 2 for n, old in zip(size, kernels.shape[-2:], strict=True))
+    padded = torch.nn.functional.pad(kernels, (right, right, down, down))
+    return padded.unflatten(-1, (size[1], factor)).unflatten(-3, (size[0], factor)).sum((-3, -1))
+
+
+def enlarged(light: Tensor, picture: Tensor) -> Tensor:
+    """Numbers (C, H′, W′) on larger pixels at those of pictures (..., C, H, W), bilinear."""
+    if light.shape[-2:] == picture.shape[-2:]:
+        return light.to(picture)
+    how = {"size": picture.shape[-2:], "mode": "bilinear", "align_corners": False}
+    return torch.nn.functional.interpolate(light.to(picture)[None], **how)[0]
+
+
+def _illumination(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
+    """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives."""
+    points = _every_pixel(sensor, like)
+    if is_round_about_axis(lens):
+        radii = _radii(points, _LIT)
+        curve = _illumination_at(lens, sensor, torch.stack([torch.zeros_like(radii), radii]))
+        return _along(radii, curve, points)
+    grid = _illumination_at(lens, sensor, _places(sensor, _FIT, _FIT, like)).reshape(_FIT, _FIT)
+    across, along = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
+    return along.T @ grid @ across
+
+
+def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+    fields = sensor.fields(lens, points)
+    arrives = ~fields.isnan().any(0)
+    values = relative_illumination(lens, fields=fields.nan_to_num(0.0)).illumination
+    return torch.where(arrives & ~values.isnan(), values, 0.0)
+
+
+def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
+    """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
+
+    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, linear between 257
+    radii; else polynomials of degree 13 through 25 × 25 chief rays.
+    """
+    if is_round_about_axis(lens):
+        every = _every_pixel(sensor, like)
+        radii = _radii(every, _RADII)
+        image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(radii[1:]), radii[1:]]))[1] / radii[1:]
+        return sensor.pixel_of(_along(radii, torch.cat([torch.ones_like(image[:1]), image]), every) * every)
+    points = _places(sensor, _FIT, _FIT, like)
+    shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
+    columns, rows = sensor.pixels
+    row, column = (_chebyshev(count, _FIT, like) for count in (rows, columns))
+    # Least squares by the pseudoinverse along either axis.
+    fitted = [torch.linalg.pinv(row[0]) @ part.reshape(_FIT, _FIT) @ torch.linalg.pinv(column[0]).T for part in shift]
+    shift = torch.stack([row[1] @ part @ column[1].T for part in fitted])
+    at = torch.meshgrid(
+        *(torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns)), indexing="ij"
+    )
+    return torch.stack([at[1], at[0]]) + shift
+
+
+def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+    """Paraxial images (2, N) mm of the objects whose chief rays meet the sensor at (2, N) mm; there itself if none."""
+    near = 1e-4 * points.abs().max() * torch.eye(2, dtype=points.dtype, device=points.device)
+    fields = sensor.fields(lens, torch.cat([points, near], 1))
+    extents = object_field(lens, fields.nan_to_num(0.0), first_order(lens))[0]
+    scale = near @ torch.linalg.inv(extents[:, -2:])  # mm of the image per unit of the object
+    return torch.where(fields[:, :-2].isnan().any(0), points, scale @ extents[:, :-2])
+
+
+def _radii(points: Tensor, count: int) -> Tensor:
+    """Radii (count,) mm from the axis to the farthest of points (2, ...)."""
+    steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
+    return steps * torch.hypot(*points.flatten(1)).max()
+
+
+def _along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
+    """A function (R,) of equally spaced radii (R,) at points (2, ...), linear in between."""
+    place = torch.hypot(*points) / radii[1]
+    left = place.floor().clamp_max(len(radii) - 2).long()
+    part = place - left
+    return (1 - part) * curve[left] + part * curve[left + 1]
+
+
+def _chebyshev(count: int, places: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """T_j at `places` from edge to edge of `count` pixels, (places, J), and at the pixels, (count, J)."""
+    fitted = torch.linspace(-1, 1, places, dtype=like.dtype, device=like.device)
+    pixels = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (2 / count) - 1
+    orders = torch.arange(_DEGREE + 1, dtype=like.dtype, device=like.device)
+    return tuple(torch.cos(torch.acos(x.clamp(-1, 1))[:, None] * orders) for x in (fitted, pixels))
+
+
+def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
+    """Places (2, H, W) mm."""
+    columns, rows = sensor.pixels
+    row = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None].expand(rows, columns)
+    column = torch.arange(columns, dtype=like.dtype, device=like.device).expand(rows, columns)
+    return sensor.points(column, row)
+
+
+def resampled(picture: Tensor, places: Tensor, boundary: str) -> Tensor:
+    """Pictures (..., C, H, W) at columns and rows (2, H, W), by cubic convolution (Keys 1981) that is exact of ramps.
+
+    boundary: "reflect" repeats the border pixel in a mirror, others continue by 0.
+    """
+    rows, columns = picture.shape[-2:]
+    # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: solved for u.
+    part = places - places.floor()
+    places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
+    size = places.new_tensor([columns, rows])[:, None, None]
+    grid = ((2 * places + 1) / size - 1).movedim(0, -1).to(picture.dtype)
+    stack = picture.reshape(1, -1, rows, columns)
+    beyond = "reflection" if boundary == "reflect" else "zeros"
+    how = {"mode": "bicubic", "align_corners": False, "padding_mode": beyond}
+    return torch.nn.functional.grid_sample(stack, grid[None], **how).reshape(picture.shape)
+
+
+def render(
+    lens: Lens,
+    picture: Tensor,
+    *,
+    sensor: Sensor | None = None,
+    depth: Tensor | None = None,
+    model: str = "gaussian",
+    tol: float = 1e-2,
+    planes: int = _PLANES,
+    boundary: str = "reflect",
+    distortion: bool = True,
+    lateral_colour: bool = True,
+    illumination: bool = True,
+    progress: Callable[[int], object] | None = None,
+) -> "Rendering":
+    """The picture that a lens projects onto its sensor, without noise, differentiable in the numbers of the lens.
+
+    picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
+    sensor: its pixels are those of the picture; by default of the size that the largest field of the lens fills to its
+        corners, one channel, or "rgb" of three.
+    depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
+        equally spaced reciprocal distances, of which near ones cover far ones.
+    model: of the PSF, see `rt.psf`; tol: bound on the estimated error of the kernels, the sum of |h - ĥ|.
+    boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
+    distortion, lateral_colour, illumination: False leaves it out.
+    progress: called with the number of convolutions done since the last call.
+    Raises ValueError for a picture, depth map or sensor that do not fit, WindowTooLarge for a blur of over 401 pixels.
+    """
+    light = linearised(picture)
+    light = light[None] if light.dim() == 2 else light
+    sensor = default_sensor(lens, light) if sensor is None else sensor
+    light, distances = checked_picture(light, sensor), None
+    if depth is not None:
+        distances = 1 / plane_distances(checked_depth(depth, light.double()), planes)
+    ready = optics(
+        lens, sensor, model=model, object_distances=distances, tol=tol, distortion=distortion,
+        lateral_colour=lateral_colour, illumination=illumination,
+    )  # fmt: skip
+    image = ready(light, depth, boundary=boundary, progress=progress)
+    return Rendering(image, light, lens, ready)
+
+
+def plane_distances(depth: Tensor, planes: int) -> Tensor:
+    """Reciprocal distances (D,) 1/mm of at most so many layers of a depth map."""
+    inverse = 1 / depth
+    known = inverse[torch.isfinite(inverse) & (inverse >= 0)]
+    if not len(known) or planes < 1:
+        raise ValueError("a depth map without distances above 0, or no planes: expected distances in mm from surface 1")
+    levels = known.unique()
+    ends = float(levels[0]), float(levels[-1])
+    return levels if len(levels) <= planes else torch.linspace(*ends, planes, dtype=depth.dtype)
+
+
+def default_sensor(lens: Lens, picture: Tensor) -> Sensor:
+    """A sensor for pictures (..., C, H, W): the largest field of the lens lies in its corners."""
+    rows, columns = picture.shape[-2:]
+    fields = field_points(None, like=lens).detach()
+    probe = Sensor(size=(1.0, rows / columns), pixels=(columns, rows))
+    reach = torch.hypot(*probe.landing(lens, fields)).max()
+    if not reach > 0:
+        raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
+    pitch = 2 * float(reach) / math.hypot(columns, rows)
+    response = {1: None, 3: "rgb"}.get(picture.shape[-3])
+    return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), response=response)
+
+
+def linearised(picture: Tensor | np.ndarray) -> Tensor:
+    """Numbers as they are; integers of 8 or 16 bits as the light that sRGB encodes (IEC 61966-2-1)."""
+    picture = torch.as_tensor(picture)
+    if picture.is_floating_point():
+        return picture
+    level = as_picture(picture)
+    return torch.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(light: Tensor) -> Tensor:
+    """sRGB levels of light, clipped to [0, 1] (IEC 61966-2-1)."""
+    light = light.clamp(0.0, 1.0)
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendering(Result):
+    """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
+
+    picture: the same of the ideal lens; optics: the lens and its sensor, for more pictures: `optics(picture)`.
+    """
+
+    image: Tensor
+    picture: Tensor
+    lens: Lens
+    optics: Optics
+
+    def text(self) -> list[str]:
+        ready = self.optics
+        columns, rows = ready.sensor.pixels
+        m, n, depths = ready.kernels.shape[:3]
+        lines = [
+            f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, {', '.join(ready.sensor.channels)}",
+            f"kernels of {ready.kernels.shape[-1]} × {ready.kernels.shape[-2]} pixels at {m} × {n} places"
+            + (f" and {depths} depths" if depths > 1 else ""),
+        ]
+        if math.isfinite(ready.error):
+            lines.append(f"estimated error between the places {ready.error:.1e} of the light")
+        if ready.illumination is not None:
+            darkest = 100 * float(ready.illumination.min())
+            lines.append(f"illumination of the darkest pixel {darkest:.1f} % of that of the axis")
+        if ready.ideal is not None:
+            column, row = (array(part) for part in ready.ideal)
+            ideal = math.hypot(column[0, 0] - column[-1, -1], row[0, 0] - row[-1, -1])
+            longer = math.hypot(columns - 1, rows - 1) / ideal - 1
+            lines.append(f"distortion of the diagonal {100 * longer:+.2f} %")
+        return lines
+
+    def __str__(self) -> str:
+        return "\n".join(self.text())
+
+    def document(self) -> dict:
+        ready = self.optics
+        darkest = None if ready.illumination is None else float(ready.illumination.min())
+        return {
+            "lens": self.lens.name,
+            "sensor": {"size": list(ready.sensor.size), "pixels": list(ready.sensor.pixels)},
+            "kernels": list(ready.kernels.shape),
+            "error": plain(ready.error),
+            "darkest": darkest,
+        }
+
+    @styled
+    def draw(self):
+        """The ideal lens's picture, the image, and both in detail at the centre and at the upper left corner."""
+        ideal, image = (_shown(one) for one in (self.picture, self.image))
+        rows, columns = image.shape[:2]
+        size = max(min(rows, columns) // 8, min(64, rows, columns))
+        middle = (slice((rows - size) // 2, (rows + size) // 2), slice((columns - size) // 2, (columns + size) // 2))
+        corner = (slice(0, size), slice(0, size))
+        heights = 4.0 * rows / columns + 0.3, 2.4
+        figure = new_figure(8.0, sum(heights))
+        whole, details = figure.subfigures(2, 1, height_ratios=heights)
+        pictures = {"ideal lens": ideal, "this lens": image}
+        for panel, (title, one) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
+            panel.imshow(one, vmin=0, vmax=1, cmap="gray")
+            panel.set_title(title)
+            panel.axis("off")
+        parts = [(f"{where}, {title}", one[at]) for where, at in (("centre", middle), ("corner", corner))
+                 for title, one in (("ideal", ideal), ("this lens", image))]  # fmt: skip
+        for panel, (title, part) in zip(details.subplots(1, 4), parts, strict=True):
+            panel.imshow(part, vmin=0, vmax=1, cmap="gray", interpolation="nearest")
+            panel.set_title(title)
+            panel.axis("off")
+        return figure
+
+
+def _shown(light: Tensor) -> np.ndarray:
+    """Levels (H, W) or (H, W, 3) of the first of pictures (..., C, H, W)."""
+    first = encoded(light.detach().reshape(-1, *light.shape[-3:])[0])
+    return array(first[0] if len(first) == 1 else first[:3].movedim(0, -1))

@@ -1,0 +1,365 @@
+"""Pictures of a lens over its sensor: varying blur, distortion, illumination, colour and depth."""
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge
+from raytrace.imaging.image import blur, blur_layers, depth_masks
+from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, resampled
+from raytrace.imaging.varying_blur import bilinear, varying_blur
+
+COLUMNS, ROWS = 48, 32
+SENSOR = rt.Sensor(size=(2.4, 1.6), pixels=(COLUMNS, ROWS), response="rgb")  # 50 µm
+FIELD = rt.Sensor(size=(18.0, 12.0), pixels=(COLUMNS, ROWS), response="rgb")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    rt.prepare()
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    """A defocused Cooke triplet, whose blur is some of the pixels of FIELD, 0.375 mm, wide."""
+    lens = rt.read_lens("cooke_triplet")
+    return lens.at(sensor_distance=lens.surfaces[-2].thickness + 3.0)
+
+
+def ready(lens, sensor=FIELD, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return optics(lens, sensor, **{"nodes": (3, 4), "order": 4, "tol": 1e-9, **options})  # no low rank
+
+
+def random(*shape, seed=0):
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def direct(picture, kernels, *, boundary="zero"):
+    """The sum over all points of the picture, each with the kernel that is interpolated at its place."""
+    m, n, C, h, w = kernels.shape
+    rows, columns = picture.shape[-2:]
+    down, right = (bilinear(count, 0, nodes, like=kernels) for count, nodes in ((rows, m), (columns, n)))
+    total = picture.new_zeros(C, rows + h - 1, columns + w - 1)
+    for i in range(rows):
+        for j in range(columns):
+            kernel = torch.einsum("m,n,mncij->cij", down[:, i], right[:, j], kernels)
+            total[:, i : i + h, j : j + w] += picture[:, i, j, None, None] * kernel
+    return total[:, h // 2 : h // 2 + rows, w // 2 : w // 2 + columns]
+
+
+# -- varying blur
+
+
+@pytest.mark.parametrize("nodes", [(1, 1), (2, 3), (4, 2), (1, 5)])
+@pytest.mark.parametrize("shape", [(16, 23), (9, 4), (3, 3)])
+def test_patches_are_the_direct_sum(nodes, shape):
+    kernels, picture = random(*nodes, 2, 5, 7), random(2, *shape, seed=1)
+    found = varying_blur(picture, kernels, boundary="zero")
+    torch.testing.assert_close(found, direct(picture, kernels), rtol=0, atol=1e-12)
+
+
+def test_low_rank_is_the_direct_sum_to_its_tolerance(monkeypatch):
+    monkeypatch.setattr("raytrace.imaging.varying_blur._operations_of_rank", lambda *_: 0.0)
+    x = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    sigma = torch.linspace(0.3, 0.5, 6, dtype=torch.float64).reshape(2, 3, 1, 1, 1)
+    kernels = torch.exp(-0.5 * (x[:, None] ** 2 + x**2) / sigma**2)
+    kernels = kernels / kernels.sum((-2, -1), keepdim=True)
+    picture = random(1, 21, 30)
+    exact = direct(picture, kernels)
+    for tol in (1e-2, 1e-4):
+        close = varying_blur(picture, kernels, boundary="zero", tol=tol)
+        assert 1e-14 < float((close - exact).abs().max()) < tol * float(picture.max())
+
+
+def test_a_single_kernel_is_an_ordinary_blur():
+    kernels, picture = random(1, 1, 3, 5, 5), random(4, 3, 17, 20, seed=2)
+    found = varying_blur(picture, kernels, boundary="reflect")
+    torch.testing.assert_close(found, blur(picture, kernels[0, 0], boundary="reflect"), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("boundary", ["zero", "reflect"])
+def test_the_transpose_is_the_adjoint(boundary):
+    kernels = random(3, 3, 1, 5, 5)
+    x, y = random(1, 14, 19, seed=3).requires_grad_(), random(1, 14, 19, seed=4)
+    image = varying_blur(x, kernels, boundary=boundary)
+    (transposed,) = torch.autograd.grad(image, x, y)
+    assert float((image.detach() * y).sum()) == pytest.approx(float((x.detach() * transposed).sum()), rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("picture", "kernels", "message"),
+    [
+        ((1, 8, 8), (2, 2, 1, 4, 5), "odd h and w"),
+        ((2, 8, 8), (2, 2, 3, 5, 5), "3 channels"),
+        ((8, 8), (2, 2, 1, 5, 5), "C, H, W"),
+    ],
+)
+def test_wrong_shapes_are_refused(picture, kernels, message):
+    with pytest.raises(ValueError, match=message):
+        varying_blur(random(*picture), random(*kernels))
+
+
+# -- kernels over the sensor
+
+
+@pytest.mark.parametrize("model", ["gaussian", "drt"])
+def test_kernels_are_those_of_psf_at_their_places(triplet, model):
+    """On an octant, its mirror images and off the grid, in the orientation of an upright picture."""
+    points = torch.tensor([[0.0, 3.0, -3.0, 5.0, -2.0], [4.0, 1.0, -1.0, 5.0, -6.0]], dtype=torch.float64)
+    lens = triplet.at(fields=[11.9])  # without vignetting factors
+    weights = FIELD.weights(lens.wavelengths)
+    kernels = FieldKernels(lens, FIELD, model, 6, 9, lens.surfaces[0].thickness.reshape(1), weights, nodes=257)
+    found = kernels.at(points)
+    assert found.shape == (5, 1, 3, 9, 9)
+    fields = FIELD.fields(lens, points)
+    parameters = {"gaussian": rt.Gaussian, "drt": rt.DRT}[model](order=6)
+    for k in range(5):
+        alone = rt.psf(
+            lens, parameters, fields=fields[:, k : k + 1], center="chief", per_wavelength=True, normalise="window",
+            grid=rt.grid(FIELD.pitch, 9),
+        ).kernel[0, 0]  # fmt: skip
+        wanted = torch.einsum("cw,wij->cij", weights, alone).flip(-1)
+        # The Gaussians are interpolated between radii; turned rays fall in other pixels of the same histogram.
+        assert float((found[k, 0] - wanted).abs().sum((-2, -1)).max()) < {"gaussian": 1e-5, "drt": 0.02}[model]
+
+
+def test_a_kernel_off_the_meridian_is_the_turned_one(triplet):
+    kernels = ready(triplet, nodes=(5, 5), distortion=False, illumination=False).kernels[:, :, 0]
+    torch.testing.assert_close(kernels, kernels.flip(0).flip(-2), rtol=0, atol=1e-13)
+    torch.testing.assert_close(kernels, kernels.flip(1).flip(-1), rtol=0, atol=1e-13)
+    assert float((kernels - kernels.flip(-1)).abs().max()) > 1e-3  # coma
+
+
+def test_window_that_would_be_too_large_is_refused(triplet):
+    fine = rt.Sensor(size=(18.0, 12.0), pixels=(18000, 12000))
+    with pytest.raises(WindowTooLarge, match=r"focus the lens.*larger pixels"):
+        optics(triplet, fine)
+
+
+# -- rendering
+
+
+def test_light_is_kept(triplet):
+    picture = torch.zeros(3, ROWS, COLUMNS, dtype=torch.float64)
+    picture[:, 12:20, 16:30] = random(3, 8, 14)
+    system = ready(triplet, distortion=False, illumination=False)
+    image = system(picture, boundary="zero")
+    assert float(image.sum()) == pytest.approx(float((system.flux[0] * picture).sum()), rel=1e-6)
+    assert float((system.flux - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("place", [(16, 24), (5, 7), (30, 46)])
+def test_a_point_gives_the_kernel_at_its_place(triplet, place):
+    triplet = triplet.at(fields=[11.9])  # vignetting factors are linear in the field, with a kink on the axis
+    system = ready(triplet, nodes=(25, 37), distortion=False, illumination=False)
+    picture = torch.zeros(3, ROWS, COLUMNS, dtype=torch.float64)
+    picture[:, place[0], place[1]] = 1
+    image = system(picture, boundary="zero")
+    size = system.kernels.shape[-1]
+    half = size // 2
+    image = torch.nn.functional.pad(image, (half,) * 4)[:, place[0] : place[0] + size, place[1] : place[1] + size]
+    point = FIELD.points(torch.tensor([place[1]]), torch.tensor([place[0]]))
+    weights = FIELD.weights(triplet.wavelengths)
+    distance = triplet.surfaces[0].thickness.reshape(1)
+    exact = FieldKernels(triplet, FIELD, "gaussian", system.order, size, distance, weights).at(point)[0, 0]
+    exact = system.flux[0, :, place[0], place[1], None, None] * exact
+    top, left = max(0, half - place[0]), max(0, half - place[1])
+    bottom, right = min(size, ROWS - place[0] + half), min(size, COLUMNS - place[1] + half)
+    part = (slice(None), slice(top, bottom), slice(left, right))
+    assert float((image - exact)[part].abs().sum((-2, -1)).max()) < 1e-3
+
+
+def test_a_turned_scene_renders_turned(triplet):
+    system = ready(triplet, nodes=(5, 7))
+    picture = random(3, ROWS, COLUMNS)
+    image = system(picture)
+    torch.testing.assert_close(system(picture.flip(-1, -2)), image.flip(-1, -2), rtol=0, atol=1e-10)
+    torch.testing.assert_close(system(picture.flip(-1)), image.flip(-1), rtol=0, atol=1e-10)
+
+
+def test_a_constant_stays_constant_but_for_the_illumination(triplet):
+    system = ready(triplet)
+    white = torch.ones(3, ROWS, COLUMNS, dtype=torch.float64)
+    torch.testing.assert_close(ready(triplet, illumination=False)(white), white, rtol=0, atol=3e-4)
+    shade = system.illumination
+    assert float(shade.min()) < 0.9
+    assert float(shade.max()) <= 1 + 1e-9
+    torch.testing.assert_close(system(white), shade.expand_as(white), rtol=0, atol=3e-4)
+
+
+def test_the_flux_is_computed_on_larger_pixels(triplet, monkeypatch):
+    fine = rt.Sensor(size=(18.0, 12.0), pixels=(144, 96))
+    white = torch.ones(1, 96, 144, dtype=torch.float64)
+    monkeypatch.setattr("raytrace.imaging.render._COARSE", 30)
+    system = ready(triplet, fine)
+    assert system.flux.shape == (1, 1, 20, 29)
+    plain = dataclasses.replace(system, flux=system.illumination.expand_as(white)[None])
+    inside = (slice(None), slice(5, -5), slice(5, -5))  # at the border the larger pixels are not whole
+    off = [(one(white) - system.illumination)[inside].square().mean().sqrt() for one in (system, plain)]
+    assert float(off[0]) < 1e-3
+    assert float(off[1]) > 2e-3
+
+
+def test_the_illumination_is_the_analysis(triplet):
+    shade = ready(triplet).illumination
+    points = torch.tensor([[10, 40], [3, 30]])
+    fields = FIELD.fields(triplet, FIELD.points(points[0], points[1]))
+    wanted = rt.relative_illumination(triplet, fields=fields).illumination
+    torch.testing.assert_close(shade[points[1], points[0]], wanted, rtol=0, atol=2e-3)
+
+
+def whole_field(lens):
+    """A sensor of 60 × 40 pixels with the largest field in its corners."""
+    return default_sensor(lens, torch.zeros(1, 40, 60))
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "phone", "double_gauss_28deg"])
+def test_the_distortion_is_that_of_chief_rays(name):
+    lens = rt.read_lens(name)
+    sensor = whole_field(lens)
+    places = ready(lens, sensor, illumination=False, size=3, order=4, nodes=(1, 1)).ideal
+    at = torch.tensor([[3, 50, 59], [38, 10, 0]])
+    points = sensor.points(at[0], at[1])
+    slope = torch.tan(torch.deg2rad(sensor.fields(lens, points)))
+    near = torch.tan(torch.deg2rad(sensor.fields(lens, 1e-4 * points)))
+    wanted = sensor.pixel_of(slope / near * 1e-4 * points)
+    torch.testing.assert_close(places[:, at[1], at[0]], wanted, rtol=0, atol=2e-3)  # of a pixel
+
+
+def test_a_picture_of_lines_is_bent_as_the_distortion_says():
+    """A ramp of columns is the column itself, the interpolation being exact of it."""
+    lens = rt.read_lens("phone")
+    system = ready(lens, whole_field(lens), illumination=False, nodes=(1, 1), size=3)
+    ramp = torch.arange(60.0, dtype=torch.float64).expand(1, 40, 60)
+    inside = (slice(8, -8), slice(8, -8))
+    bent = resampled(ramp, system.ideal, "reflect")[0]
+    assert float((bent - ramp[0])[inside].abs().max()) > 0.02
+    torch.testing.assert_close(bent[inside], system.ideal[0][inside], rtol=0, atol=1e-9)
+
+
+def test_without_lateral_colour_all_colours_lie_together(triplet):
+    centroids = []
+    for lateral in (True, False):
+        kernels = ready(
+            triplet, SENSOR, nodes=(2, 2), lateral_colour=lateral, illumination=False, distortion=False
+        ).kernels
+        lines = torch.arange(kernels.shape[-1], dtype=torch.float64)
+        centroids.append((kernels[0, 0, 0] * lines).sum((-2, -1)))
+    apart = [float(each.max() - each.min()) for each in centroids]
+    assert apart[0] != pytest.approx(apart[1], abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["curvature", "thickness"])
+def test_gradients_of_the_whole_rendering_are_those_of_differences(triplet, name):
+    picture, weight = random(3, ROWS, COLUMNS), random(3, ROWS, COLUMNS, seed=5)
+    number = getattr(triplet.surfaces[3], name).clone()
+    fixed = ready(triplet)
+
+    def value(number):
+        lens = triplet.replace(3, **{name: number})
+        return (ready(lens, size=fixed.kernels.shape[-1])(picture) * weight).sum()
+
+    number.requires_grad_()
+    (gradient,) = torch.autograd.grad(value(number), number)
+    step = 1e-5 * max(abs(float(number)), 1e-2)
+    with torch.no_grad():
+        difference = (value(number + step) - value(number - step)) / (2 * step)
+    assert float(gradient) == pytest.approx(float(difference), rel=2e-5)
+
+
+def test_single_precision_is_close(triplet):
+    system, picture = ready(triplet), random(3, ROWS, COLUMNS)
+    image = system(picture.float())
+    assert image.dtype == torch.float32
+    torch.testing.assert_close(image.double(), system(picture), rtol=0, atol=2e-6)
+
+
+# -- depth
+
+
+def test_layers_are_those_of_blur_layers(triplet):
+    distances = torch.tensor([2e3, 4e3, math.inf], dtype=torch.float64)
+    near = triplet.at(object_distance=4e3)
+    system = ready(near, object_distances=distances, nodes=(1, 1), distortion=False, illumination=False)
+    picture = random(3, ROWS, COLUMNS)
+    depth = torch.tensor([2e3, 4e3, math.inf], dtype=torch.float64).repeat(ROWS, COLUMNS // 3)
+    masks = depth_masks(1 / depth, 1 / distances.flip(0))
+    wanted = blur_layers(picture, masks, system.kernels[0, 0], boundary="reflect")
+    torch.testing.assert_close(system(picture, depth), wanted, rtol=0, atol=1e-10)
+    assert len(system.planes) == 3
+    assert torch.equal(system.planes, (1 / distances).sort().values)
+
+
+def test_a_flat_depth_map_is_that_distance(triplet):
+    picture = random(3, ROWS, COLUMNS)
+    flat = torch.full((ROWS, COLUMNS), 3e3, dtype=torch.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        deep = rt.render(triplet, picture, sensor=FIELD, depth=flat, distortion=False, illumination=False)
+        alone = optics(
+            triplet, FIELD, object_distances=torch.tensor([3e3]), distortion=False, illumination=False,
+            order=deep.optics.order, nodes=deep.optics.kernels.shape[:2],
+        )(picture)  # fmt: skip
+    torch.testing.assert_close(deep.image, alone, rtol=0, atol=1e-9)
+
+
+# -- the verb
+
+
+def test_render_chooses_sensor_grid_and_window(triplet):
+    picture = (random(3, 24, 36) * 255).to(torch.uint8)
+    result = rt.render(triplet, picture, tol=0.05)
+    assert result.image.shape == (3, 24, 36)
+    corner = torch.hypot(*result.optics.sensor.corners[:, 0])
+    largest = result.optics.sensor.landing(triplet, torch.tensor([[0.0], [11.9]], dtype=torch.float64))[1]
+    assert float(corner) == pytest.approx(float(largest.abs()), rel=1e-9)
+    assert result.optics.error <= 0.025
+    assert "kernels of" in str(result)
+    torch.testing.assert_close(encoded(linearised(picture)) * 255, picture.float(), rtol=0, atol=1e-3)
+
+
+def test_a_grey_picture_and_one_smaller_than_a_kernel(triplet):
+    fine = rt.Sensor(size=(0.09, 0.07), pixels=(9, 7))
+    image = rt.render(triplet, random(7, 9), sensor=fine, tol=0.1).image
+    assert image.shape == (1, 7, 9)
+    assert bool(torch.isfinite(image).all())
+
+
+@pytest.mark.parametrize(
+    ("picture", "options", "message"),
+    [
+        (torch.zeros(3, 30, 48), {}, "48 × 30 pixels on a sensor of 48 × 32"),
+        (torch.zeros(2, ROWS, COLUMNS), {}, "2 channels on a sensor of 3"),
+        (torch.full((3, ROWS, COLUMNS), math.nan), {}, "numbers of the picture are not finite"),
+        (torch.zeros(3, ROWS, COLUMNS, dtype=torch.int64), {}, "its white is unknown"),
+        (torch.zeros(3, ROWS, COLUMNS), {"depth": torch.ones(5, 5)}, "the distance of every pixel"),
+        (torch.zeros(3, ROWS, COLUMNS), {"depth": torch.full((ROWS, COLUMNS), -1.0)}, "distances above 0"),
+        (torch.zeros(3, ROWS, COLUMNS), {"model": "airy"}, "model 'airy'"),
+    ],
+)
+def test_bad_input_is_one_clear_error(triplet, picture, options, message):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(ValueError, match=message):
+            rt.render(triplet, picture, sensor=FIELD, tol=0.3, **options)
+
+
+def test_the_grid_is_refined_to_the_tolerance(triplet):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        errors = [optics(triplet, FIELD, tol=tol, illumination=False, distortion=False).error for tol in (0.2, 0.02)]
+    assert errors[0] <= 0.1
+    assert errors[1] <= 0.01
+
+
+def test_optics_is_a_value(triplet):
+    system = ready(triplet, nodes=(2, 2))
+    assert isinstance(system, Optics)
+    assert np.isnan(system.error)  # of a grid that was asked for nothing is estimated
