@@ -124,7 +124,7 @@ def test_report_and_figure_are_written(tmp_path, capsys):
         ("double_gauss", 1e-10),
         pytest.param("phone", 1e-10, marks=pytest.mark.slow),
         ("hubble", 1e-6),
-        ("cooke_triplet", 1e-10),
+        pytest.param("cooke_triplet", 1e-10, marks=pytest.mark.slow),
     ],
 )
 def test_package_agrees_with_the_reference(name, bound):

@@ -172,6 +172,7 @@ def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
     torch.testing.assert_close(together, each, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_as_built_resumes_bit_by_bit(lens, pictures, tmp_path):
     def trained(folder, stop=None):
         own = camera(lens, BUILT)

@@ -109,6 +109,7 @@ def test_the_adjoint_equals_autograd(dtype, close, with_path):
 @pytest.mark.parametrize(
     ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
 )
+@pytest.mark.slow
 def test_the_forward_derivatives_of_every_number_are_those_of_torch(dtype, close):
     """∂hit/∂v by every number of the lens, through the compiled tangents and through jvp."""
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(200, dtype=dtype)
