@@ -20,11 +20,6 @@ LENS = "cemented_achromat"
 QUICK = ("--sensor", "6x4", "--tol", "0.3")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    rt.prepare()
-
-
 def levels(*shape, most=256, seed=0):
     return np.random.default_rng(seed).integers(0, most, shape)
 
