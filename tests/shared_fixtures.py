@@ -14,6 +14,8 @@ from raytrace.io import read_lens
 from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.compiler import NoCompiler, library
 
+gc.disable()  # while tests are collected: nothing that imports make is garbage
+
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
 
@@ -37,6 +39,8 @@ def _imports_are_no_garbage():
     """The collector leaves alone what imports and the collection of tests have made, instead of looking it through."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 20, 20)  # trees and tensors of a test are many: looked through less often than by default
+    gc.enable()
     yield
     gc.unfreeze()
 

@@ -167,8 +167,17 @@ def test_derivatives_of_an_aimed_beam_are_finite_for_an_object_at_infinity():
     assert slope.isfinite()
 
 
-@pytest.mark.parametrize("aiming", ["paraxial", "real"])
-@pytest.mark.parametrize("name", ["double_gauss", "folded_relay"])
+@pytest.mark.parametrize(
+    ("name", "aiming"),
+    [
+        ("double_gauss", "real"),
+        ("folded_relay", "paraxial"),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("double_gauss", "paraxial"), ("folded_relay", "real"))
+        ),
+    ],
+)
 def test_aimed_rays_of_a_batch_of_lenses_are_those_of_each(name, aiming):
     """Launch and trace inside `torch.func.vmap`, and derivatives of each lens."""
     lens = rt.read_lens(name).at(ray_aiming=aiming)

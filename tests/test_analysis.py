@@ -210,6 +210,7 @@ def test_through_focus_is_the_mtf_at_each_sensor():
             rt.mtf(lens, frequencies, through_focus=0.5)
 
 
+@pytest.mark.slow
 def test_through_focus_has_the_derivative_of_the_mtf_at_each_sensor(monkeypatch):
     monkeypatch.setattr("raytrace.analysis.mtf._DISTANCES", 3)
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="real")
@@ -403,7 +404,9 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=pytest.mark.slow if c == "wavefront" else ()) for c in COMMANDS]
+)
 def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
     def refuse(word):
         raise AssertionError(f"{word} is no JSON")

@@ -201,6 +201,7 @@ def test_errors(cooke):
         rt.optimize(cooke, as_built="precision", **spots)
 
 
+@pytest.mark.slow
 def test_search_orders_minima_by_the_merit_as_built(cooke):
     """The same minima as without, in another order, each with the figures of `optimize`."""
     lens = cooke.at(f_number=5, fields=[0, 8])

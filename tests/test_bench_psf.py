@@ -179,6 +179,7 @@ def test_command_writes_everything(few, tmp_path, capsys):
     assert "## hubble, 0°" in (tmp_path / "r.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_script_adds_random_rays_direct_sums_and_targets(few, tmp_path, capsys):
     extended.main(["hubble", "--repeats", "1", "--no-peers", "--json", "--docs", str(tmp_path)])
     document = json.loads(capsys.readouterr().out)

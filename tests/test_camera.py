@@ -261,6 +261,7 @@ def test_a_run_begins_at_the_optimum_of_the_closed_form(tmp_path, vary, bounds):
     assert {name: record[name] for name in begun} == own.variables.numbers()
 
 
+@pytest.mark.slow
 def test_a_run_started_from_the_closed_form_resumes_to_the_same_end(tmp_path):
     """Stopped before its first checkpoint it begins there again; behind one it goes on from that."""
     settings = dataclasses.replace(SMALL, start="spectral", model="paraxial")
@@ -350,6 +351,7 @@ def test_an_optimum_at_the_end_of_its_range_is_none():
         assert course.no_optimum == (f"no optimum inside sensor from {low} to {high}: the loss still falls at its end")
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
     """20 mm behind all images windows hold but the middle of any blur, and the slope leads nowhere."""
     S = patch_spectrum(dead_leaves(4, size=64), 22)

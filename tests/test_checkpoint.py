@@ -32,6 +32,7 @@ def mean_square(lens):
     return rt.spot(lens, fields=[0.0, 8.0]).whole.rms_radius.square().mean()
 
 
+DEAR = ("a function", "paths that end by themselves")
 HOW = {
     "one path": SPOT,
     "paths that end by themselves": {**PATHS, "vary": "curvature:1-3", "bounds": None, "cycles": 60},
@@ -61,7 +62,7 @@ def stops_at(cycle):
     return Bar
 
 
-@pytest.mark.parametrize("name", HOW)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in DEAR else ()) for name in HOW])
 def test_an_interrupted_run_resumes_to_the_same_end(name, tmp_path, monkeypatch):
     """The same variables, merits, dampings and evaluations to the last bit, wherever it was interrupted."""
     monkeypatch.setattr(checkpoint, "EVERY", 0.0)

@@ -217,6 +217,7 @@ def test_the_module_is_the_command_with_its_exit_codes():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a POSIX pipe")
+@pytest.mark.slow
 def test_reader_that_leaves_early_is_no_error(tmp_path):
     rays = write_rays(tmp_path / "rays.csv", [(0.001 * i, 0, -5, 0, 0, 1) for i in range(2000)])
     process = subprocess.Popen(

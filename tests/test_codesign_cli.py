@@ -140,6 +140,7 @@ def test_a_stopped_run_resumes_to_the_same_end(run, pictures, monkeypatch):
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_run_as_built_resumes_and_lists_its_perturbed_cameras(run, pictures, monkeypatch):
     few = ("--limits", "thickness=0.1", "element_decenter=0.05", "--rays", "20", "--drt-rays", "20", "--cameras", "2")
     command = ("double_gauss", "--data", pictures, *SMALL, "--center", "chief", *few, "--as-built")
@@ -256,6 +257,7 @@ def test_the_penalty_is_reported_with_the_loss(run, pictures):
     assert "'0.9:0.3': expected 0 ≤ least < greatest" in err
 
 
+@pytest.mark.slow
 def test_a_run_begins_where_the_closed_form_ends(run, pictures):
     """One command: the log of the training begins where `--loss spectral` ends."""
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--rho", "0.3", "-o", "one")

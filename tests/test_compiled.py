@@ -109,6 +109,7 @@ def test_the_adjoint_equals_autograd(dtype, close, with_path):
 @pytest.mark.parametrize(
     ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
 )
+@pytest.mark.slow
 def test_the_forward_derivatives_of_every_number_are_those_of_torch(dtype, close):
     """∂hit/∂v by every number of the lens, through the compiled tangents and through jvp."""
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(200, dtype=dtype)
@@ -298,6 +299,7 @@ def test_it_is_compiled_once_for_work_that_is_worth_it(tmp_path):
     assert [path.stat().st_ino for path in tmp_path.iterdir()] == [made]
 
 
+@pytest.mark.slow
 def test_without_a_compiler_torch_traces_and_one_line_gives_the_reason(tmp_path):
     """One line for each compiler: one that is missing, and one that fails."""
     done = probe(tmp_path, 2**20, ("no-such-compiler", "false"))

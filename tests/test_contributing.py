@@ -59,11 +59,23 @@ def test_every_addition_has_a_test_that_the_page_runs():
         assert f"\npytest {path}\n" in page
 
 
+@pytest.mark.parametrize(("path", "kind", "text"), BLOCKS, ids=[path for path, *_ in BLOCKS])
+def test_every_change_applies(path, kind, text):
+    """To a file of the repository; a new file is Python."""
+    file = ROOT / path
+    assert file.exists() == (kind == "diff")
+    new = changed(file.read_text("utf-8"), text) if kind == "diff" else text
+    if path.endswith(".py"):
+        compile(new, path, "exec")
+
+
+@pytest.mark.slow
 def test_the_shown_tests_pass(copy):
     summary = run(copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", *TESTS).splitlines()[-1]
     assert int(re.match(r"(\d+) passed", summary)[1]) >= 7, summary
 
 
+@pytest.mark.slow
 def test_the_code_is_formatted_and_its_command_runs(copy):
     files = [path for path, _, _ in BLOCKS if path.endswith(".py")]
     run(copy, "-m", "ruff", "check", "-q", *files)

@@ -53,7 +53,7 @@ def mtf_of(lens, frequency):
     return float(0.5 * (found.tangential + found.sagittal).mean())
 
 
-@pytest.mark.parametrize("frequency", [10.0, 40.0])
+@pytest.mark.parametrize("frequency", [10.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_mtf_is_that_of_single_lenses(triplet, frequency):
     rows = rt.tolerances(triplet, LIMITS, compensators=[])
     errors = rt.draw_errors(rows, 3)
@@ -81,6 +81,7 @@ def test_changes_of_the_mtf_are_those_of_single_lenses(triplet):
             assert float(found.nominal + change) == pytest.approx(float(alone.nominal), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_mtf_as_built_reads_the_right_way_round(triplet):
     found = rt.tolerance(triplet, limits=LIMITS, criterion="mtf@20", trials=24)
     assert found.better == "larger"
@@ -139,7 +140,7 @@ def test_mtf_of_a_clipped_beam_is_refused(triplet):
 # -- merit functions ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["spot", "wavefront"])
+@pytest.mark.parametrize("kind", ["spot", pytest.param("wavefront", marks=pytest.mark.slow)])
 def test_merit_is_that_of_single_lenses(triplet, kind):
     rows, sampling = rt.tolerances(triplet, LIMITS + " irregularity=0.5 index=0.0005"), sampling_of(triplet)
     errors = rt.draw_errors(rows, 2)
@@ -169,6 +170,7 @@ def test_evaluate_takes_a_batch(triplet):
     assert "lost" in str(found)
 
 
+@pytest.mark.slow
 def test_merit_as_built(triplet):
     rows = rt.tolerances(triplet, "radius=0.1% element_decenter=0.02")
     found = rt.tolerance(triplet, rows, criterion="merit", merit="spot", trials=16)

@@ -142,8 +142,14 @@ def derivatives(function, rims: int, names) -> dict[str, torch.Tensor]:
     return {name: torch.stack([row[k] for row in rows]) for k, name in enumerate(names)}
 
 
-@pytest.mark.parametrize("rims", [1, 2])
-@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize(
+    ("quantity", "rims"),
+    [
+        pytest.param(quantity, rims, marks=pytest.mark.slow if rims == 1 else ())
+        for quantity in QUANTITIES
+        for rims in (1, 2)
+    ],
+)
 def test_derivatives_are_those_of_finer_quadrature(quantity, rims):
     function, entries, error = QUANTITIES[quantity]
     names = [name for name in NUMBERS if rims == 2 or name != "rear"]
@@ -155,7 +161,7 @@ def test_derivatives_are_those_of_finer_quadrature(quantity, rims):
         )
 
 
-@pytest.mark.parametrize("rims", [1, 2])
+@pytest.mark.parametrize("rims", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_relative_illumination_has_the_derivative_of_its_number(rims):
     names = ["f_number", "front", "field"]
     computed, expected = (find(illumination, rims, names) for find in (derivatives, differences))

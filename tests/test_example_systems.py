@@ -18,7 +18,7 @@ def test_every_example_is_opened_by_its_name_traced_and_drawn(name, tmp_path):
     assert lens.notes
     assert bool(rt.trace(lens).valid.all())
     for view in ("yz", "xz"):
-        rt.layout(lens, view=view, rays=3).plot(tmp_path / f"{view}.png")
+        rt.layout(lens, view=view, rays=3).plot(tmp_path / f"{view}.png", dpi=60)
     rt.write_lens(lens, tmp_path / "copy.zmx")
     assert (tmp_path / "copy.zmx").read_text() == (shipped("lenses") / "examples" / f"{name}.zmx").read_text()
 

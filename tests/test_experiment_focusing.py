@@ -48,7 +48,7 @@ def test_ideal_heights_are_the_ideal_lens(collimator):
     assert residual_phase(setting, elements) < 1e-6
 
 
-@pytest.mark.parametrize("collimator", [False, True])
+@pytest.mark.parametrize("collimator", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_learns_a_lens_from_a_flat_plate(collimator):
     """The law of the issue: at least 0.98 of the ideal peak within 300 steps, from next to nothing."""
     found = learn_to_focus(Setting(collimator=collimator), steps=300, enough=0.99, frames=(0,))

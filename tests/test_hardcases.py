@@ -37,7 +37,7 @@ def of_kind(kind: str) -> list:
 
 
 def by_engine() -> list:
-    """Parameters of a test: all cases by both engines, the dearest of those by torch alone in the slow suite."""
+    """Parameters of a test: all cases by both engines, the dearest in the slow suite."""
     listed = [case for kind in dict.fromkeys(c["kind"] for c in CASES) for case in of_kind(kind)]
     dearest = "property-A7-d-gradcheck", "eager"
     return [
@@ -45,7 +45,7 @@ def by_engine() -> list:
             *case.values,
             engine,
             id=f"{case.id}-{engine}",
-            marks=pytest.mark.slow if (case.id, engine) == dearest else (),
+            marks=pytest.mark.slow if case.id == dearest else (),
         )
         for engine in ("eager", "compiled")
         for case in listed

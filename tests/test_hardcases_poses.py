@@ -288,7 +288,8 @@ def test_all_of_it_follows_the_scale(engine, dtype, power):
 
 
 @pytest.mark.parametrize("engine", [pytest.param("eager", marks=pytest.mark.slow), "compiled"], indirect=True)
-def test_derivatives_with_failed_rays_by_every_number(engine):
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_derivatives_with_failed_rays_by_every_number(order, engine):
     """By finite differences, of first and of second order; some rays are evanescent, some miss, some are cut off."""
     rays = beam([-9.0, -1.0, 0.5, 2.0, 40.0, 1.0], slope=[0.0, 0.02, -0.03, 0.05, 0.0, 0.95])
     names = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
@@ -309,8 +310,10 @@ def test_derivatives_with_failed_rays_by_every_number(engine):
     given = [real(0.9), vector(0.02, 0.03), vector(-30.0, 5.0), vector(1.0, 2.0, -50.0)]
     given += [real(n) for n in (0.2, -0.1, 0.3, 5.0, -4.0, 30.0)]
     given = [leaf.requires_grad_() for leaf in given]
-    assert gradcheck(traced, given, atol=1e-6, rtol=1e-5)
-    assert gradgradcheck(lambda *g: traced(*g)[0], given, atol=1e-4, rtol=1e-4, fast_mode=True)
+    if order == 1:
+        assert gradcheck(traced, given, atol=1e-6, rtol=1e-5)
+    else:
+        assert gradgradcheck(lambda *g: traced(*g)[0], given, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
 def test_a_fold_by_half_turns_is_the_path_there_and_back():

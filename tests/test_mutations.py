@@ -219,7 +219,9 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "lenses.seq" else ()) for name in READERS]
+)
 def test_damaged_files_are_read_or_refused(name, tmp_path, capfd):
     read, refused = survive(READERS[name](tmp_path), 200, seed=1)
     assert read  # unread files would test nothing

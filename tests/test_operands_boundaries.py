@@ -222,7 +222,10 @@ def rows_of(found) -> list[Row]:
     return rows
 
 
-@pytest.fixture(scope="module", params=LENSES)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.slow if name == "double gauss" else ()) for name in LENSES],
+)
 def case(request):
     found = LENSES[request.param]()
     model = Model(found, VARY[request.param])

@@ -241,7 +241,7 @@ def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet)
     def merit(lens):
         return rt.spot(lens, fields=[0, 8.4], wavelengths=lens.wavelengths).rms_radius.mean()
 
-    found = rt.optimize(triplet, merit=merit, vary="curvature:1-3 sensor", bounds="curvature_1:0.02,0.03", cycles=30)
+    found = rt.optimize(triplet, merit=merit, vary="curvature:1-3 sensor", bounds="curvature_1:0.02,0.03", cycles=8)
     assert float(merit(found.lens)) == pytest.approx(found.merit_after, rel=1e-9)
     assert found.merit_after < 0.9 * found.merit_before
     assert 0.02 <= float(found.lens.surfaces[1].curvature) <= 0.03
@@ -393,7 +393,7 @@ def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(kno
     assert moved.merit_after <= 1.01 * best
 
 
-@pytest.mark.parametrize("fell", [0.9, 1e-3, 1e-7, 0.0])
+@pytest.mark.parametrize("fell", [*(pytest.param(f, marks=pytest.mark.slow) for f in (0.9, 1e-3)), 1e-7, 0.0])
 def test_labels_of_the_merit_history_differ(fell):
     """Also where the merit hardly changes: labels, and what the axis says that they are counted from."""
     found = rt.optimize(rt.read_lens("singlet"), merit="spot", vary="sensor", cycles=3)
@@ -420,6 +420,7 @@ def test_lenses_and_spots_before_and_after_are_drawn_on_one_scale():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_optimisation(triplet, capfd):
     """They meet the image nowhere and miss it by no number that has a derivative."""
     turned = Surface(torch.tensor(37.4, dtype=torch.float64), before=Pose(tilt_x=torch.tensor(90.0)), is_break=True)
@@ -481,6 +482,7 @@ def test_each_cycle_is_watched_with_its_lens_and_an_interrupt_keeps_the_last():
     assert float(rt.evaluate(last, merit="spot").merit) == pytest.approx(seen[-1][0].merit, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_an_mtf_that_starts_near_zero_is_reported():
     """Through spots first the same merit function ends far lower, and the line is gone."""
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial", fields=[0.0, 8.4])

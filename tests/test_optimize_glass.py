@@ -192,9 +192,9 @@ def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
     optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))
     lens = dataclasses.replace(triplet, optimization_data=optimization_data)
-    found = rt.optimize(lens, merit=MERIT, vary="curvature sensor glass", hold="efl=100", cycles=3)
+    found = rt.optimize(lens, merit=MERIT, vary="curvature sensor glass:1", hold="efl=100", cycles=3)
     assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
-    assert {step.surface for step in found.glasses} <= {0, 1, 3}
+    assert {step.surface for step in found.glasses} <= {0, 1}
 
 
 def test_the_command_prints_the_sequence(capsys):
@@ -213,6 +213,7 @@ def test_the_command_prints_the_sequence(capsys):
 # -- interrupted -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_interrupted_exchanges_resume(triplet, tmp_path, monkeypatch):
     """Ended hard behind the first exchanges, and begun again from the checkpoint: the same lens to the last digit."""
     path, done = tmp_path / "kept.json", []

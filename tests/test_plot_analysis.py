@@ -49,7 +49,16 @@ COMMANDS = (
 
 
 TWELVE = ("double_gauss", "--field", *map(str, range(12)))
-DEAR = ("mtf", "encircled-energy", "wavefront", "opd-fan", "ray-fan", "field-curvature")  # seconds of twelve fields
+DEAR = (
+    "mtf",
+    "encircled-energy",
+    "wavefront",
+    "opd-fan",
+    "ray-fan",
+    "field-curvature",
+    "spot",
+    "relative-illumination",
+)  # seconds of twelve fields
 
 
 @pytest.mark.parametrize(
@@ -138,7 +147,9 @@ def test_the_axis_alone_has_no_curve_over_the_field(analyse):
         found.plot()
 
 
-@pytest.mark.parametrize(("fields", "wavelengths"), [(1, 1), (3, 1), (12, 1), (3, 3)])
+@pytest.mark.parametrize(
+    ("fields", "wavelengths"), [(1, 1), pytest.param(3, 1, marks=pytest.mark.slow), (12, 1), (3, 3)]
+)
 def test_maps_fill_their_page_and_their_scale(fields, wavelengths):
     lens = read_lens(LENSES / "singlet.zmx")
     y = torch.linspace(0, 5, fields, dtype=torch.float64)

@@ -33,7 +33,10 @@ def seen(name: str, model: str, **options):
     return result, close_up_of(result), fields
 
 
-@pytest.mark.parametrize(("name", "model"), [("phone", "wave"), ("hubble", "wave"), ("telephoto", "gaussian")])
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [pytest.param("phone", "wave", marks=pytest.mark.slow), ("hubble", "wave"), ("telephoto", "gaussian")],
+)
 def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
     """The phone's kernel is one pixel of 5 µm: seen closely it is 50 samples wide, of the same energy and centroid."""
     result, light, _ = seen(name, model, fields=number([[0.0], [0.05]]))

@@ -102,7 +102,7 @@ def test_derivatives_of_the_moments(model, shift):
     assert float(slope) == pytest.approx(float(expected), rel=1e-4)
 
 
-@pytest.mark.parametrize("model", ["paraxial", "gaussian", "wave"])
+@pytest.mark.parametrize("model", ["paraxial", "gaussian", pytest.param("wave", marks=pytest.mark.slow)])
 def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
     lens = read_lens("telephoto")
     options = {"fields": number([[0.0, 0.0], [0.0, 2.0]]), "center": "chief", "tol": 1e-2}

@@ -20,6 +20,7 @@ from raytrace.tracing.scene import Scene, scene
 from raytrace.tracing.wavefront import wavefront_of
 
 WAVES = ("fourier", "wave")
+DEAR = ("conic", "thickness", "sensor", "pitch")  # numbers of the wave model in the slow suite; others alike are tested
 MODULES = {"fourier": fourier, "wave": wave}
 
 
@@ -245,8 +246,14 @@ def small_kernel(model: str, rim: float | None = 0.9, **changed) -> torch.Tensor
     return MODULES[model].kernels(s, window).kernel
 
 
-@pytest.mark.parametrize("name", NUMBERS)
-@pytest.mark.parametrize("model", WAVES)
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        pytest.param(model, name, marks=pytest.mark.slow if model == "wave" and name in DEAR else ())
+        for model in WAVES
+        for name in NUMBERS
+    ],
+)
 def test_gradients_with_rays_vignetted(model, name):
     """Central differences agree to 1e-5 of the largest derivative of a pixel; a paraxial lens has no aspheres."""
     start, step = NUMBERS[name]

@@ -144,8 +144,7 @@ def test_derivatives_are_those_of_finite_differences(cases, name, engine):
         "at infinity",
         "near",
         "image heights, near",
-        "aimed",
-        pytest.param("aimed by the paraxial ray", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("aimed", "aimed by the paraxial ray")),
     ],
 )
 def test_the_launch_in_numpy_is_that_of_torch(cases, name):

@@ -1,5 +1,6 @@
 """README.md: its commands and examples run, its links and pictures exist."""
 
+import operator
 import re
 import shlex
 from pathlib import Path
@@ -20,6 +21,7 @@ PYTHON = [
 ]
 #: Pages of every public name with an example each.
 API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
+STEM = operator.attrgetter("stem")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -79,7 +81,17 @@ def test_extras_that_the_readme_installs_exist():
     assert 'raytrace = "raytrace.cli:script"' in project
 
 
-@pytest.mark.parametrize("line", examples())
+#: Examples and pages of seconds; by default the commands are only read, and run in the tests of their own.
+DEAR = ("compare double_gauss", "bench trace", "psf double_gauss --model drt", "api_analysis", "psf")
+
+
+def quick_and_slow(listed: list, name) -> list:
+    """Parameters of a test, those of DEAR in the slow suite."""
+    dear = [name(one) in DEAR or name(one).startswith(DEAR[:3]) for one in listed]
+    return [pytest.param(one, marks=pytest.mark.slow if slow else ()) for one, slow in zip(listed, dear, strict=True)]
+
+
+@pytest.mark.parametrize("line", quick_and_slow(examples(), str))
 def test_examples_run(line, tmp_path, monkeypatch, capsys):
     (tmp_path / "lenses").symlink_to(ROOT / "lenses")
     monkeypatch.chdir(tmp_path)
@@ -97,7 +109,7 @@ def test_readme_is_one_screen():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", quick_and_slow(PYTHON, STEM), ids=STEM)
 def test_python_runs(page, tmp_path, monkeypatch, capsys):
     import torch
 
@@ -114,7 +126,7 @@ def test_python_runs(page, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", API, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", quick_and_slow(API, STEM), ids=STEM)
 def test_examples_of_public_names_run(page, tmp_path, monkeypatch):
     import dataclasses
     import os

@@ -11,8 +11,9 @@ import torch
 import raytrace as rt
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge
 from raytrace.imaging.image import blur, blur_layers, depth_masks
-from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, resampled
+from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, render_patches, resampled
 from raytrace.imaging.varying_blur import bilinear, varying_blur
+from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 
 COLUMNS, ROWS = 48, 32
 SENSOR = rt.Sensor(size=(2.4, 1.6), pixels=(COLUMNS, ROWS), response="rgb")  # 50 µm
@@ -113,7 +114,7 @@ def test_wrong_shapes_are_refused(picture, kernels, message):
 def test_kernels_are_those_of_psf_at_their_places(triplet, model):
     """On an octant, its mirror images and off the grid, in the orientation of an upright picture."""
     points = torch.tensor([[0.0, 3.0, -3.0, 5.0, -2.0], [4.0, 1.0, -1.0, 5.0, -6.0]], dtype=torch.float64)
-    lens = triplet.at(fields=[11.9])  # without vignetting factors
+    lens = triplet.at(fields=[11.9])  # without vignetting factors, which move the chief ray of a PSF
     weights = FIELD.weights(lens.wavelengths)
     kernels = FieldKernels(lens, FIELD, model, 6, 9, lens.surfaces[0].thickness.reshape(1), weights, nodes=257)
     found = kernels.at(points)
@@ -128,6 +129,20 @@ def test_kernels_are_those_of_psf_at_their_places(triplet, model):
         wanted = torch.einsum("cw,wij->cij", weights, alone).flip(-1)
         # The Gaussians are interpolated between radii; turned rays fall in other pixels of the same histogram.
         assert float((found[k, 0] - wanted).abs().sum((-2, -1)).max()) < {"gaussian": 1e-5, "drt": 0.02}[model]
+
+
+def test_kernels_lie_where_the_light_does(triplet):
+    """About the chief ray through the centre of the pupil, whose landing the distortion is of."""
+    point = torch.tensor([[0.0], [8.0]], dtype=torch.float64)
+    fields = FIELD.fields(triplet, point)
+    centroid = rt.psf(triplet, rt.Gaussian(order=4), fields=fields, wavelengths=[triplet.primary]).centroid[1, 0, 0]
+    grey = dataclasses.replace(FIELD, response=None)
+    lens = triplet.at(wavelengths=[float(triplet.primary)])
+    for model in ("gaussian", "drt"):
+        kernels = FieldKernels(lens, grey, model, 4, 21, lens.surfaces[0].thickness.reshape(1), torch.ones(1, 1))
+        kernel = kernels.at(point)[0, 0, 0]
+        rows = (torch.arange(21, dtype=torch.float64) - 10) * FIELD.pitch
+        assert float((kernel.sum(-1) * rows).sum()) == pytest.approx(float(centroid - 8.0), abs=3e-3)
 
 
 def test_a_kernel_off_the_meridian_is_the_turned_one(triplet):
@@ -363,3 +378,30 @@ def test_optics_is_a_value(triplet):
     system = ready(triplet, nodes=(2, 2))
     assert isinstance(system, Optics)
     assert np.isnan(system.error)  # of a grid that was asked for nothing is estimated
+
+
+# -- patches
+
+
+def test_patches_have_the_kernels_of_their_places(triplet):
+    patches, points = random(2, 3, 20, 20), torch.tensor([[0.0, -3.0], [2.0, 4.0]], dtype=torch.float64)
+    weights = FIELD.weights(triplet.wavelengths)
+    kernels = FieldKernels(triplet, FIELD, "gaussian", 4, 7, triplet.surfaces[0].thickness.reshape(1), weights)
+    how = {"sensor": FIELD, "size": 7, "order": 4}
+    found = render_patches(triplet, patches, points, **how)
+    torch.testing.assert_close(found, blur(patches, kernels.at(points)[:, 0]), rtol=0, atol=1e-12)
+    shaded = render_patches(triplet, patches, points, **how, illumination=True)
+    wanted = rt.relative_illumination(triplet, fields=FIELD.fields(triplet, points)).illumination
+    torch.testing.assert_close(shaded, wanted[:, None, None, None] * found, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("deviation", [1.0, 1.3, 2.5])
+def test_wide_gaussians_are_those_of_the_quadrature(deviation):
+    pixels = rt.grid(1.0, 31)
+    for angle in (0.0, 0.4, math.pi / 4):
+        c, s, wide = math.cos(angle), math.sin(angle), 1.7 * deviation
+        rows = [c * c * deviation**2 + s * s * wide**2, c * s * (deviation**2 - wide**2)]
+        covariance = torch.tensor([*rows, s * s * deviation**2 + c * c * wide**2], dtype=torch.float64)
+        centroid = torch.tensor([0.3, -0.2], dtype=torch.float64)
+        close = wide_gaussian_pixels(pixels, centroid, covariance)
+        assert float((close - gaussian_pixels(pixels, centroid, covariance)).abs().sum()) < 1e-4 / deviation**5

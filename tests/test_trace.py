@@ -230,10 +230,14 @@ def test_the_lossy_system_loses_rays_in_every_way():
     assert 0 < crossings[-1].rays.valid.sum() < 7
 
 
+#: Of the systems whose first and second derivatives take a second each.
+DEFAULT = (("eager", 2), ("compiled", 0), ("compiled", 4))
+
+
 @pytest.mark.parametrize(
     ("engine", "number"),
     [
-        pytest.param(engine, k, marks=pytest.mark.slow if engine == "eager" and k != 2 else ())
+        pytest.param(engine, k, marks=pytest.mark.slow if (engine, k) not in DEFAULT else ())
         for engine in ("eager", "compiled")
         for k in range(5)
     ],
@@ -321,6 +325,7 @@ def compiled_equals_eager(backend: str, system):
     assert (found.opl - expected.opl).abs().max() <= tolerance
 
 
+@pytest.mark.slow
 def test_compiled_trace_equals_the_eager_one_bit_for_bit():
     """An asphere, a conic and a mirror in one graph without a break."""
     front = surface(0.02, 5.0, 1.53, coefficients=[2e-3, -1e-5], semi_diameter=9.0)

@@ -71,6 +71,7 @@ def test_pose_and_shape_of_the_image_vary(lens):
         assert by == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-6), found.variables[k]
 
 
+@pytest.mark.slow
 def test_the_image_of_a_tilted_lens_follows_scheimpflug():
     """An object at d, a lens tilted by θ: u = d/cos θ along its axis, and tan θ′ = (v/u) tan θ of the image."""
     distance, focal, tilt = 150.0, 50.0, math.radians(10.0)

@@ -90,7 +90,9 @@ def _illumination(lens: Lens, fields: Tensor, *, marked: bool = False) -> Relati
     scene = scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1))
     front = wavefront_of(scene, points, weights)
     orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
-    basis, light = zernike.polynomials(orders, *points), torch.where(front.usable, weights, 0.0)
+    basis, usable = zernike.polynomials(orders, *points), front.usable
+    # Fields without a lost ray share their weights, hence one factorisation.
+    light = weights.expand(1, 1, 1, -1) if bool(usable.all()) else torch.where(usable, weights, 0.0)
     # Where light comes through a small part of the pupil alone, the slopes of the map are not known from it.
     fitted, known = zernike.fit_known(front.direction[:2], basis, light, worst=_WORST_CONDITION)
     lit = front.valid

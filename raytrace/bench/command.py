@@ -8,7 +8,7 @@ from types import ModuleType
 
 import torch
 
-from raytrace.bench import psf, speed, tolerance, trace
+from raytrace.bench import camera, psf, speed, tolerance, trace
 from raytrace.bench.report import Measured, Request
 from raytrace.cli.run import CommandError, printed_on_failure, say
 from raytrace.shards import torch_threads
@@ -19,6 +19,7 @@ _SUBJECTS = {
     "psf": (psf.bench, ("lenses", "output", "csv", "plot")),
     "speed": (speed.bench, ("docs", "quick")),
     "tolerance": (tolerance.bench, ("output", "plot")),
+    "camera": (camera.bench, ("output", "plot")),
 }
 
 

@@ -689,14 +689,16 @@ pictures, which share the kernels if they have one size.""",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
         "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
         "with gradients, aspheres and the step of the sensor distance (minutes); or Cooke triplets perturbed and "
-        "refocused. With the extra [bench] Optiland and ray-optics are measured, too.",
+        "refocused; or pictures rendered through one, and steps of training. With the extra [bench] Optiland and "
+        "ray-optics are measured, too.",
         """
         trace
         psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
         trace --rays 1000 100000 -o bench.md --plot bench.png
         speed --quick --repeats 1
-        tolerance --json""",
-        option("what", choices=("trace", "psf", "speed", "tolerance"), help="subject of the measurement"),
+        tolerance --json
+        camera -o camera.md --plot camera.png""",
+        option("what", choices=("trace", "psf", "speed", "tolerance", "camera"), help="subject of the measurement"),
         option(
             "lenses",
             metavar="LENS",

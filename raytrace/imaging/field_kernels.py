@@ -19,8 +19,8 @@ from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.sampling import gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, model_of, psf
-from raytrace.psf_models.gaussian import gaussian_pixels
-from raytrace.system.lens import Lens, is_round_about_axis
+from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
+from raytrace.system.lens import Lens, is_round_about_axis, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import chief_landing, scene, trace_scene
 
@@ -87,16 +87,14 @@ class FieldKernels:
         """By the PSF model, field by field."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(self.sensor.pitch), self.size)}
-        how = {"fields": fields, "object_distances": self.object_distances, "normalise": "window"}
-        model = model_of(self.model, order=self.order)
-        if self.lateral_colour:
-            kernels = psf(self.lens, model, **how, **about, per_wavelength=True).kernel
-        else:
-            alone = [
-                self.lens.at(wavelengths=self.lens.wavelengths[w : w + 1]) for w in range(len(self.lens.wavelengths))
-            ]
-            kernels = torch.stack([psf(lens, model, **how, **about).kernel for lens in alone], 2)
+        about = {"fields": fields, "object_distances": self.object_distances, "normalise": "window", "center": "axis"}
+        model, wavelengths = model_of(self.model, order=self.order), self.lens.wavelengths
+        groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
+        kernels = []
+        for some, origin in zip(groups, self._origin(fields).unbind(-1), strict=True):
+            window = make_grid(points.new_tensor(self.sensor.pitch), self.size, origin[:, None])
+            kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=some, per_wavelength=True).kernel)
+        kernels = torch.cat(kernels, 2)
         kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
         kept = arrives[:, None, None, None, None] & ~kernels.isnan()
         return torch.where(kept, kernels, _point(kernels))
@@ -104,22 +102,26 @@ class FieldKernels:
     def _turned(self, points: Tensor) -> Tensor:
         """Gaussians of the moments along a radius, turned to the azimuth of every place."""
         radius = safe_sqrt((points * points).sum(0))
-        largest = radius.detach().amax().clamp_min(self.sensor.pitch)
-        nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
-        place = radius * ((self.nodes - 1) / largest)
-        # Linear: vignetting factors are, too, with a kink on the axis.
-        left = place.detach().floor().clamp_max(self.nodes - 2).long()
-        part = (place - left)[:, None]
-        moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
+        units, which = torch.unique((radius / self.sensor.pitch * 1e6).round(), return_inverse=True)
+        if len(units) <= self.nodes:
+            moments = [moment[:, which] for moment in self._moments(units * (1e-6 * self.sensor.pitch))]
+        else:  # linear between radii: vignetting factors are, too, with a kink on the axis
+            largest = radius.amax()
+            nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
+            place = radius * ((self.nodes - 1) / largest)
+            left = place.floor().clamp_max(self.nodes - 2).long()
+            part = (place - left)[:, None]
+            moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        parts = []
+        parts, narrowest = [], torch.minimum(*moments[1:]).min()
         for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
             shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
             x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
             pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
             covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-            kernels = gaussian_pixels(window, torch.stack([x * shift, y * shift]), covariance)
+            pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
+            kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
             kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
             parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
         return torch.cat(parts)
@@ -133,11 +135,17 @@ class FieldKernels:
         spots = psf(
             self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
         )
-        wavelengths = self.lens.primary[None] if self.lateral_colour else self.lens.wavelengths
-        chief = chief_landing(scene(self.lens, fields, self.object_distances, wavelengths))[1]
-        moments = spots.centroid[1] - chief, spots.covariance[0], spots.covariance[2]
+        moments = spots.centroid[1] - self._origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
         return tuple(torch.where(known, moment, 0.0) for moment in moments)
+
+    def _origin(self, fields: Tensor) -> Tensor:
+        """Where chief rays of fields (2, N) meet the sensor, (2, N, 1) mm, or of every wavelength, (2, N, W).
+
+        They pass the centre of the pupil; vignetting factors are left out.
+        """
+        lens = with_object_distance(self.lens, self.object_distances[0])
+        return self.sensor.landing(lens, fields, lens.primary[None] if self.lateral_colour else lens.wavelengths)
 
 
 def _point(kernels: Tensor) -> Tensor:

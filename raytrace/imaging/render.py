@@ -26,7 +26,7 @@ from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
 from raytrace.imaging.field_kernels import FieldKernels, order_of, window_size
-from raytrace.imaging.image import as_picture, depth_masks, occlusion
+from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.io.pictures import write_picture
@@ -399,6 +399,33 @@ def render(
     )  # fmt: skip
     image = ready(light, depth, boundary=boundary, progress=progress)
     return Rendering(image, light, lens, ready)
+
+
+def render_patches(
+    lens: Lens,
+    patches: Tensor,
+    points: Tensor,
+    *,
+    sensor: Sensor,
+    size: int,
+    order: int,
+    model: str = "gaussian",
+    lateral_colour: bool = True,
+    illumination: bool = False,
+) -> Tensor:
+    """Images (B, C, H - size + 1, W - size + 1) of patches (B, C, H, W) centred at points (2, B) mm: for training.
+
+    Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
+    change over a patch are left out. size, order: of the window and of the PSF model, as of `Optics.kernels` and
+    `Optics.order` of the initial lens. Differentiable in the numbers of the lens.
+    """
+    patches = as_picture(patches)
+    distance = lens.surfaces[0].thickness.reshape(1)
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distance)
+    kernels = FieldKernels(lens, sensor, model, order, size, distance, weights, lateral_colour).at(points)[:, 0]
+    if illumination:
+        kernels = _illumination_at(lens, sensor, points)[:, None, None, None] * kernels
+    return blur(patches, kernels.to(patches))
 
 
 def plane_distances(depth: Tensor, planes: int) -> Tensor:

@@ -46,6 +46,7 @@ class Sensor:
     full_well: electrons at level 1, where pixels saturate; None: no shot noise.
     read_noise: standard deviation in electrons; without a full well a fraction of level 1.
     bits: of the quantisation; None: continuous levels.
+
     The centre of pixel (column c, row r), counted from 0, is at
 
         x = offset_x - (c - (columns - 1)/2) pitch,   y = offset_y + (r - (rows - 1)/2) pitch
@@ -261,6 +262,7 @@ class Sensor:
         index: global numbers (...) of the pictures, by default 0, 1, …: the noise of a picture depends on seed and
         index alone (of one dtype and shape, on one kind of device). origin: (column, row) of the first pixel on the
         sensor, or (..., 2).
+
         In this order: mosaic; shot noise, Poisson (`count_electrons`), or, where a derivative by the irradiance may be
         requested, its Gaussian approximation with its derivative (`add_shot_noise`); read noise; saturation at 1;
         quantisation (`digitise`), which the derivative ignores and which cuts levels below 0. Without bits levels below
@@ -281,7 +283,6 @@ class Sensor:
 
     def _noisy(self, picture: Tensor, generator: torch.Generator) -> Tensor:
         """A picture (C, H, W) with shot and read noise."""
-        picture = picture.contiguous()  # `torch.poisson` follows the strides
         if self.full_well is not None:
             shot = add_shot_noise if differentiating() and varies(picture) else count_electrons
             picture = shot(picture, self.full_well, generator=generator)

@@ -27,6 +27,7 @@ WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
 
 #: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
 SUFFIXES = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+_PNG = {"compress_level": 4}  # of zlib; its default, 6, takes a fifth longer to save a figure, for 1 to 10 % less
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -99,7 +100,9 @@ def save(figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     if suffix not in SUFFIXES:
         found = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
         raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
-    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=SUFFIXES[suffix]))
+    how = {"pil_kwargs": _PNG} if suffix == ".png" else {}
+    metadata = SUFFIXES[suffix]
+    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=metadata, **how))
 
 
 def array(tensor: Tensor) -> np.ndarray:

@@ -64,6 +64,28 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
     return _Rotated.apply(x, y, half, variance_x, variance_y, xy, x_edges, y_edges)
 
 
+def wide_gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
+    """`gaussian_pixels` of deviations of a pixel and more in every direction, to 1e-4 of the energy, in few operations.
+
+        P ≈ h² N(r; Σ + h²/12) [1 - h⁴/2880 (H_x + H_y)],   H_x = a⁴ - 6 Λxx a² + 3 Λxx²,   a = (Λ r)_x
+
+    Pixels h wide add the variance h²/12 of a square to Σ, whose inverse is then Λ; the bracket is the first term of the
+    Gram-Charlier series (Cramér, Mathematical Methods of Statistics, 1946, §17.6), for the fourth cumulant -h⁴/120.
+    """
+    x, y = centres(grid)
+    x, y = (x - centroid[0][..., None])[..., None, :], (y - centroid[1][..., None])[..., :, None]
+    square = grid.pitch * grid.pitch
+    xx, xy, yy = (
+        part[..., None, None] for part in (covariance[0] + square / 12, covariance[1], covariance[2] + square / 12)
+    )
+    det = xx * yy - xy * xy
+    a, b = (yy * x - xy * y) / det, (xx * y - xy * x) / det
+    (u, p), (v, q) = (a * a, yy / det), (b * b, xx / det)
+    fourth = u * (u - 6 * p) + 3 * p * p + v * (v - 6 * q) + 3 * q * q
+    peak = square / (2 * math.pi * torch.sqrt(det))
+    return peak * torch.exp(-0.5 * (a * x + b * y)) * (1 - (square * square / 2880) * fourth)
+
+
 def _sides(x: Tensor, x_edges: Tensor, y: Tensor, y_edges: Tensor, half: Tensor) -> tuple[tuple, tuple]:
     """Lower and upper edge, middle and half width of the pixels along x (..., 1, columns) and y (..., rows, 1)."""
     return (x_edges[..., :-1], x_edges[..., 1:], x, half), (y_edges[..., :-1, :], y_edges[..., 1:, :], y, half)
