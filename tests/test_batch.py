@@ -172,7 +172,14 @@ def test_table_and_document_have_the_lens():
     assert "lens" in str(spots)
 
 
-@pytest.mark.parametrize("verb", ["rms", "centroid", "spots of all wavelengths", "psf gaussian"])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        *(pytest.param(verb, marks=pytest.mark.slow) for verb in ("rms", "centroid")),
+        "spots of all wavelengths",
+        "psf gaussian",
+    ],
+)
 def test_a_clipped_batch_is_a_loop(verb):
     """The pupil of every lens ends at its own rims."""
     lens = rt.read_lens("double_gauss").at(fields=[0, 10], ray_aiming="off")

@@ -109,6 +109,7 @@ def test_the_spectrometer_disperses_as_its_grating_says():
     assert abs(moved[1] - moved[0]) == pytest.approx(150.0 * 0.3 * 0.002 / math.sqrt(1 - sine * sine), rel=0.02)
 
 
+@pytest.mark.slow
 def test_report_and_figure_are_written(tmp_path, capsys):
     report, figure = tmp_path / "bench.md", tmp_path / "bench.png"
     assert main([*TINY, "-o", str(report), "--plot", str(figure)]) == 0

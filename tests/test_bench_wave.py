@@ -40,6 +40,7 @@ def test_two_converged_references_agree(scene, monkeypatch):
     assert agreement(scene) < 3e-5
 
 
+@pytest.mark.slow
 def test_sitzmanns_method_comes_to_the_same_waves(scene):
     """At 3.125 µm a sample, just below λz/(D + blur): right to the staircase of its rim, 1e-3 of the light."""
     method = bench.sitzmann_method(scene, torch.float64, samples=1600)

@@ -33,8 +33,14 @@ def mean_square_radius(lens, fields):
     return rt.spot(lens, fields=fields).mean_square_radius.mean((-2, -1))
 
 
-@pytest.mark.parametrize("center", ["chief", "centroid"])
-@pytest.mark.parametrize("model", ["gaussian", "drt"])
+@pytest.mark.parametrize(
+    ("model", "center"),
+    [
+        ("gaussian", "chief"),
+        ("drt", "centroid"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("gaussian", "centroid"), ("drt", "chief"))),
+    ],
+)
 def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, center):
     settings = dataclasses.replace(BUILT, model=model, refocus="none", fields=(0.0, 7.0), center=center)
     built = camera(lens, settings)
@@ -107,7 +113,7 @@ def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
         assert torch.equal(sensors(fixed.as_built(errors)), still)
 
 
-@pytest.mark.parametrize("refocus", ["sensor", "none"])
+@pytest.mark.parametrize("refocus", ["sensor", pytest.param("none", marks=pytest.mark.slow)])
 def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, refocus):
     built = camera(lens, dataclasses.replace(BUILT, refocus=refocus, size=21, fields=(7.0,)))
     built._order = 2

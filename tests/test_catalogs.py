@@ -245,6 +245,7 @@ def test_a_changed_user_catalog_is_read_again(small):
     assert find_glass("ONE", user=[small]).nd_listed == 1.5168001
 
 
+@pytest.mark.slow
 def test_one_catalog_is_parsed_for_a_glass_it_holds():
     """`raytrace info` on a lens of one maker must not wait for twenty catalogs."""
     script = (

@@ -75,6 +75,7 @@ def test_edge_is_where_the_ray_grazes_the_aperture():
     assert float(clearance.abs().max()) < 1e-10
 
 
+@pytest.mark.slow
 def test_edges_move_with_the_pupil_to_second_order():
     """Of an opening of radius b the share b²/R² is clear: derivatives -2 b²/R³ and 6 b²/R⁴ by the pupil radius R."""
     opening = Aperture("circular", (0.0, 3.0), False, (0.5, 0.5))

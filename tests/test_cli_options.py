@@ -37,7 +37,8 @@ DIFFERENT = {
     "--configuration": "layout draws all of them in one figure",
     "--log": "optimize writes one; elsewhere the scale of a figure",
     "--resume": "codesign finds its own runs",
-    "--depth": "layers of a network, and distances of points",
+    "--depth": "layers of a network, distances of points, and a map",
+    "--sensor": "its distance from an element, and its size",
 }
 
 
@@ -77,8 +78,9 @@ def test_data_pixels_and_figures_have_their_own_options(name):
     if "-o" in known:
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
-        with pytest.raises(argparse.ArgumentTypeError, match="is a picture: figures are saved by --plot"):
-            known["-o"].type("x.png")
+        wrong, said = ("x.pdf", "ends in .png") if name == "render" else ("x.png", "is a picture: figures are saved by")
+        with pytest.raises(argparse.ArgumentTypeError, match=said):
+            known["-o"].type(wrong)
     if "--size" in known:
         assert known["--size"].help.startswith("pixels across")
     if "--plot" in known:

@@ -257,6 +257,7 @@ def test_the_penalty_is_reported_with_the_loss(run, pictures):
     assert "'0.9:0.3': expected 0 ≤ least < greatest" in err
 
 
+@pytest.mark.slow
 def test_a_run_begins_where_the_closed_form_ends(run, pictures):
     """One command: the log of the training begins where `--loss spectral` ends."""
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--rho", "0.3", "-o", "one")

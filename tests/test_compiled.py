@@ -299,6 +299,7 @@ def test_it_is_compiled_once_for_work_that_is_worth_it(tmp_path):
     assert [path.stat().st_ino for path in tmp_path.iterdir()] == [made]
 
 
+@pytest.mark.slow
 def test_without_a_compiler_torch_traces_and_one_line_gives_the_reason(tmp_path):
     """One line for each compiler: one that is missing, and one that fails."""
     done = probe(tmp_path, 2**20, ("no-such-compiler", "false"))

@@ -140,7 +140,7 @@ def test_mtf_of_a_clipped_beam_is_refused(triplet):
 # -- merit functions ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["spot", "wavefront"])
+@pytest.mark.parametrize("kind", ["spot", pytest.param("wavefront", marks=pytest.mark.slow)])
 def test_merit_is_that_of_single_lenses(triplet, kind):
     rows, sampling = rt.tolerances(triplet, LIMITS + " irregularity=0.5 index=0.0005"), sampling_of(triplet)
     errors = rt.draw_errors(rows, 2)
@@ -170,6 +170,7 @@ def test_evaluate_takes_a_batch(triplet):
     assert "lost" in str(found)
 
 
+@pytest.mark.slow
 def test_merit_as_built(triplet):
     rows = rt.tolerances(triplet, "radius=0.1% element_decenter=0.02")
     found = rt.tolerance(triplet, rows, criterion="merit", merit="spot", trials=16)

@@ -145,7 +145,7 @@ def derivatives(function, rims: int, names) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize(
     ("quantity", "rims"),
     [
-        pytest.param(quantity, rims, marks=pytest.mark.slow if rims == 1 and quantity != "spot" else ())
+        pytest.param(quantity, rims, marks=pytest.mark.slow if rims == 1 else ())
         for quantity in QUANTITIES
         for rims in (1, 2)
     ],

@@ -299,7 +299,7 @@ def spectrum(pictures):
     return patch_spectrum(pictures, SMALL.patch + SMALL.size - 1)
 
 
-@pytest.mark.parametrize("model", ["paraxial", "gaussian"])
+@pytest.mark.parametrize("model", [pytest.param("paraxial", marks=pytest.mark.slow), "gaussian"])
 def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
     settings = dataclasses.replace(SMALL, model=model)
     found = closed_form(lens, settings, spectrum)
@@ -343,7 +343,10 @@ def test_closed_forms_of_rows_begin_where_the_rows_do(lens, spectrum, monkeypatc
     assert begun == [("paraxial", "paraxial"), ("gaussian", "57.8")]
 
 
-@pytest.mark.parametrize(("noise", "starts"), [(0.1, ("57.4", "paraxial", "57.95")), (0.01, ("57.4", "paraxial"))])
+@pytest.mark.parametrize(
+    ("noise", "starts"),
+    [pytest.param(0.1, ("57.4", "paraxial", "57.95"), marks=pytest.mark.slow), (0.01, ("57.4", "paraxial"))],
+)
 def test_the_optimum_of_gaussian_drt_is_no_matter_of_where_it_begins(lens, pictures, noise, starts):
     """To a micrometre. With little noise the first step of 1 mm that scipy would take lands behind another optimum."""
     spectrum, places = patch_spectrum(pictures, 36), []

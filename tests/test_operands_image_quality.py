@@ -324,6 +324,7 @@ def test_a_function_that_gives_no_numbers_is_refused():
         values(rt.read_lens("cooke_triplet"), [Row(lambda lens: torch.ones(2, 2), weight=1.0)])
 
 
+@pytest.mark.slow
 def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     """Its row has a name in every result; in a lens file a text replaces it, with a warning."""
     lens = rt.read_lens("cooke_triplet")

@@ -84,6 +84,7 @@ def test_derivatives_of_incidence(name):
     check_derivatives(name, rows + at_object)
 
 
+@pytest.mark.slow
 def test_derivatives_of_incidence_on_tilted_surfaces():
     lens = rt.read_lens(shipped("lenses") / "examples" / "folded_relay.zmx")
     breaks = [k for k, surface in enumerate(lens.surfaces) if surface.is_break]

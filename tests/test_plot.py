@@ -331,8 +331,9 @@ def test_focus_report_takes_several_objects_and_fields(double_gauss):
     ("suffix", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("PNG", b"\x89PNG")]
 )
 def test_save_writes_the_format_of_the_suffix_and_the_same_bytes_again(double_gauss, tmp_path, suffix, start):
+    layout = rt.layout(double_gauss, rays=3)
     for name in ("a", "b"):
-        style.save(rt.layout(double_gauss, rays=3).plot(), tmp_path / f"{name}.{suffix}", dpi=60)
+        style.save(layout.plot(), tmp_path / f"{name}.{suffix}", dpi=60)
     first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
     assert first.startswith(start)
     assert first == second
@@ -364,6 +365,7 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
         style.save(style.new_figure(1, 1), tmp_path / "nowhere" / "figure.png")
 
 
+@pytest.mark.slow
 def test_figures_touch_neither_pyplot_nor_the_settings_of_the_reader():
     script = (
         "import sys, matplotlib\n"

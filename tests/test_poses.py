@@ -127,6 +127,7 @@ def test_a_surface_with_a_phase_needs_a_wavelength():
         trace_surfaces([grating], bundle(), indices=[real(1.0)] * 2)
 
 
+@pytest.mark.slow
 def test_derivatives_by_every_number_of_a_pose_and_a_grating():
     names = list(SOME)
     spot = bundle()

@@ -401,7 +401,7 @@ def with_numbers(lens: Lens, curvature, thickness, sensor) -> Lens:
     return with_sensor_distance(lens.replace(3, curvature=curvature).replace(4, thickness=thickness), sensor)
 
 
-@pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
+@pytest.mark.parametrize("model", ["paraxial", "fourier", pytest.param("gaussian", marks=pytest.mark.slow), "drt"])
 def test_derivatives_in_the_lens_the_sensor_and_the_grid_with_rays_vignetted(model):
     lens = slow(double_gauss(stop=2.0)) if model in ("fourier", "wave") else double_gauss(stop=9.0)
 

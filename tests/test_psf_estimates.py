@@ -185,7 +185,7 @@ def coverage(computed: list[tuple[float, float]]) -> tuple[int, float, float]:
 
 
 @pytest.mark.parametrize(
-    "model", [pytest.param(m, marks=pytest.mark.slow if m in ("fourier", "drt") else ()) for m in TOLERANCES]
+    "model", [pytest.param(m, marks=pytest.mark.slow if m in ("fourier", "drt", "wave") else ()) for m in TOLERANCES]
 )
 def test_estimates_bound_the_true_error(model):
     """On the few of those held out that are quick; all of them in the slow run."""

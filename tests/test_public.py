@@ -18,6 +18,7 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.cli.commands import COMMANDS
 from raytrace.cli.run import RUNNER_OPTIONS
+from raytrace.io.pictures import read_depth
 from raytrace.maths.result import Result
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_of_options
 from raytrace.system.lens import field_points
@@ -299,6 +300,9 @@ def test_a_command_has_the_options_of_its_function(command):
         own -= {"rays", "rho"}
     if "merit" in keywords:
         for definition in (merit_of_options, DefaultMerit, Merit.of):
+            own -= {*inspect.signature(definition).parameters}
+    if "sensor" in keywords:
+        for definition in (rt.Sensor, rt.Sensor.capture, read_depth):
             own -= {*inspect.signature(definition).parameters}
     if "as_built" in keywords:
         own -= {*inspect.signature(rt.AsBuilt).parameters}

@@ -166,6 +166,7 @@ def test_each_minimum_is_reported_once_and_is_one():
     assert (apart.amax(-1) + torch.eye(len(found.lenses)) > 0.03).all()
 
 
+@pytest.mark.slow
 def test_the_best_singlet_is_that_of_a_scan_over_its_bending(plate, found):
     """Of one thin lens with its stop near, the bending decides."""
     scanned = []

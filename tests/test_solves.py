@@ -150,7 +150,7 @@ def test_a_real_ray_meets_the_image_at_the_height_of_its_solve(part):
     assert exact == pytest.approx(differences, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize("height", [12.0, 0.0])
+@pytest.mark.parametrize("height", [12.0, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(height):
     lens = rt.read_lens("double_gauss")
     lens = dataclasses.replace(lens, optimization_data=OptimizationData(semi_diameter_margin=(5.0, 0.1)))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import structure
+from test_layers import parsed
 
 
 @pytest.mark.parametrize(
@@ -22,7 +23,7 @@ def helpers() -> dict[str, list[str]]:
     """Where the functions of all test files stand that are no tests, by their bodies without docstring; methods not."""
     found = defaultdict(list)
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = parsed.__wrapped__(path)  # not stored
         methods = {id(part) for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for part in node.body}
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("test_") and id(node) not in methods:

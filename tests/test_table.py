@@ -344,6 +344,7 @@ def test_frame_of_a_designer():
         lens_from_frame(frame.drop(columns="Thickness"))
 
 
+@pytest.mark.slow
 def test_reading_a_table_loads_no_pandas():
     code = "import sys, raytrace.io; sys.exit('pandas' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -195,6 +195,7 @@ def test_no_error_alone_does_more_than_the_increment(triplet):
     assert f"limits tightened of {len(held.tightened())} of" in str(held)
 
 
+@pytest.mark.slow
 def test_limits_of_a_yield_have_it_at_less_tightness_than_a_common_factor(triplet, built):
     goal, free = float(built.percentile(60)), built
     found = rt.tolerance(triplet, limits=LIMITS, trials=1500, goal=goal, yield_=0.9)

@@ -230,10 +230,14 @@ def test_the_lossy_system_loses_rays_in_every_way():
     assert 0 < crossings[-1].rays.valid.sum() < 7
 
 
+#: Of the systems whose first and second derivatives take a second each.
+DEFAULT = (("eager", 2), ("compiled", 0), ("compiled", 4))
+
+
 @pytest.mark.parametrize(
     ("engine", "number"),
     [
-        pytest.param(engine, k, marks=pytest.mark.slow if k in (1, 3) or (engine == "eager" and k != 2) else ())
+        pytest.param(engine, k, marks=pytest.mark.slow if (engine, k) not in DEFAULT else ())
         for engine in ("eager", "compiled")
         for k in range(5)
     ],

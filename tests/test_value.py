@@ -100,6 +100,7 @@ torch.save([leaf.detach() for leaf in torch.utils._pytree.tree_leaves(lens)], sy
 """
 
 
+@pytest.mark.slow
 def test_a_lens_of_torch_save_is_loaded_by_default_in_another_process(tmp_path):
     """With poses, phases, sag terms, apertures, configurations, an environment, variables and a merit function."""
     lens = dataclasses.replace(double_gauss(), notes=("a note",)).with_configurations(thickness={6: [12.0, 16.0]})

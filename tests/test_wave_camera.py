@@ -268,6 +268,7 @@ def test_the_table_lists_known_values():
     assert rows["singlet"]["gain_blind"] == pytest.approx(rows["singlet"]["blind"] - rows["fresnel"]["blind"])
 
 
+@pytest.mark.slow
 def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
     """Both plates have the one that is best on the PMMA lens; rows that are not learned yet are left out."""
     tried = []

@@ -172,6 +172,7 @@ def test_cubic_plates_have_the_strength_of_their_noise():
     ]
 
 
+@pytest.mark.slow
 def test_the_start_of_least_expected_error_is_kept(tmp_path):
     """Whatever the restored pictures say; errors are computed once for these pictures, and refused for others."""
     bank = Bank.of("leaves", PICTURES[:5], PICTURES[5:])

@@ -58,7 +58,8 @@ class _Parser(argparse.ArgumentParser):
         name, sign, value = arg_string.partition("=")
         if name not in self._option_string_actions and name.startswith("--"):
             keyword = name[2:].replace("-", "_")
-            known = next((a for a in self._actions if a.option_strings and a.dest == keyword), None)
+            spelled = (a for a in self._actions if a.option_strings and a.dest == keyword)
+            known = next((a for a in spelled if a.const is not False), None)  # --distortion is not --no-distortion
             arg_string = arg_string if known is None else known.option_strings[-1] + sign + value
         return super()._parse_optional(arg_string)
 

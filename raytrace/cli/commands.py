@@ -40,14 +40,20 @@ from raytrace.cli.options import (
     row,
 )
 from raytrace.cli.types import (
+    Names,
     count,
     count_or_none,
     data_file,
+    extent,
     file_name,
     file_of,
+    finite,
     folder_name,
     many,
+    not_negative,
     output_file,
+    picture_file,
+    picture_or_folder,
     positive_finite,
 )
 from raytrace.cli.wave_options import camera, element, engine, light, pixels
@@ -263,6 +269,12 @@ def _codesign(arguments: argparse.Namespace):
     return run(arguments)
 
 
+def _render(arguments: argparse.Namespace):
+    from raytrace.cli.render_run import render_files
+
+    return render_files(arguments)
+
+
 def _wave_design(arguments: argparse.Namespace):
     from raytrace.cli.wave_run import design
 
@@ -273,6 +285,18 @@ def _wave_restore(arguments: argparse.Namespace):
     from raytrace.cli.wave_run import restore_files
 
     return restore_files(arguments)
+
+
+def _mosaics():
+    from raytrace.imaging.sensor import PATTERNS
+
+    return ("none", *PATTERNS)
+
+
+def _psf_models():
+    from raytrace.psf_models import MODELS
+
+    return MODELS
 
 
 # -- the table
@@ -555,6 +579,69 @@ COMMANDS = (
         size="pixels across the window of the PSF (default 21)",
         center="centre of the window: the chief ray (default), the optical axis or the centroid of the rays",
         per_wavelength="a kernel for each wavelength instead of their weighted sum",
+    ),
+    _command(
+        "render",
+        "photograph pictures through a lens",
+        """\
+Compute the image that a lens projects onto its sensor. Every picture is the upright view of a scene; its image has the
+blur, distortion, lateral colour and relative illumination of each place, and with --depth the blur of each distance.
+
+Pictures (.png, .jpg, .tif, .bmp) hold sRGB levels of 8 bits, grey ones also of 16. They are decoded to light; 1 is
+white on the axis. The image is encoded as sRGB of 8 bits. With --mosaic, --full-well, --read-noise or --bits the sensor
+records it first, and colours that the mosaic lacks are interpolated. -o names a .png file, or a folder for several
+pictures, which share the kernels if they have one size.""",
+        """
+        cooke_triplet photo.jpg -o rendered.png --plot comparison.png
+        double_gauss photo.png --sensor 36x24 --f-number 2.8 --mosaic RGGB --full-well 3e4 --bits 12 -o raw.png
+        tessar near_far.png --depth map.png --depth-range 800 5000 --planes 6 -o rendered.png
+        phone a.jpg b.jpg --no-distortion --no-illumination -o folder --json""",
+        lens,
+        option("picture", metavar="PICTURE", type=file_name, nargs="+", help="pictures to render, sRGB levels"),
+        partial(conditions, several="one result after the other, in files named by the distance"),
+        option("-o", "--output", metavar="OUT", type=picture_or_folder,
+            help="picture to write (.png), of several pictures a folder of them"),
+        option("--compare", "--plot", dest="plot", metavar="FILE", type=picture_file,
+            help="save the pictures of an ideal lens and of this one, whole and in detail, as .png, .pdf or .svg"),
+        group(
+            "the sensor",
+            option("--sensor", metavar="WxH", type=extent,
+                help="width and height in mm, as 24x16 (default: the largest field of the lens in the corners)"),
+            option("--offset", metavar=("X", "Y"), type=finite, nargs=2,
+                help="of its centre from the optical axis, mm (default 0 0)"),
+            option("--response", metavar="NAME",
+                help="rgb, grey, a table wavelength_nm,r,g,b (.csv), or a measured camera: 'Nikon 5100 (NPL)', 'Sigma "
+                "SDMerill (NPL)' (default rgb of coloured pictures, grey of grey ones)"),
+            option("--mosaic", choices=Names(_mosaics), metavar="PATTERN",
+                help="Bayer pattern: RGGB, BGGR, GRBG or GBRG (default none)"),
+            option("--full-well", metavar="E", type=positive_finite, help="electrons of white: adds shot noise"),
+            option("--read-noise", metavar="E", type=not_negative,
+                help="standard deviation in electrons; without --full-well a fraction of white"),
+            option("--bits", metavar="N", type=count, help="bits of the quantisation, before the 8 of the file"),
+            row("seed", default=0, help="of the noise, which differs from picture to picture"),
+        ),
+        group(
+            "depth",
+            option("--depth", metavar="MAP", type=file_name,
+                help="distance of every pixel from surface 1: an array of mm (.npy), or a grey picture, dark is near"),
+            option("--depth-range", metavar=("NEAR", "FAR"), type=positive_finite, nargs=2,
+                help="mm of black and of white of the picture MAP, linear between them"),
+            parameters("render", "planes", planes={
+                "help": "layers, at equally spaced reciprocal distances; near ones cover far ones",
+            }),
+        ),
+        group("left out", parameters(
+            "render", "distortion", "lateral_colour", "illumination",
+            distortion={"help": "no distortion: the image of an ideal lens, blurred"},
+            lateral_colour={"help": "no lateral colour: the kernels of all wavelengths are centred on one chief ray"},
+            illumination={"help": "no relative illumination: as bright in the corners as on the axis"},
+        )),
+        run=_render,
+        model={"choices": Names(_psf_models), "default": "gaussian",
+            "help": "of the PSF: paraxial, fourier, gaussian, drt or wave, in order of fidelity"},
+        tol="bound on the estimated error of the kernels, of the light of a point",
+        boundary={"choices": ("reflect", "zero"),
+            "help": "the scene beyond the edge of the picture: reflect, its mirror image, or zero, black"},
     ),
     _command(
         "compare",

@@ -105,6 +105,7 @@ def add_parameter(group, name: str, parameter: Parameter, row: Mapping, *, keep_
         "help": parameter.help.replace("%", "%%"),
         "default": parameter.default,
     }
+    settings |= {"flags": (f"--no-{flag(name)[2:]}",), "action": "store_false"} if parameter.default is True else {}
     settings |= row
     default, flags = settings.pop("default"), settings.pop("flags", (flag(name),))
     usual = " ".join(map(_shown, default)) if isinstance(default, tuple) else _shown(default)

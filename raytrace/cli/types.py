@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 PICTURES = (".png", ".pdf", ".svg")
 
@@ -91,6 +91,18 @@ def folder_or_lens(text: str) -> OutputFolder:
     folder = folder_name(text)
     folder.may_be_file = bool(PurePath(text).suffix)
     return folder
+
+
+def picture_or_folder(text: str) -> OutputFile | OutputFolder:
+    """A picture to write (.png), or a folder of pictures."""
+    suffix = PurePath(file_name(text)).suffix.lower()
+    if suffix not in ("", ".png"):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a picture that ends in .png, or a folder")
+    if not suffix or Path(text).is_dir():
+        return OutputFolder(text)
+    file = OutputFile(text)
+    file.suffixes = (".png",)
+    return file
 
 
 # -- numbers
@@ -183,6 +195,15 @@ def field_point(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(f"{text!r} is not a field point, Y or X,Y; several have spaces between them")
     x, y = (0.0, finite(text)) if len(parts) == 1 else map(finite, parts)
     return x, y
+
+
+def extent(text: str) -> tuple[float, float]:
+    """Width and height, as 24x16."""
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r} is no width and height in mm, as 24x16")
+    width, height = map(positive_finite, parts)
+    return width, height
 
 
 def _whole(text: str) -> int:

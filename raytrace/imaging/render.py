@@ -15,7 +15,10 @@ p(râ€²): the paraxial image of the object whose chief ray meets the sensor at râ
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -26,6 +29,7 @@ from raytrace.imaging.field_kernels import FieldKernels, order_of, window_size
 from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
+from raytrace.io.pictures import write_picture
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
@@ -435,17 +439,29 @@ def plane_distances(depth: Tensor, planes: int) -> Tensor:
     return levels if len(levels) <= planes else torch.linspace(*ends, planes, dtype=depth.dtype)
 
 
-def default_sensor(lens: Lens, picture: Tensor) -> Sensor:
-    """A sensor for pictures (..., C, H, W): the largest field of the lens lies in its corners."""
+def default_sensor(
+    lens: Lens,
+    picture: Tensor,
+    *,
+    size: tuple[float, float] | None = None,
+    offset: tuple[float, float] = (0, 0),
+    **others,
+) -> Sensor:
+    """A sensor for pictures (..., C, H, W), by default so large that the largest field of the lens lies in its corners.
+
+    size, offset, others: parameters of `Sensor`; response: by default none for one channel, "rgb" for three.
+    """
     rows, columns = picture.shape[-2:]
+    others = {"response": {1: None, 3: "rgb"}.get(picture.shape[-3]), **others}
+    if size is not None:
+        return Sensor(size=size, pixels=(columns, rows), offset=offset, **others)
     fields = field_points(None, like=lens).detach()
     probe = Sensor(size=(1.0, rows / columns), pixels=(columns, rows))
     reach = torch.hypot(*probe.landing(lens, fields)).max()
     if not reach > 0:
         raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
     pitch = 2 * float(reach) / math.hypot(columns, rows)
-    response = {1: None, 3: "rgb"}.get(picture.shape[-3])
-    return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), response=response)
+    return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), offset=offset, **others)
 
 
 def linearised(picture: Tensor | np.ndarray) -> Tensor:
@@ -468,12 +484,44 @@ class Rendering(Result):
     """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
 
     picture: the same of the ideal lens; optics: the lens and its sensor, for more pictures: `optics(picture)`.
+    `save` writes .png: the levels of sRGB of a single image, 8 bits.
     """
 
     image: Tensor
     picture: Tensor
     lens: Lens
     optics: Optics
+
+    def another(
+        self,
+        picture: Tensor,
+        depth: Tensor | None = None,
+        *,
+        boundary: str = "reflect",
+        progress: Callable[[int], object] | None = None,
+    ) -> Self:
+        """The rendering of another picture of the same size by the same optics; arguments as for `render`."""
+        light = checked_picture(linearised(picture), self.optics.sensor)
+        image = self.optics(light, depth, boundary=boundary, progress=progress)
+        return dataclasses.replace(self, image=image, picture=light)
+
+    def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """With the noise, the quantisation and the Bayer mosaic of the sensor, whose missing colours are interpolated.
+
+        index, seed: of the noise, see `Sensor.capture`.
+        """
+        sensor = self.optics.sensor
+        recorded = sensor.capture(self.image, index, seed)
+        return dataclasses.replace(self, image=sensor.demosaic(recorded))
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the image of one or three channels as .png of 8 bits, as sRGB levels; .json as other results."""
+        if Path(path).suffix.lower() != ".png":
+            return super().save(path)
+        image = self.image.detach()
+        if image[..., 0, 0].numel() not in (1, 3):
+            raise ValueError(f"{path}: an image of shape {tuple(image.shape)}; expected one, of one or three channels")
+        write_picture(path, array(encoded(image.reshape(-1, *image.shape[-2:]))))
 
     def text(self) -> list[str]:
         ready = self.optics

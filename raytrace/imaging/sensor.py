@@ -38,7 +38,7 @@ class Sensor:
     """A sensor of square pixels.
 
     size: (width, height) mm; pixels: (columns, rows); offset: of its centre from the optical axis, (x, y) mm.
-    response: None, one grey channel; "rgb", three Gaussians (`spectral_response.GAUSSIANS`); a table
+    response: None or "grey", one channel; "rgb", three Gaussians (`spectral_response.GAUSSIANS`); a table
         {"wavelengths": (N,) µm, "sensitivities": (C, N)}, linear between its wavelengths and 0 outside; the path of a
         CSV file with the header wavelength_nm (or wavelength_um), r, g, b; "Nikon 5100 (NPL)" or "Sigma SDMerill
         (NPL)", measured cameras of the extra: pip install 'raytrace[colour]'.

@@ -141,12 +141,14 @@ class _Gaussians:
 
 
 def read_response(response: object) -> SpectralResponse | str | None:
-    """What a user specifies as a response: None and "rgb" as they are, all others as a table.
+    """What a user specifies as a response: None, or "grey", and "rgb" as they are, all others as a table.
 
     Raises ValueError, TypeError, ImportError as `SpectralResponse`.
     """
     if response is None or isinstance(response, SpectralResponse):
         return response
+    if isinstance(response, str) and response == "grey":
+        return None
     if isinstance(response, str) and response == "rgb":
         return response
     if isinstance(response, os.PathLike) or (isinstance(response, str) and response.lower().endswith(".csv")):

@@ -15,6 +15,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 _MOST_BYTES, _MOST_PIXELS, _PIXELS_PER_BYTE = 2**28, 10**8, 1032
 #: Pixels that are decoded at any ratio.
 _FEW_PIXELS = 2**22
+_MOST_ARRAY = 2**30  # bytes
 
 
 class PictureError(ValueError):
@@ -27,8 +28,15 @@ def read_grey(path: str | Path) -> np.ndarray:
 
 
 def _pixels(path: str | Path, mode: str) -> np.ndarray:
+    picture = _picture(path)
+    if picture.mode.startswith("I"):  # which PIL would clip at 255
+        picture = Image.fromarray(np.round(_sixteen_bits(picture, path) / 257).astype(np.uint8))
+    return np.asarray(picture.convert(mode))
+
+
+def _picture(path: str | Path) -> Image.Image:
     try:
-        return np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert(mode))
+        return decoded(read_bytes(path, _MOST_BYTES))
     except (OSError, ValueError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         message = f"{path}: cannot be read as a picture ({reason}); remove it or convert it"
@@ -62,6 +70,54 @@ def read_channels(path: str | Path, channels: int) -> np.ndarray:
         raise PictureError(f"{path}: a picture has 1 or 3 channels, not one for each of {channels} wavelengths")
     picture = _pixels(path, "L" if channels == 1 else "RGB")
     return np.atleast_3d(picture).transpose(2, 0, 1) / 255.0
+
+
+def read_levels(path: str | Path, channels: int | None = None) -> np.ndarray:
+    """A picture as levels (channels, H, W) of 8 bits, or of 16 where a grey file has them; else as `read_channels`.
+
+    channels: 1 or 3, by default 1 of a grey file and 3 of a coloured one. Colours of 16 bits are read with 8.
+    """
+    picture = _picture(path)
+    grey = picture.mode in ("1", "L", "LA", "I", "I;16", "I;16B", "I;16L")
+    channels = (1 if grey else 3) if channels is None else channels
+    if channels not in (1, 3):
+        raise PictureError(f"{path}: a picture has 1 or 3 channels, not {channels}")
+    if picture.mode.startswith("I"):
+        return np.repeat(_sixteen_bits(picture, path)[None], channels, 0)
+    return np.atleast_3d(np.asarray(picture.convert("L" if channels == 1 else "RGB"))).transpose(2, 0, 1)
+
+
+def _sixteen_bits(picture: Image.Image, path: str | Path) -> np.ndarray:
+    values = np.asarray(picture)
+    if values.min() < 0 or values.max() >= 2**16:
+        raise PictureError(f"{path}: levels from {values.min()} to {values.max()}; expected 8 or 16 bits: convert it")
+    return values.astype(np.uint16)
+
+
+def read_depth(path: str | Path, depth_range: tuple[float, float] | None = None) -> np.ndarray:
+    """A depth map (H, W) mm: an array of a .npy file, or a grey picture whose black is near and whose white is far.
+
+    depth_range: (near, far) mm of the picture, linear in its levels. Raises PictureError naming the file.
+    """
+    if Path(path).suffix.lower() == ".npy":
+        if depth_range is not None:
+            raise PictureError(f"{path}: an array of distances in mm needs no `depth_range`: leave it out")
+        try:
+            depth = np.load(io.BytesIO(read_bytes(path, _MOST_ARRAY)), allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
+            raise PictureError(f"{path}: cannot be read as an array ({reason}); write it by numpy.save") from error
+        if depth.ndim != 2 or depth.dtype.kind not in "fiu":
+            kind = f"an array of shape {depth.shape}, {depth.dtype}"
+            raise PictureError(f"{path}: {kind}; expected numbers (rows, columns), the distance of every pixel in mm")
+        return depth.astype(np.float64)
+    if depth_range is None:
+        raise PictureError(f"{path}: a picture has levels and no distances; give `depth_range`, mm of black and white")
+    near, far = depth_range
+    if not 0 < near < far < np.inf:
+        raise PictureError(f"{path}: a depth range of {near:g} to {far:g} mm; expected 0 < near < far, both finite")
+    levels = read_levels(path, 1)[0]
+    return near + (far - near) * (levels / np.iinfo(levels.dtype).max)
 
 
 def write_picture(path: str | Path, channels: np.ndarray) -> None:

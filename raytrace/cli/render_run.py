@@ -1,0 +1,140 @@
+"""`raytrace render`: pictures as a lens and a sensor record them."""
+
+import argparse
+import dataclasses
+import inspect
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import raytrace
+from raytrace.cli.progress import progress
+from raytrace.cli.run import CommandError, open_lens, options_of, say
+from raytrace.cli.types import OutputFolder
+from raytrace.imaging.render import checked_depth, default_sensor, linearised
+from raytrace.imaging.sensor import Sensor
+from raytrace.imaging.spectral_response import channel_names, read_response
+from raytrace.io.pictures import read_depth, read_levels
+from raytrace.maths.result import Result
+from raytrace.system.lens import Lens
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderedPictures(Result):
+    """A text and a record each; record: file, written (None without -o), and the document of the rendering."""
+
+    texts: tuple[str, ...]
+    records: tuple[dict, ...]
+
+    def document(self) -> dict:
+        return {"pictures": [*self.records]}
+
+    def __str__(self) -> str:
+        if len(self.texts) == 1:
+            return self.texts[0]
+        return "\n".join(f"{record['file']}\n{text}" for record, text in zip(self.records, self.texts, strict=True))
+
+
+@torch.no_grad()
+def render_files(arguments: argparse.Namespace) -> RenderedPictures:
+    """Render and write pictures one after the other; all are read once before the first is rendered."""
+    files, targets = arguments.picture, _targets(arguments.picture, arguments.output)
+    options = {name: value for name, value in options_of(arguments).items() if name in _names(raytrace.render)}
+    for name in ("picture", "sensor", "progress"):
+        options.pop(name, None)
+    lens, options["depth"] = open_lens(arguments), _depth(arguments)
+    pictures = [_picture(arguments, lens, file, options["depth"]) for file in files]
+    texts, records, rendering = [], [], None
+    for number, file in enumerate(progress(files, "picture", what="render") if len(files) > 1 else files):
+        load, sensor = pictures[number]
+        with _named(arguments.lens), progress(None, "convolution", what=f"render {file}") as bar:
+            if rendering is None or rendering.optics.sensor != sensor:
+                rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=bar.update)
+            else:
+                rendering = rendering.another(
+                    load(), options["depth"], boundary=options["boundary"], progress=bar.update
+                )
+            recorded = rendering.captured(number, arguments.seed)
+        if targets[number] is not None:
+            targets[number].parent.mkdir(parents=True, exist_ok=True)
+            recorded.save(targets[number])
+            say(f"written: {targets[number]}")
+        if path := arguments.plot:
+            path = Path(path) if len(files) == 1 else Path(path).with_stem(f"{Path(path).stem}_{Path(file).stem}")
+            recorded.plot(path)
+            say(f"written: {path}")
+        written = None if targets[number] is None else str(targets[number])
+        records.append({"file": str(file), "written": written, **recorded.document()})
+        texts.append(str(recorded))
+    arguments.plot = arguments.output = None
+    return RenderedPictures(tuple(texts), tuple(records))
+
+
+def _names(function: Callable) -> set[str]:
+    return {*inspect.signature(function).parameters}
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Errors within the block begin with the name of their file."""
+    try:
+        yield
+    except ValueError as error:
+        raise CommandError(f"{name}: {error}") from error
+
+
+def _targets(files: list[str], output: str | None) -> list[Path | None]:
+    """The file to write of every picture."""
+    if output is None:
+        return [None] * len(files)
+    if not isinstance(output, OutputFolder):
+        if len(files) > 1:
+            raise CommandError(f"-o {output}: {len(files)} pictures; expected the name of a folder")
+        return [Path(output)]
+    twice = [name for name, count in Counter(Path(file).stem for file in files).items() if count > 1]
+    if twice:
+        raise CommandError(f"-o {output}: several pictures would be {twice[0]}.png there; give them other names")
+    targets = [Path(output) / f"{Path(file).stem}.png" for file in files]
+    for target in targets:
+        if os.path.realpath(target) in map(os.path.realpath, files):
+            raise CommandError(f"-o {output}: {target} is a picture to render; give another folder")
+    return targets
+
+
+def _depth(arguments: argparse.Namespace) -> Tensor | None:
+    if arguments.depth is None:
+        if arguments.depth_range:
+            raise CommandError("--depth-range is that of a picture --depth MAP: give the map")
+        return None
+    depth = torch.as_tensor(read_depth(arguments.depth, arguments.depth_range))
+    with _named(arguments.depth):
+        return checked_depth(depth, depth)
+
+
+def _picture(
+    arguments: argparse.Namespace, lens: Lens, file: str, depth: Tensor | None
+) -> tuple[Callable[[], Tensor], Sensor]:
+    """How to read a picture as light (C, H, W), and its sensor."""
+    options = {name: value for name, value in vars(arguments).items() if name in _names(Sensor) and value is not None}
+    channels = None
+    if "response" in options:
+        options["response"] = read_response(options["response"])
+        channels = len(channel_names(options["response"]))
+
+    def load() -> Tensor:
+        return linearised(read_levels(file, channels))
+
+    light = load()
+    rows, columns = light.shape[-2:]
+    if depth is not None and depth.shape != (rows, columns):
+        size = f"{depth.shape[1]} × {depth.shape[0]}"
+        raise CommandError(
+            f"{arguments.depth}: a depth map of {size} pixels; expected {columns} × {rows}, those of {file}"
+        )
+    with _named(file):
+        return load, default_sensor(lens, light, size=arguments.sensor, **options)
