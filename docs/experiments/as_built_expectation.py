@@ -13,6 +13,7 @@ import torch
 
 import raytrace as rt
 from raytrace.tolerancing import study
+from raytrace.tolerancing.criteria import criterion_of
 
 LENSES, GRADES = ("cooke_triplet", "double_gauss", "phone"), ("commercial", "precision", "high")
 
@@ -26,7 +27,7 @@ def focused(name: str) -> rt.Lens:
 def seconds_of_expectation(lens: rt.Lens, grade: str, criterion: str) -> float:
     """Processor time in s of the expectation alone, without changes at the limits."""
     rows, sampling = rt.tolerances(lens, grade=grade), study.sampling_of(lens, None, rings=4, arms=6)
-    chosen = study.criterion_of(criterion, lens, sampling)
+    chosen = criterion_of(criterion, lens, sampling)
     for _ in range(3):  # the first compiles, and fills tables
         start = time.process_time()
         with torch.no_grad():
