@@ -192,6 +192,31 @@ def test_the_figure_is_saved_as_a_comparison_too(command, photo):
     assert Path("fig.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_the_figure_shows_details_at_their_places_and_the_kernels_there():
+    picture = torch.as_tensor(levels(ROWS, COLUMNS, 3).astype(np.uint8)).movedim(-1, 0)
+    with torch.no_grad():
+        rendering = rt.render(rt.read_lens(LENS), picture, sensor=sensor(), tol=0.3)
+    shown = [panel.images[0].get_array() for panel in rendering.plot().axes]
+    image, ideal = (np.moveaxis(encoded(one).numpy(), 0, -1) for one in (rendering.image, rendering.picture))
+    centre, corner = (slice(13, 27), slice(23, 37)), (slice(0, 14), slice(0, 14))
+    expected = [ideal, image, ideal[centre], image[centre], None, ideal[corner], image[corner], None]
+    assert len(shown) == len(expected)
+    for found, one in zip(shown, expected, strict=True):
+        if one is None:
+            assert found.shape[0] == rendering.optics.kernels.shape[-2]
+            assert float(found.max()) == pytest.approx(1.0)
+        else:
+            np.testing.assert_allclose(found, one, atol=1e-6)
+
+
+def test_a_picture_of_one_pixel(command):
+    Image.new("L", (1, 1), 255).save("white.png")
+    code, out, err = command("render", LENS, "white.png", "--sensor", "0.05x0.05", "--tol", 0.3, "-o", "out.png")
+    assert code == 0, err
+    assert "distortion" not in out
+    assert written().tolist() == [[[255]]]
+
+
 # -- what is refused
 
 

@@ -31,7 +31,7 @@ from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.io.pictures import write_picture
 from raytrace.maths.result import Result, plain
-from raytrace.plotting.style import array, new_figure, styled
+from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
 from raytrace.system.lens import Lens, field_points, is_round_about_axis
 from raytrace.tracing.launch import object_field
@@ -315,7 +315,7 @@ def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
 def _radii(points: Tensor, count: int) -> Tensor:
     """Radii (count,) mm from the axis to the farthest of points (2, ...)."""
     steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
-    return steps * torch.hypot(*points.flatten(1)).max()
+    return steps * torch.hypot(*points.flatten(1)).max().clamp_min(1e-3)  # a single pixel has its point on the axis
 
 
 def _along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
@@ -537,7 +537,7 @@ class Rendering(Result):
         if ready.illumination is not None:
             darkest = 100 * float(ready.illumination.min())
             lines.append(f"illumination of the darkest pixel {darkest:.1f} % of that of the axis")
-        if ready.ideal is not None:
+        if ready.ideal is not None and max(rows, columns) > 1:
             column, row = (array(part) for part in ready.ideal)
             ideal = math.hypot(column[0, 0] - column[-1, -1], row[0, 0] - row[-1, -1])
             longer = math.hypot(columns - 1, rows - 1) / ideal - 1
@@ -560,30 +560,56 @@ class Rendering(Result):
 
     @styled
     def draw(self):
-        """The ideal lens's picture, the image, and both in detail at the centre and at the upper left corner."""
+        """The ideal lens's picture and the image, both in detail at the centre and at the upper left corner, and the
+        kernels there, of several depths that of the farthest; brightness is encoded as sRGB."""
         ideal, image = (_shown(one) for one in (self.picture, self.image))
+        ready = self.optics
         rows, columns = image.shape[:2]
-        size = max(min(rows, columns) // 8, min(64, rows, columns))
-        middle = (slice((rows - size) // 2, (rows + size) // 2), slice((columns - size) // 2, (columns + size) // 2))
-        corner = (slice(0, size), slice(0, size))
-        heights = 4.0 * rows / columns + 0.3, 2.4
-        figure = new_figure(8.0, sum(heights))
-        whole, details = figure.subfigures(2, 1, height_ratios=heights)
+        size = max(min(rows, columns) // 8, min(64, (min(rows, columns) + 2) // 3))
+        kernels = ready.kernels[:, :, 0]
+        m, n = kernels.shape[:2]
+        middle = kernels[(m - 1) // 2 : m // 2 + 1, (n - 1) // 2 : n // 2 + 1].mean((0, 1))
+        window = f"{kernels.shape[-1]} × {kernels.shape[-2]} pixels"
+        details = {
+            "centre": ((rows - size) // 2, (columns - size) // 2, middle, FIELD_COLOURS[2]),
+            "corner": (0, 0, kernels[0, 0], FIELD_COLOURS[0]),
+        }
+        heights = 5.0 * rows / columns + 0.3, 2.0
+        figure = new_figure(10.0, sum(heights) + 0.3)
+        width, height = ready.sensor.size
+        figure.suptitle(
+            f"{self.lens.name}   {width:.4g} × {height:.4g} mm, {columns} × {rows} pixels of "
+            f"{1e3 * ready.sensor.pitch:.4g} µm", fontsize=9,
+        )  # fmt: skip
+        whole, close = figure.subfigures(2, 1, height_ratios=heights)
         pictures = {"ideal lens": ideal, "this lens": image}
         for panel, (title, one) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
             panel.imshow(one, vmin=0, vmax=1, cmap="gray")
             panel.set_title(title)
             panel.axis("off")
-        parts = [(f"{where}, {title}", one[at]) for where, at in (("centre", middle), ("corner", corner))
-                 for title, one in (("ideal", ideal), ("this lens", image))]  # fmt: skip
-        for panel, (title, part) in zip(details.subplots(1, 4), parts, strict=True):
-            panel.imshow(part, vmin=0, vmax=1, cmap="gray", interpolation="nearest")
-            panel.set_title(title)
-            panel.axis("off")
+            for row, column, _, colour in details.values():
+                right, below = (
+                    column - 0.5 + np.array([0, size, size, 0, 0]),
+                    row - 0.5 + np.array([0, 0, size, size, 0]),
+                )
+                panel.plot(right, below, color=colour, linewidth=1.2, scalex=False, scaley=False, clip_on=False)
+        panels = iter(close.subplots(1, 6))
+        for place, (row, column, kernel, colour) in details.items():
+            at = slice(row, row + size), slice(column, column + size)
+            shown = {f"{place}, {title}": one[at] for title, one in pictures.items()}
+            shown[f"kernel, {window}"] = _shown(kernel / kernel.amax())
+            for title, part in shown.items():
+                panel = next(panels)
+                panel.imshow(part, vmin=0, vmax=1, cmap="gray", interpolation="nearest")
+                panel.set_title(title)
+                panel.set_xticks([])
+                panel.set_yticks([])
+                for spine in panel.spines.values():
+                    spine.set(visible=True, color=colour, linewidth=1.2)
         return figure
 
 
 def _shown(light: Tensor) -> np.ndarray:
-    """Levels (H, W) or (H, W, 3) of the first of pictures (..., C, H, W)."""
+    """Levels (H, W) or (H, W, 3) of the first of pictures (..., C, H, W), of two channels the first one."""
     first = encoded(light.detach().reshape(-1, *light.shape[-3:])[0])
-    return array(first[0] if len(first) == 1 else first[:3].movedim(0, -1))
+    return array(first[0] if len(first) < 3 else first[:3].movedim(0, -1))
