@@ -78,8 +78,8 @@ def shared(compute: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(compute)
     def result(*arguments: P.args, **options: P.kwargs) -> T:
-        found = _found.get()
-        if found is None or options or torch.is_grad_enabled():
+        # torch.compile does not trace context variables.
+        if torch.compiler.is_compiling() or torch.is_grad_enabled() or options or (found := _found.get()) is None:
             return compute(*arguments, **options)
         key = compute, *map(_key, arguments)
         if key not in found:  # the arguments are stored, too: as long as they live their identity is their own
