@@ -11,6 +11,7 @@ place, so that kernels of sum 1 keep the light. Either of two algorithms compute
 Sources: Nagy and O'Leary, SIAM J. Sci. Comput. 19, 1063 (1998); Denis et al., Int. J. Comput. Vis. 115, 253 (2015).
 """
 
+import bisect
 import math
 from collections.abc import Callable
 
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from raytrace.imaging.image import as_picture, extend
 
-_RANKS = 40  # at most
+_RANKS, _SAMPLE = 40, 256  # at most: modes of low rank, and kernels that they are found from
 
 
 def varying_blur(
@@ -49,7 +50,7 @@ def varying_blur(
     weights = [bilinear(count, reach, nodes, like=kernels) for count, reach, nodes in
                ((rows, down, kernels.shape[0]), (columns, right, kernels.shape[1]))]  # fmt: skip
     records = torch.is_grad_enabled() and (picture.requires_grad or kernels.requires_grad)
-    if tol > 0 and not records:
+    if tol > 0 and not records and _operations_of_rank(large, 1) < _operations_of_patches(large, kernels):
         modes, shares = _modes(kernels, tol)
         if modes is not None and _operations_of_rank(large, len(modes)) < _operations_of_patches(large, kernels):
             return _by_rank(large, modes, shares, weights, progress)
@@ -87,20 +88,22 @@ def _spans(weights: Tensor) -> list[tuple[int, int]]:
 def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress) -> Tensor:
     h, w = kernels.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
-    bands = []
+    records = torch.is_grad_enabled() and (large.requires_grad or kernels.requires_grad)
+    total = large.new_zeros(*large.shape[:-2], *shape)
     for k, (top, bottom) in enumerate(_spans(weights[0])):
-        band = 0.0
         for n, (left, right) in enumerate(_spans(weights[1])):
             window = weights[0][k, top:bottom, None] * weights[1][n, left:right]
             part = large[..., top:bottom, left:right] * window.to(large.dtype)
             part = _convolved(part, kernels[k, n].to(large.dtype))
-            band = band + torch.nn.functional.pad(part, (left, shape[1] - left - part.shape[-1]))
+            rows, columns = part.shape[-2:]
+            if records:
+                beyond = left, shape[1] - left - columns, top, shape[0] - top - rows
+                total = total + torch.nn.functional.pad(part, beyond)
+            else:
+                total[..., top : top + rows, left : left + columns] += part
             if progress is not None:
                 progress(1)
-        bands.append(torch.nn.functional.pad(band, (0, 0, top, shape[0] - top - band.shape[-2])))
-        if len(bands) == 2:  # in turn, for memory
-            bands = [bands[0] + bands[1]]
-    return _inner(bands[0], h, w)
+    return _inner(total, h, w)
 
 
 def _inner(full: Tensor, h: int, w: int) -> Tensor:
@@ -117,18 +120,26 @@ def _convolved(picture: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _modes(kernels: Tensor, tol: float) -> tuple[Tensor | None, Tensor | None]:
-    """Kernels u_j (J, h, w) and shares a (J, m, n, C) that give all kernels to `tol`; None where these are too many."""
+    """Kernels u_j (J, h, w) and shares a (J, m, n, C) that give all kernels to `tol`; None where these are too many.
+
+    The modes are singular vectors of at most 256 of the kernels, evenly spread; the error is that of all.
+    """
     flat = kernels.detach().flatten(3).flatten(0, 2)
-    left, sizes, right = torch.linalg.svd(flat, full_matrices=False)
-    allowed = tol * flat.abs().sum(-1)
-    for count in range(1, min(_RANKS, len(sizes)) + 1):
-        shares = left[:, :count] * sizes[:count]
-        close = shares @ right[:count]
-        if bool(((flat - close).abs().sum(-1) <= allowed).all()):
-            # As much light as the kernels have.
-            shares = shares * (flat.sum(-1) / close.sum(-1))[:, None]
-            return right[:count].reshape(count, *kernels.shape[-2:]), shares.T.reshape(count, *kernels.shape[:3])
-    return None, None
+    some = flat[:: math.ceil(len(flat) / _SAMPLE)]
+    modes = torch.linalg.svd(some, full_matrices=False)[2][:_RANKS]
+    shares, allowed = flat @ modes.T, tol * flat.abs().sum(-1)
+
+    def suffices(count: int) -> bool:
+        close = shares[:, :count] @ modes[:count]
+        return bool(((flat - close).abs().sum(-1) <= allowed).all())
+
+    if not suffices(len(modes)):
+        return None, None
+    count = 1 + bisect.bisect_left(range(1, len(modes)), True, key=suffices)
+    # As much light as the kernels have.
+    scale = flat.sum(-1) / (shares[:, :count] @ modes[:count].sum(-1))
+    kept = shares[:, :count] * scale[:, None]
+    return modes[:count].reshape(count, *kernels.shape[-2:]), kept.T.reshape(count, *kernels.shape[:3])
 
 
 def _operations_of_rank(large: Tensor, count: int) -> float:
