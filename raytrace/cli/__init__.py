@@ -7,11 +7,12 @@ only when the command runs, so that `raytrace --help` answers at once.
   public function of that name; `parameters` reads those from signature and docstring, without importing the function.
 - `options`: options that several commands share, and `ROWS`, what signatures do not say; `types`: their values.
 - `run`: the runner: opens the lens, calls the function, prints, saves; `progress`: bars.
+- `render_run`: files of pictures through a lens.
 - `codesign`, `wave_…`, `settings`: co-design and phase elements, whose options are fields of settings.
 
 To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function with its
 entry in the docstring; a row where its type or spelling is not that of its annotation. Tests: `test_cli`,
-`test_cli_options`, `test_public`, `test_wave_cli`, `test_codesign_cli`.
+`test_cli_options`, `test_public`, `test_render_command`, `test_wave_cli`, `test_codesign_cli`.
 """
 
 import argparse
