@@ -286,3 +286,16 @@ def test_a_killed_study_loses_nothing(triplet, tmp_path):
     again = rt.tolerance(triplet, limits=LIMITS, trials=trials, checkpoint=file)
     assert 2 < before < 1 + math.ceil(trials / 1024)
     assert torch.equal(again.trials, rt.tolerance(triplet, limits=LIMITS, trials=trials).trials)
+
+
+def test_trials_without_light_are_counted_by_every_criterion():
+    """A decentre of ±30 mm: some lenses let no light of a field through; they have neither spot nor wavefront."""
+    lens = rt.read_lens("cooke_triplet").at(fields=[0, 11.9], ray_aiming="off")
+    rows = rt.Tolerances((rt.Tolerance("element_decenter_y", (1, 2), -30.0, 30.0),))
+    dark = [
+        rt.tolerance(lens, rows, criterion=name, trials=24, seed=1, rings=2).trials.isnan()
+        for name in ("rms", "wavefront")
+    ]
+    assert bool(dark[0].any())
+    assert not bool(dark[0].all())
+    assert torch.equal(*dark)

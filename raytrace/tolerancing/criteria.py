@@ -89,10 +89,13 @@ def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square (L,) of the OPD about its mean and tilt, waves²."""
     distance = lens.surfaces[0].thickness.reshape(-1).expand(lens.count or 1)
     front = wavefront_of(scene(lens, sampling.fields, distance, lens.wavelengths), sampling.points, sampling.weights)
+    lit = (front.energy > 0).sum(-1, keepdim=True) >= 3  # fewer rays have no mean and tilt
+    front = dataclasses.replace(front, energy=torch.where(lit, front.energy, 1.0))
     flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
     share = front.energy / front.energy.sum(-1, keepdim=True)
+    squares = torch.where(lit[..., 0], (share * flat * flat).sum(-1), torch.nan)
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    return (sampling.field_weights * ((share * flat * flat).sum(-1) * shares).sum(-1)).sum(-1)
+    return (sampling.field_weights * (squares * shares).sum(-1)).sum(-1)
 
 
 def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
