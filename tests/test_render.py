@@ -380,6 +380,28 @@ def test_optics_is_a_value(triplet):
     assert np.isnan(system.error)  # of a grid that was asked for nothing is estimated
 
 
+# -- a camera
+
+
+def test_a_camera_renders_with_its_current_lens(triplet):
+    """Its sensor, PSF model and variables: the image follows the sensor distance, with its derivative."""
+    variables = rt.Variables(triplet, "sensor")
+    camera = rt.Camera(variables, torch.nn.Identity(), sensor=FIELD)
+    picture, options = random(3, ROWS, COLUMNS), {"tol": 0.2, "illumination": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with torch.no_grad():
+            before = camera.render(picture, **options)
+            wanted = rt.render(triplet, picture, sensor=FIELD, model="gaussian", **options)
+        torch.testing.assert_close(before.image, wanted.image, rtol=0, atol=1e-12)
+        (parameter,) = variables.parameters()
+        camera.render(picture, **options).image.square().mean().backward()
+        assert float(parameter.grad.abs()) > 0
+        with torch.no_grad():
+            parameter += 0.5
+            assert float((camera.render(picture, **options).image - before.image).abs().max()) > 1e-3
+
+
 # -- patches
 
 

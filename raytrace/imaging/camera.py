@@ -23,6 +23,8 @@ from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.image import add_noise, as_picture, blur
+from raytrace.imaging.render import Rendering, render
+from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import Variables, converted
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import Grid, grid
@@ -57,6 +59,7 @@ class Camera(nn.Module):
     error. tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
     for each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
+    sensor: of whole pictures, see `render`.
     The object is planar and upright; image inversion and magnification are ignored.
     Warns UnfilledStop once, for the lens at construction.
     """
@@ -78,6 +81,7 @@ class Camera(nn.Module):
         pupil_points: Tensor | None = None,
         center: Literal["chief", "centroid"] = "chief",
         tolerances: Tolerances | None = None,
+        sensor: Sensor | None = None,
     ):
         super().__init__()
         if not isinstance(variables, Variables):
@@ -91,7 +95,7 @@ class Camera(nn.Module):
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self.pupil_points, self._order = pupil_points, None
-        self.center, self.tolerances = center, tolerances
+        self.center, self.tolerances, self.sensor = center, tolerances, sensor
         self._check()
         self._memo = Memo(object_distances=object_distances)
 
@@ -223,6 +227,14 @@ class Camera(nn.Module):
         """
         picture = _grey(picture, object_distances)
         return blur(picture, self.kernels(object_distances, field, errors).to(picture.dtype))
+
+    def render(self, scene: Tensor, depth: Tensor | None = None, **options) -> Rendering:
+        """The picture that the current lens projects onto the whole sensor, by the camera's PSF model: see `rt.render`.
+
+        scene: (..., C, H, W) linear in light, of as many pixels as the sensor; depth: (H, W) mm; options: those of
+        `rt.render`.
+        """
+        return render(self.variables(), scene, depth=depth, **{"sensor": self.sensor, "model": self.model, **options})
 
     def restore(self, image: Tensor) -> Tensor:
         """The network's estimate (B, h, w) from a noisy image."""
