@@ -1,6 +1,9 @@
 """Loads `shared_fixtures.py`, except in the process of `pytest -n` that only distributes tests to its workers."""
 
 import os
+from pathlib import Path
+
+import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: threads of workers would hinder each other
@@ -9,3 +12,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 def pytest_configure(config):
     if not config.getoption("numprocesses", None):
         config.pluginmanager.import_plugin("shared_fixtures")
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` deselects
+def pytest_collection_modifyitems(items):
+    lines = (Path(__file__).parent / "slow_cases.txt").read_text(encoding="utf-8").splitlines()
+    names = {line for line in lines if line and not line.startswith("#")}
+    for item in items:
+        if item.nodeid in names:
+            item.add_marker(pytest.mark.slow)

@@ -19,6 +19,7 @@ def small(monkeypatch):
     monkeypatch.setattr(camera, "TOLERANCES", (0.1, 0.03))
 
 
+@pytest.mark.slow
 def test_every_row_and_the_figure(capsys, tmp_path):
     figure = tmp_path / "camera.png"
     assert (

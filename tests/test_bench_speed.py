@@ -253,6 +253,7 @@ def measured(request):
         return rows, ratios
 
 
+@pytest.mark.slow
 def test_every_ratio_is_there_for_both_dtypes(measured):
     _, ratios = measured
     assert list(ratios) == ["float32", "float64"]
@@ -261,6 +262,7 @@ def test_every_ratio_is_there_for_both_dtypes(measured):
         assert all(numbers[key] > 0 for key in KEYS), dtype
 
 
+@pytest.mark.slow
 def test_ratios_are_those_of_the_speeds(measured):
     rows, ratios = measured
     for dtype, numbers in ratios.items():
@@ -279,6 +281,7 @@ def test_ratios_are_those_of_the_speeds(measured):
         assert numbers["small_batch_ms"] == pytest.approx(1e3 * small_s)
 
 
+@pytest.mark.slow
 def test_tables_have_the_accuracy_of_every_speed(measured):
     """nm on the image: rounding of float32 at 20 mm, and of float64."""
     rows, _ = measured
@@ -290,6 +293,7 @@ def test_tables_have_the_accuracy_of_every_speed(measured):
             assert row.what != "backward" or 0 < row.gradient < 1e-3, row
 
 
+@pytest.mark.slow
 def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     rows, ratios = measured
     about = {"processor": "one", "torch threads": 2}
