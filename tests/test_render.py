@@ -259,16 +259,26 @@ def test_a_picture_of_lines_is_bent_as_the_distortion_says():
     torch.testing.assert_close(bent[inside], system.ideal[0][inside], rtol=0, atol=1e-9)
 
 
-def test_without_lateral_colour_all_colours_lie_together(triplet):
-    centroids = []
-    for lateral in (True, False):
-        kernels = ready(
-            triplet, SENSOR, nodes=(2, 2), lateral_colour=lateral, illumination=False, distortion=False
-        ).kernels
-        lines = torch.arange(kernels.shape[-1], dtype=torch.float64)
-        centroids.append((kernels[0, 0, 0] * lines).sum((-2, -1)))
-    apart = [float(each.max() - each.min()) for each in centroids]
-    assert apart[0] != pytest.approx(apart[1], abs=1e-4)
+def test_without_lateral_colour_every_wavelength_lies_about_its_own_chief_ray(triplet):
+    """Then its kernel is that of `psf` there; else it is shifted as the chief ray is."""
+    point, distance = torch.tensor([[0.0], [6.0]], dtype=torch.float64), triplet.surfaces[0].thickness.reshape(1)
+    each = torch.eye(3, dtype=torch.float64)
+    about = {
+        lateral: FieldKernels(triplet, FIELD, "gaussian", 4, 15, distance, each, lateral) for lateral in (True, False)
+    }
+    kernels = {lateral: one.at(point)[0, 0] for lateral, one in about.items()}
+    fields = FIELD.fields(triplet, point)
+    for w in range(3):
+        wavelengths = triplet.wavelengths[w : w + 1]
+        there = FIELD.landing(triplet, fields, wavelengths)[..., 0]
+        window = rt.grid(torch.tensor(FIELD.pitch, dtype=torch.float64), 15, there[:, None])
+        how = {"wavelengths": wavelengths, "grid": window, "center": "axis", "normalise": "window"}
+        wanted = rt.psf(triplet, rt.Gaussian(order=4), fields=fields, **how).kernel[0, 0].flip(-1)
+        torch.testing.assert_close(kernels[False][w], wanted, rtol=0, atol=1e-5)
+        lines = torch.arange(15, dtype=torch.float64)
+        rows = [float((kernels[lateral][w].sum(-1) * lines).sum()) for lateral in (True, False)]
+        shift = float((there - point)[1]) / FIELD.pitch
+        assert rows[0] - rows[1] == pytest.approx(shift, abs=2e-4)
 
 
 @pytest.mark.parametrize("name", ["curvature", "thickness"])
@@ -310,6 +320,23 @@ def test_layers_are_those_of_blur_layers(triplet):
     torch.testing.assert_close(system(picture, depth), wanted, rtol=0, atol=1e-10)
     assert len(system.planes) == 3
     assert torch.equal(system.planes, (1 / distances).sort().values)
+
+
+def test_no_depth_lies_between_two_objects(triplet):
+    """A step of the depth map stays a step where distortion moves it: every pixel is of one of both layers."""
+    distances = torch.tensor([2e3, math.inf], dtype=torch.float64)
+    system = ready(triplet.at(object_distance=4e3), object_distances=distances, nodes=(1, 1), illumination=False)
+    inverse = torch.zeros(1, ROWS, COLUMNS, dtype=torch.float64)
+    inverse[..., COLUMNS // 2 + 9 :] = 1 / 2e3
+    moved = resampled(inverse, system.ideal, "reflect", mode="nearest")
+    assert set(moved.unique().tolist()) == {0.0, 1 / 2e3}
+    assert len(resampled(inverse, system.ideal, "reflect").unique()) > 2
+
+
+def test_rendering_maps_over_pictures(triplet):
+    system, pictures = ready(triplet), random(2, 3, ROWS, COLUMNS)
+    mapped = torch.func.vmap(lambda picture: varying_blur(picture, system.kernels[:, :, 0]))(pictures)
+    torch.testing.assert_close(mapped, varying_blur(pictures, system.kernels[:, :, 0]), rtol=0, atol=1e-12)
 
 
 def test_a_flat_depth_map_is_that_distance(triplet):
@@ -374,10 +401,10 @@ def test_the_grid_is_refined_to_the_tolerance(triplet):
     assert errors[1] <= 0.01
 
 
-def test_optics_is_a_value(triplet):
+def test_no_error_is_estimated_of_requested_nodes(triplet):
     system = ready(triplet, nodes=(2, 2))
     assert isinstance(system, Optics)
-    assert np.isnan(system.error)  # of a grid that was asked for nothing is estimated
+    assert np.isnan(system.error)
 
 
 # -- a camera

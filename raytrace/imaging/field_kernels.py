@@ -22,7 +22,7 @@ from raytrace.psf_models import MODELS, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.system.lens import Lens, is_round_about_axis, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.scene import chief_landing, scene, trace_scene
+from raytrace.tracing.scene import scene, trace_scene
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
 _RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
@@ -106,21 +106,18 @@ class FieldKernels:
         if len(units) <= self.nodes:
             moments = [moment[:, which] for moment in self._moments(units * (1e-6 * self.sensor.pitch))]
         else:  # linear between radii: vignetting factors are, too, with a kink on the axis
-            largest = radius.amax()
-            nodes = largest * torch.linspace(0, 1, self.nodes, dtype=points.dtype, device=points.device)
-            place = radius * ((self.nodes - 1) / largest)
-            left = place.floor().clamp_max(self.nodes - 2).long()
-            part = (place - left)[:, None]
-            moments = [(1 - part) * moment[:, left] + part * moment[:, left + 1] for moment in self._moments(nodes)]
+            nodes = radii(points, self.nodes)
+            moments = [along(nodes, moment.movedim(1, 0), points).movedim(0, 1) for moment in self._moments(nodes)]
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        parts, narrowest = [], torch.minimum(*moments[1:]).min()
+        narrowest = torch.minimum(*moments[1:]).min()
+        pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
+        parts = []
         for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
             shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
             x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
             pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
             covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-            pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
             kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
             kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
             parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
@@ -140,12 +137,30 @@ class FieldKernels:
         return tuple(torch.where(known, moment, 0.0) for moment in moments)
 
     def _origin(self, fields: Tensor) -> Tensor:
-        """Where chief rays of fields (2, N) meet the sensor, (2, N, 1) mm, or of every wavelength, (2, N, W).
+        return origin(self.lens, self.sensor, fields, self.object_distances[0], lateral_colour=self.lateral_colour)
 
-        They pass the centre of the pupil; vignetting factors are left out.
-        """
-        lens = with_object_distance(self.lens, self.object_distances[0])
-        return self.sensor.landing(lens, fields, lens.primary[None] if self.lateral_colour else lens.wavelengths)
+
+def origin(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, lateral_colour: bool) -> Tensor:
+    """Where the chief rays of fields (2, N) meet the sensor, mm: (2, N, 1), or without lateral colour (2, N, W).
+
+    They come from an object at distance () mm and pass the centre of the pupil; vignetting factors are left out.
+    """
+    lens = with_object_distance(lens, distance)
+    return sensor.landing(lens, fields, lens.primary[None] if lateral_colour else lens.wavelengths)
+
+
+def radii(points: Tensor, count: int) -> Tensor:
+    """Equally spaced radii (count,) mm from the axis to the farthest of points (2, ...)."""
+    steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
+    return steps * torch.hypot(*points.flatten(1)).max().clamp_min(1e-3)  # the point of a single pixel is on the axis
+
+
+def along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
+    """Values (*points, ...) at points (2, *points) mm of a function (R, ...) of equally spaced radii, linear."""
+    place = torch.hypot(*points) / radii[1]
+    left = place.floor().clamp_max(len(radii) - 2).long()
+    part = (place - left).reshape(*place.shape, *(1,) * (curve.dim() - 1))
+    return (1 - part) * curve[left] + part * curve[left + 1]
 
 
 def _point(kernels: Tensor) -> Tensor:
@@ -163,7 +178,7 @@ def window_size(
         fields = sensor.fields(lens, points)
         fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
         how = {"tails": model != "drt", "lateral_colour": lateral_colour}
-        reach = max(_reach(lens, fields, distance, **how) for distance in object_distances.split(1))
+        reach = max(_reach(lens, sensor, fields, distance, **how) for distance in object_distances.split(1))
         if MODELS[model].waves:
             reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
     size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
@@ -175,13 +190,12 @@ def window_size(
     return size
 
 
-def _reach(lens: Lens, fields: Tensor, distance: Tensor, *, tails: bool, lateral_colour: bool) -> float:
+def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tails: bool, lateral_colour: bool) -> float:
     """Largest distance in x or y, mm, of light from the origin of its kernel; tails: of Gaussians, too."""
     batch = scene(lens, fields, distance, lens.wavelengths)
     rays = trace_scene(batch, with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0])
-    chief = chief_landing(batch)
-    origin = chief[..., lens.primary_wavelength - 1, None] if lateral_colour else chief
-    offset = torch.where(rays.valid, rays.position[:2] - origin[..., None], torch.nan)
+    centre = origin(lens, sensor, fields, distance[0], lateral_colour=lateral_colour)[:, None, :, :, None]
+    offset = torch.where(rays.valid, rays.position[:2] - centre, torch.nan)
     reach = offset.abs().nan_to_num(0.0).max()
     if tails:
         mean = offset.nanmean(-1, keepdim=True)

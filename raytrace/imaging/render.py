@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
-from raytrace.imaging.field_kernels import FieldKernels, order_of, window_size
+from raytrace.imaging.field_kernels import FieldKernels, along, order_of, radii, window_size
 from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
@@ -46,16 +46,19 @@ _RADII = 257  # at which the chief rays of a round lens are traced
 _COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
 _ROUNDS = 4
 _PLANES = 8
+#: Shares of the tolerance: of the PSF model, of the interpolation between nodes and of low rank.
+_MODEL, _BETWEEN, _LOW_RANK = 0.3, 0.5, 0.2
 
 
 @dataclasses.dataclass(frozen=True)
 class Optics:
-    """A lens in front of a sensor, prepared for pictures: what `optics` computes once for many of them.
+    """A lens in front of a sensor, prepared for any number of pictures by `optics`.
 
     kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
     a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
-    distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ|; order: of the model.
+    distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
+    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model.
     """
 
     sensor: Sensor
@@ -80,12 +83,19 @@ class Optics:
         picture = checked_picture(picture, self.sensor)
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
-        inverse = None if depth is None else 1 / checked_depth(depth, picture)
+        depth = None if depth is None else checked_depth(depth, picture)
+        return self.image_of(picture, depth, boundary=boundary, progress=progress)
+
+    def image_of(
+        self, picture: Tensor, depth: Tensor | None, *, boundary: str, progress: Callable[[int], object] | None
+    ) -> Tensor:
+        """The same of a picture and a depth map that are checked."""
+        inverse = None if depth is None else 1 / depth
         if self.ideal is not None:
             picture = resampled(picture, self.ideal, boundary)
-            if inverse is not None:
-                inverse = resampled(inverse[..., None, :, :], self.ideal, boundary)[..., 0, :, :]
-        how = {"boundary": boundary, "tol": 0.3 * self.tol, "progress": progress}
+            if inverse is not None:  # the mean of two depths is that of no object
+                inverse = resampled(inverse[..., None, :, :], self.ideal, boundary, mode="nearest")[..., 0, :, :]
+        how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": progress}
         flux = [enlarged(part, picture) for part in self.flux]
         if inverse is None:
             return varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how)
@@ -169,9 +179,9 @@ def optics(
     corners = _places(sensor, 5, 5, like)
     chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour)
     if order is None:
-        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, 0.3 * tol)
+        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol)
     kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
-    grid, error = _grid(kernels, sensor, nodes, 0.5 * tol, like)
+    grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
     shade = _illumination(lens, sensor, like) if illumination else None
     ideal = _ideal(lens, sensor, like) if distortion else None
     return Optics(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
@@ -264,12 +274,11 @@ def _illumination(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives."""
     points = _every_pixel(sensor, like)
     if is_round_about_axis(lens):
-        radii = _radii(points, _LIT)
-        curve = _illumination_at(lens, sensor, torch.stack([torch.zeros_like(radii), radii]))
-        return _along(radii, curve, points)
+        nodes = radii(points, _LIT)
+        return along(nodes, _illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), points)
     grid = _illumination_at(lens, sensor, _places(sensor, _FIT, _FIT, like)).reshape(_FIT, _FIT)
-    across, along = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
-    return along.T @ grid @ across
+    across, down = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
+    return down.T @ grid @ across
 
 
 def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
@@ -287,9 +296,9 @@ def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
     """
     if is_round_about_axis(lens):
         every = _every_pixel(sensor, like)
-        radii = _radii(every, _RADII)
-        image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(radii[1:]), radii[1:]]))[1] / radii[1:]
-        return sensor.pixel_of(_along(radii, torch.cat([torch.ones_like(image[:1]), image]), every) * every)
+        nodes = radii(every, _RADII)
+        image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(nodes[1:]), nodes[1:]]))[1] / nodes[1:]
+        return sensor.pixel_of(along(nodes, torch.cat([torch.ones_like(image[:1]), image]), every) * every)
     points = _places(sensor, _FIT, _FIT, like)
     shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
     columns, rows = sensor.pixels
@@ -312,20 +321,6 @@ def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     return torch.where(fields[:, :-2].isnan().any(0), points, scale @ extents[:, :-2])
 
 
-def _radii(points: Tensor, count: int) -> Tensor:
-    """Radii (count,) mm from the axis to the farthest of points (2, ...)."""
-    steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
-    return steps * torch.hypot(*points.flatten(1)).max().clamp_min(1e-3)  # a single pixel has its point on the axis
-
-
-def _along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
-    """A function (R,) of equally spaced radii (R,) at points (2, ...), linear in between."""
-    place = torch.hypot(*points) / radii[1]
-    left = place.floor().clamp_max(len(radii) - 2).long()
-    part = place - left
-    return (1 - part) * curve[left] + part * curve[left + 1]
-
-
 def _chebyshev(count: int, places: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """T_j at `places` from edge to edge of `count` pixels, (places, J), and at the pixels, (count, J)."""
     fitted = torch.linspace(-1, 1, places, dtype=like.dtype, device=like.device)
@@ -342,20 +337,22 @@ def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
     return sensor.points(column, row)
 
 
-def resampled(picture: Tensor, places: Tensor, boundary: str) -> Tensor:
-    """Pictures (..., C, H, W) at columns and rows (2, H, W), by cubic convolution (Keys 1981) that is exact of ramps.
+def resampled(picture: Tensor, places: Tensor, boundary: str, mode: str = "bicubic") -> Tensor:
+    """Pictures (..., C, H, W) at columns and rows (2, H, W).
 
+    mode: "bicubic", cubic convolution (Keys, IEEE Trans. ASSP 29, 1153 (1981)) that is exact of ramps, or "nearest".
     boundary: "reflect" repeats the border pixel in a mirror, others continue by 0.
     """
     rows, columns = picture.shape[-2:]
-    # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: solved for u.
-    part = places - places.floor()
-    places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
+    if mode == "bicubic":
+        # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: solved for u.
+        part = places - places.floor()
+        places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
     size = places.new_tensor([columns, rows])[:, None, None]
     grid = ((2 * places + 1) / size - 1).movedim(0, -1).to(picture.dtype)
     stack = picture.reshape(1, -1, rows, columns)
     beyond = "reflection" if boundary == "reflect" else "zeros"
-    how = {"mode": "bicubic", "align_corners": False, "padding_mode": beyond}
+    how = {"mode": mode, "align_corners": False, "padding_mode": beyond}
     return torch.nn.functional.grid_sample(stack, grid[None], **how).reshape(picture.shape)
 
 
@@ -392,12 +389,13 @@ def render(
     sensor = default_sensor(lens, light) if sensor is None else sensor
     light, distances = checked_picture(light, sensor), None
     if depth is not None:
-        distances = 1 / plane_distances(checked_depth(depth, light.double()), planes)
+        depth = checked_depth(depth, light)
+        distances = 1 / plane_distances(depth.double(), planes)
     ready = optics(
         lens, sensor, model=model, object_distances=distances, tol=tol, distortion=distortion,
         lateral_colour=lateral_colour, illumination=illumination,
     )  # fmt: skip
-    image = ready(light, depth, boundary=boundary, progress=progress)
+    image = ready.image_of(light, depth, boundary=boundary, progress=progress)
     return Rendering(image, light, lens, ready)
 
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import as_picture, extend
+from raytrace.maths.numerics import varies
 
 _RANKS, _SAMPLE = 40, 256  # at most: modes of low rank, and kernels that they are found from
 
@@ -37,7 +38,7 @@ def varying_blur(
     The nodes are equally spaced from the upper to the lower edge of the picture and from the left to the right one; a
     single row or column of nodes is the same everywhere. boundary: one of `image.EXTENSIONS`, how the picture continues
     beyond its edge. tol: allowed error of low rank, Σ |h - ĥ| / Σ |h| of every kernel; 0: patches alone. Low rank is
-    used where no gradient is recorded and where it needs fewer operations. progress: called with the number of
+    used where no derivative may be requested and where it needs fewer operations. progress: called with the number of
     convolutions done.
     Raises ValueError for other shapes.
     """
@@ -49,12 +50,12 @@ def varying_blur(
     large = torch.roll(large, (down, right), (-2, -1))
     weights = [bilinear(count, reach, nodes, like=kernels) for count, reach, nodes in
                ((rows, down, kernels.shape[0]), (columns, right, kernels.shape[1]))]  # fmt: skip
-    records = torch.is_grad_enabled() and (picture.requires_grad or kernels.requires_grad)
-    if tol > 0 and not records and _operations_of_rank(large, 1) < _operations_of_patches(large, kernels):
+    differentiated = varies(picture) or varies(kernels)
+    if tol > 0 and not differentiated and _operations_of_rank(large, 1) < _operations_of_patches(large, kernels):
         modes, shares = _modes(kernels, tol)
         if modes is not None and _operations_of_rank(large, len(modes)) < _operations_of_patches(large, kernels):
             return _by_rank(large, modes, shares, weights, progress)
-    return _by_patches(large, kernels, weights, progress)
+    return _by_patches(large, kernels, weights, progress, in_place=not differentiated)
 
 
 def _check(picture: Tensor, kernels: Tensor) -> tuple[int, int]:
@@ -85,10 +86,9 @@ def _spans(weights: Tensor) -> list[tuple[int, int]]:
     return [(int(one[0]), int(one[-1]) + 1) for one in there]
 
 
-def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress) -> Tensor:
+def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress, *, in_place: bool) -> Tensor:
     h, w = kernels.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
-    records = torch.is_grad_enabled() and (large.requires_grad or kernels.requires_grad)
     total = large.new_zeros(*large.shape[:-2], *shape)
     for k, (top, bottom) in enumerate(_spans(weights[0])):
         for n, (left, right) in enumerate(_spans(weights[1])):
@@ -96,11 +96,11 @@ def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress)
             part = large[..., top:bottom, left:right] * window.to(large.dtype)
             part = _convolved(part, kernels[k, n].to(large.dtype))
             rows, columns = part.shape[-2:]
-            if records:
+            if in_place:
+                total[..., top : top + rows, left : left + columns] += part
+            else:
                 beyond = left, shape[1] - left - columns, top, shape[0] - top - rows
                 total = total + torch.nn.functional.pad(part, beyond)
-            else:
-                total[..., top : top + rows, left : left + columns] += part
             if progress is not None:
                 progress(1)
     return _inner(total, h, w)
