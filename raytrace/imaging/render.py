@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
-from raytrace.imaging.field_kernels import FieldKernels, along, order_of, radii, window_size
+from raytrace.imaging.field_kernels import FieldKernels, along, check_model, field_kernels, order_of, radii, window_size
 from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
@@ -36,6 +36,9 @@ from raytrace.psf_models import MODELS, NotConverged
 from raytrace.system.lens import Lens, field_points, is_round_about_axis
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order
+from raytrace.wave_optics.compute import COLOURS, DESIGN
+from raytrace.wave_optics.element import Element, in_contact
+from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
 from raytrace.words import calling_level
 
 _MOST_NODES = 65  # along the longer side
@@ -153,7 +156,8 @@ def optics(
     lens: Lens,
     sensor: Sensor,
     *,
-    model: str = "gaussian",
+    elements: Element | Sequence[Element] = (),
+    model: str | None = None,
     object_distances: Tensor | None = None,
     tol: float = 1e-2,
     distortion: bool = True,
@@ -165,11 +169,15 @@ def optics(
 ) -> Optics:
     """Prepare a lens and its sensor for `Optics.__call__`; arguments as for `render`.
 
-    object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of
-    as many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
+    elements: at the stop; of elements alone the lens is `wave_optics.hybrid.stop_alone`. object_distances: (D,) mm of
+    layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
+    needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
     """
+    elements = in_contact(elements)
+    model = model or ("wave" if elements else "gaussian")
     if model not in MODELS:
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    check_model(model, elements)
     like = lens.surfaces[-2].thickness
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
     distances = distances.to(like).reshape(-1)
@@ -177,13 +185,14 @@ def optics(
     distances = distances[nearer]
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
     corners = _places(sensor, 5, 5, like)
-    chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour)
+    how = {"lateral_colour": lateral_colour, "elements": elements}
+    chosen = size or window_size(lens, sensor, model, corners, distances, **how)
     if order is None:
-        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol)
-    kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
+        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol, elements=elements)
+    kernels = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how)
     grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
     shade = _illumination(lens, sensor, like) if illumination else None
-    ideal = _ideal(lens, sensor, like) if distortion else None
+    ideal = _ideal(lens, sensor, like) if distortion and not is_stop_alone(lens) else None
     return Optics(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
 
 
@@ -357,12 +366,15 @@ def resampled(picture: Tensor, places: Tensor, boundary: str, mode: str = "bicub
 
 
 def render(
-    lens: Lens,
+    lens: Lens | Element | Sequence[Element],
     picture: Tensor,
     *,
     sensor: Sensor | None = None,
+    elements: Element | Sequence[Element] = (),
+    sensor_distance: float | Tensor | None = None,
+    wavelengths: Sequence[float] | Tensor | None = None,
     depth: Tensor | None = None,
-    model: str = "gaussian",
+    model: str | None = None,
     tol: float = 1e-2,
     planes: int = _PLANES,
     boundary: str = "reflect",
@@ -373,12 +385,16 @@ def render(
 ) -> "Rendering":
     """The picture that a lens projects onto its sensor, without noise, differentiable in the numbers of the lens.
 
+    lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
+        or of `depth`; wavelengths: (W,) µm of theirs, by default 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
     sensor: its pixels are those of the picture; by default of the size that the largest field of the lens fills to its
         corners, one channel, or "rgb" of three.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
         equally spaced reciprocal distances, of which near ones cover far ones.
-    model: of the PSF, see `rt.psf`; tol: bound on the estimated error of the kernels, the sum of |h - ĥ|.
+    elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
+    model: of the PSF, see `rt.psf`, by default "gaussian"; with elements "wave".
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call.
@@ -386,17 +402,39 @@ def render(
     """
     light = linearised(picture)
     light = light[None] if light.dim() == 2 else light
+    if not isinstance(lens, Lens):
+        lens, elements = _alone(lens, sensor, elements, sensor_distance, wavelengths), lens
+    elif sensor_distance is not None or wavelengths is not None:
+        raise ValueError("a lens has a sensor distance and wavelengths: give lens.at(sensor_distance=…, wavelengths=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
     light, distances = checked_picture(light, sensor), None
     if depth is not None:
         depth = checked_depth(depth, light)
         distances = 1 / plane_distances(depth.double(), planes)
     ready = optics(
-        lens, sensor, model=model, object_distances=distances, tol=tol, distortion=distortion,
+        lens, sensor, elements=elements, model=model, object_distances=distances, tol=tol, distortion=distortion,
         lateral_colour=lateral_colour, illumination=illumination,
     )  # fmt: skip
     image = ready.image_of(light, depth, boundary=boundary, progress=progress)
     return Rendering(image, light, lens, ready)
+
+
+def _alone(
+    elements: Element | Sequence[Element],
+    sensor: Sensor | None,
+    others: Element | Sequence[Element],
+    sensor_distance: float | Tensor | None,
+    wavelengths: Sequence[float] | Tensor | None,
+) -> Lens:
+    """The stop of elements without a lens. Raises ValueError for options that are missing."""
+    parts = in_contact(elements)
+    if not parts or others:
+        raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
+    if sensor is None or sensor_distance is None:
+        raise ValueError("elements without a lens: give sensor=rt.Sensor(…) and sensor_distance=…, mm")
+    if wavelengths is None:
+        wavelengths = COLOURS if sensor.response is not None else (DESIGN,)
+    return stop_alone(parts, sensor_distance=sensor_distance, wavelengths=wavelengths)
 
 
 def render_patches(
