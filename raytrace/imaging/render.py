@@ -445,7 +445,9 @@ def render_patches(
     sensor: Sensor,
     size: int,
     order: int,
-    model: str = "gaussian",
+    elements: Element | Sequence[Element] = (),
+    model: str | None = None,
+    object_distances: Tensor | None = None,
     lateral_colour: bool = True,
     illumination: bool = False,
 ) -> Tensor:
@@ -453,15 +455,42 @@ def render_patches(
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
     change over a patch are left out. size, order: of the window and of the PSF model, as of `Optics.kernels` and
-    `Optics.order` of the initial lens. Differentiable in the numbers of the lens.
+    `Optics.order` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1 to the
+    object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers of the
+    lens and of the elements and in the distances.
+    Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
-    distance = lens.surfaces[0].thickness.reshape(1)
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distance)
-    kernels = FieldKernels(lens, sensor, model, order, size, distance, weights, lateral_colour).at(points)[:, 0]
+    _check_pairs(patches, points, object_distances)
+    distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
+    distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
+    elements = in_contact(elements)
+    model = model or ("wave" if elements else "gaussian")
+    kernels = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
+    kernels = kernels.at(points)[:, 0] if len(distances) == 1 else kernels.paired(points)
     if illumination:
         kernels = _illumination_at(lens, sensor, points)[:, None, None, None] * kernels
     return blur(patches, kernels.to(patches))
+
+
+def _check_pairs(patches: Tensor, points: Tensor, object_distances: Tensor | None) -> None:
+    count = len(patches)
+    if patches.dim() != 4 or points.shape != (2, count):
+        raise ValueError(
+            f"patches of shape {tuple(patches.shape)} at points of shape {tuple(points.shape)}: expected (B, C, H, W) "
+            "and (2, B) mm"
+        )
+    if object_distances is None:
+        return
+    distances = torch.as_tensor(object_distances)
+    if distances.numel() != 1 and distances.shape != (count,):
+        raise ValueError(
+            f"object_distances of shape {tuple(distances.shape)} of {count} patches: expected one distance in mm, or "
+            f"({count},), one of each patch"
+        )
+    if bool(distances.isnan().any()) or bool((distances == 0).any()):
+        raise ValueError("object_distances with nan or 0: expected distances in mm from surface 1; inf is allowed")
 
 
 def plane_distances(depth: Tensor, planes: int) -> Tensor:
