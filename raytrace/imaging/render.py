@@ -455,9 +455,9 @@ def render_patches(
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
     change over a patch are left out. size, order: of the window and of the PSF model, as of `Optics.kernels` and
-    `Optics.order` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1 to the
-    object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers of the
-    lens and of the elements and in the distances.
+    `Optics.order` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1 to
+    the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers of
+    the lens, of the elements and in the distances.
     Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
