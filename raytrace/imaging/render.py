@@ -418,12 +418,34 @@ def render_patches(
     `Optics.order` of the initial lens. Differentiable in the numbers of the lens.
     """
     patches = as_picture(patches)
-    distance = lens.surfaces[0].thickness.reshape(1)
+    kernels = patch_kernels(
+        lens, points, sensor=sensor, size=size, order=order, model=model, lateral_colour=lateral_colour,
+        illumination=illumination,
+    )  # fmt: skip
+    return blur(patches, kernels.to(patches))
+
+
+def patch_kernels(
+    lens: Lens,
+    points: Tensor,
+    *,
+    sensor: Sensor,
+    size: int,
+    order: int,
+    model: str = "gaussian",
+    object_distances: Tensor | None = None,
+    lateral_colour: bool = True,
+    illumination: bool = False,
+) -> Tensor:
+    """TEMPORARY."""
+    distance = lens.surfaces[0].thickness.expand(points.shape[1]) if object_distances is None else object_distances
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distance)
-    kernels = FieldKernels(lens, sensor, model, order, size, distance, weights, lateral_colour).at(points)[:, 0]
+    kernels = torch.cat([
+        FieldKernels(lens, sensor, model, order, size, d, weights, lateral_colour).at(p)[:, 0]
+        for d, p in zip(distance.split(1), points.split(1, 1), strict=True)])
     if illumination:
         kernels = _illumination_at(lens, sensor, points)[:, None, None, None] * kernels
-    return blur(patches, kernels.to(patches))
+    return kernels
 
 
 def plane_distances(depth: Tensor, planes: int) -> Tensor:

@@ -151,6 +151,22 @@ class OtherLens(ValueError):
     """A state of another lens or element, or one without an identity; the message names both."""
 
 
+def encoded_text(document: dict) -> Tensor:
+    """A document as the bytes of its JSON, a uint8 tensor, so that a state remains a dictionary of tensors."""
+    return torch.tensor(list(json.dumps(document).encode()), dtype=torch.uint8)
+
+
+def decoded_text(stored: Tensor) -> dict:
+    """The document of `encoded_text`. Raises OtherLens where it is damaged."""
+    try:
+        document = json.loads(bytes(stored.tolist()).decode())
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        raise OtherLens("the state does not say which lens or element it is of: its identity is damaged")
+    return document
+
+
 class Owned(nn.Module, abc.ABC):
     """A module of offsets, which are meaningless without the lens or element that they are offsets from.
 
@@ -169,7 +185,7 @@ class Owned(nn.Module, abc.ABC):
         """How an identity differs from this one, "" where it does not."""
 
     def get_extra_state(self) -> Tensor:
-        return torch.tensor(list(json.dumps(self.identity()).encode()), dtype=torch.uint8)
+        return encoded_text(self.identity())
 
     def set_extra_state(self, state: Tensor) -> None:
         """Does nothing: the identity of a module is constant."""
@@ -184,13 +200,7 @@ class Owned(nn.Module, abc.ABC):
                     f"{type(self).__name__}, first"
                 )
         else:
-            try:
-                before = json.loads(bytes(stored.tolist()).decode())
-            except (ValueError, TypeError, AttributeError, RecursionError):
-                before = None
-            if not isinstance(before, dict):
-                raise OtherLens("the state does not say which lens or element it is of: its identity is damaged")
-            if words := self.difference(before):
+            if words := self.difference(decoded_text(stored)):
                 raise OtherLens(f"the state is of {words}")
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *lists)
 
