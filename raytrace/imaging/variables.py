@@ -3,6 +3,7 @@
     variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
     changed = variables()                               # the lens with its variables, differentiable
     limits = limits_of(changed, glass=(2, 15), edge=1)  # thicknesses of glass, its edge thickness, mm
+    variables.project()                                 # after a step: onto bounds and constraints, rays brought back
     violation(changed, limits)                          # Σ (excess over a limit)², mm²; 0 can be fabricated
 
 Variable and bound syntax is that of `optimize` (`optimization.variables`). The parameters are offsets from the lens. A
@@ -17,20 +18,25 @@ power is finite where the lens is afocal.
 
 import abc
 import dataclasses
+import functools
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
+from raytrace.imaging.constraints import Constraints
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import to
+from raytrace.optimization.problem import conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
     GLASS,
@@ -222,6 +228,7 @@ def _floating(values: tuple) -> Tensor:
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
+_NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
 
@@ -261,7 +268,9 @@ class Variables(Owned):
         without solves, pickups and exchangeable glasses.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
-        it is then not a parameter but solved for, and its bounds count in `violation`.
+        it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
+        constraint syntax of `optimize` as "total_track<=80", and "buildable", thicknesses within their limits, are met
+        by `project`.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
     `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
@@ -283,19 +292,25 @@ class Variables(Owned):
         super().__init__()
         self.lens = lens = as_lens(lens, "Variables")
         numbers, kinds = _named(lens, vary)
-        self._modelled = with_modelled(lens, numbers)
+        self._modelled, words = with_modelled(lens, numbers), constraint_words(hold)
+        efl = [word for word in words if re.fullmatch("efl(=.*)?", word)]
+        self.conditions = tuple(word for word in words if word not in efl)
         every = tuple(
             _variable(self._modelled, one.surface, kind, one.quantity) for one, kind in zip(numbers, kinds, strict=True)
         )
-        self.held = self._held(hold, every)
+        self.held = self._held(" ".join(efl), every)
         self.variables = tuple(one for one in every if self.held is None or one is not self.held.by)
         self.names = tuple(variable.name for variable in every)
-        ends = zip(self.names, *(end.tolist() for end in bounds_of(lens, numbers, bounds)), strict=True)
+        lower, upper = bounds_of(lens, numbers, bounds)
+        ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
+        self._ends, self._numbers, self._all = (lower, upper), numbers, every
+        self._constraints  # refuses words that are no conditions
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
+        self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
                 f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
@@ -304,6 +319,7 @@ class Variables(Owned):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
         self.lens, self._modelled = converted((self.lens, self._modelled), fn)
+        self.__dict__.pop("_constraints", None)
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:
@@ -363,7 +379,8 @@ class Variables(Owned):
         """The lens (`identity.identity`), and each variable's number in it and unit."""
         starts = {variable.name: [variable.start, variable.unit] for variable in self._every()}
         held = None if self.held is None else ["efl", self.held.focal_length, self.held.by.name]
-        return {**identity(self.lens), "variables": starts, "hold": held}
+        further = {"conditions": [*self.conditions]} if self.conditions else {}
+        return {**identity(self.lens), "variables": starts, "hold": held, **further}
 
     def difference(self, before: dict) -> str:
         """The difference of a stored identity from this one, "" where there is none."""
@@ -375,6 +392,9 @@ class Variables(Owned):
                 return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
             if not alike(before["hold"], now["hold"]):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
+            if before.get("conditions") != now.get("conditions"):
+                stored, current = (" ".join(one.get("conditions", ["none"])) for one in (before, now))
+                return f"variables with the conditions {stored}, not {current}"
             for name, pair in before["variables"].items():
                 if not alike(pair, now["variables"][name]):
                     return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
@@ -411,11 +431,66 @@ class Variables(Owned):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Clamp variables to their bounds, after a step of an optimiser."""
+        """Move variables to the nearest ones within their bounds that meet the conditions of `hold`, after a step.
+
+        Rays of the rim of every field that fail are brought back. Warns NotReached for what is not met.
+        """
         for variable in self.variables:
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
                 self.get_parameter(variable.name).clamp_(min(low, high), max(low, high))
+        if self._constraints is None:
+            return
+        x = self._values()
+        nearest = self._constraints.nearest(x, self._before)
+        for variable, before, after in zip(self._all, x, nearest, strict=True):
+            if variable in self.variables and after != before:
+                self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
+        self._before = self._values()
+
+    @torch.no_grad()
+    def _values(self) -> np.ndarray:
+        return np.array([float(self.number(variable)) for variable in self._all])
+
+    def _load_from_state_dict(self, *arguments) -> None:
+        super()._load_from_state_dict(*arguments)
+        self._before = self._values()
+
+    @functools.cached_property
+    def _constraints(self) -> Constraints | None:
+        """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
+        if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
+            return None
+        words = [word for word in self.conditions if word != "buildable"]
+        words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
+        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        return Constraints(
+            lens,
+            self._numbers,
+            conditions_in_unit(lens, words, 1.0),
+            unit=np.array([abs(variable.unit) for variable in self._all]),
+            lower=self._ends[0],
+            upper=self._ends[1],
+            limits=self._excess if "buildable" in self.conditions else None,
+        )
+
+    def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""
+        numbers = torch.tensor(x)
+        with torch.set_grad_enabled(derivatives):
+            numbers.requires_grad_(derivatives)
+            lens = to(self._modelled, dtype=torch.float64, device="cpu")
+            for variable, number in zip(self._all, numbers.unbind(), strict=True):
+                lens = _with_value(lens, variable, number)
+            each = [*_shortfalls(lens, self.limits)]
+        excess = np.array([float(one.detach()) for one in each])
+        if not derivatives:
+            return excess, None
+        slope = np.zeros((len(excess), len(x)))
+        for k, one in enumerate(each):
+            if excess[k] > -_NEAR and one.requires_grad:
+                slope[k] = torch.autograd.grad(one, numbers, retain_graph=True)[0].numpy()
+        return excess, slope
 
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
