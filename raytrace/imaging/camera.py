@@ -45,7 +45,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import Tolerances
-from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
 from raytrace.words import named_value
 
@@ -221,6 +221,7 @@ class Camera(nn.Module):
         errors = None if self.tolerances is None else draw_errors(self.tolerances, len(distances))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
+            warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
             if self.sensor is not None:
                 lens, places = self.variables(), self.sensor.landing(self.variables(), self.fields)
                 self._order = order_of(lens, self.sensor, self.model, places, distances, self.size, self.tol)
