@@ -19,7 +19,6 @@ Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with 
 """
 
 import dataclasses
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
@@ -72,9 +71,10 @@ class Camera(nn.Module):
     pupil_points: (2, P), PSFs of these rays, all of one weight, instead of as many rays as `tol` needs ("gaussian",
     "drt"): a Gaussian of twelve rays has their centroid and covariance, not those of all light.
     center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): image position is no
-    error (both with white noise only: without a sensor). tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
+    error. tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
     for each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
+    pupil_points, center, tolerances, normalise and noise are those of cameras without a sensor.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
     its variables and the sensor, and loads into a camera of the same ones alone.
     Warns UnfilledStop once, for the lens at construction.

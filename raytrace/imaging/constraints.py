@@ -1,7 +1,7 @@
 """Exact constraints of a training: the nearest lens that meets them, after every step of an optimiser.
 
-Optimisers of trainings, such as Adam, know no constraints. From the variables x that such a step reached, the lens moves
-to the nearest x′ that is buildable and meets the conditions of `hold`:
+Optimisers of trainings, such as Adam, know no constraints. From the variables x that such a step reached, the lens
+moves to the nearest x′ that is buildable and meets the conditions of `hold`:
 
     min |x′ - x|²   with   c(x′) = 0,   g(x′) ≤ 0,   lower ≤ x′ ≤ upper
 
@@ -58,7 +58,8 @@ class Constraints:
     def nearest(self, x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
         """The nearest variables (n,) that meet all conditions; before: those of the last step, whose rays arrive.
 
-        Rays that fail are brought back by their misses, or else by a shorter step. Warns NotReached for what is not met.
+        Rays that fail are brought back by their misses, or else by a shorter step. Warns NotReached for conditions that
+        are not met.
         """
         wanted = np.clip(x, self.lower, self.upper)
         x, state = wanted, self._state(wanted, derivatives=False)

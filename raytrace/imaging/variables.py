@@ -36,7 +36,7 @@ from raytrace.imaging.constraints import Constraints
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import to
-from raytrace.optimization.problem import conditions_in_unit
+from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
     GLASS,
@@ -306,7 +306,7 @@ class Variables(Owned):
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
         self._ends, self._numbers, self._all = (lower, upper), numbers, every
-        self._constraints  # refuses words that are no conditions
+        self._held_to = self._conditions()
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
@@ -379,7 +379,7 @@ class Variables(Owned):
         """The lens (`identity.identity`), and each variable's number in it and unit."""
         starts = {variable.name: [variable.start, variable.unit] for variable in self._every()}
         held = None if self.held is None else ["efl", self.held.focal_length, self.held.by.name]
-        further = {"conditions": [*self.conditions]} if self.conditions else {}
+        further = {"constraints": [*self.conditions]} if self.conditions else {}
         return {**identity(self.lens), "variables": starts, "hold": held, **further}
 
     def difference(self, before: dict) -> str:
@@ -392,9 +392,9 @@ class Variables(Owned):
                 return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
             if not alike(before["hold"], now["hold"]):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
-            if before.get("conditions") != now.get("conditions"):
-                stored, current = (" ".join(one.get("conditions", ["none"])) for one in (before, now))
-                return f"variables with the conditions {stored}, not {current}"
+            if before.get("constraints") != now.get("constraints"):
+                stored, current = (" ".join(one.get("constraints", ["none"])) for one in (before, now))
+                return f"variables with the constraints {stored}, not {current}"
             for name, pair in before["variables"].items():
                 if not alike(pair, now["variables"][name]):
                     return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
@@ -456,18 +456,25 @@ class Variables(Owned):
         super()._load_from_state_dict(*arguments)
         self._before = self._values()
 
+    def _conditions(self) -> tuple[Condition, ...]:
+        """The conditions of `hold` on the lens. Raises BadVariables."""
+        words = [word for word in self.conditions if word != "buildable"]
+        words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
+        try:
+            return conditions_in_unit(to(self._modelled, dtype=torch.float64, device="cpu"), words, 1.0)
+        except BadHold as error:
+            raise BadVariables(str(error)) from error
+
     @functools.cached_property
     def _constraints(self) -> Constraints | None:
         """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
         if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
             return None
-        words = [word for word in self.conditions if word != "buildable"]
-        words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
         lens = to(self._modelled, dtype=torch.float64, device="cpu")
         return Constraints(
             lens,
             self._numbers,
-            conditions_in_unit(lens, words, 1.0),
+            self._held_to,
             unit=np.array([abs(variable.unit) for variable in self._all]),
             lower=self._ends[0],
             upper=self._ends[1],
