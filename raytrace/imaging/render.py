@@ -423,28 +423,43 @@ def render_patches(
     Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
-    _check_pairs(patches, points, object_distances)
-    lens = lens if object_distances is None else by_angle(lens)
+    if patches.dim() != 4 or points.shape != (2, len(patches)):
+        raise ValueError(
+            f"patches of shape {tuple(patches.shape)} at points of shape {tuple(points.shape)}: expected (B, C, H, W) "
+            "and (2, B) mm"
+        )
+    kernels = patch_kernels(
+        lens, points, sensor=sensor, size=size, order=order, model=model, object_distances=object_distances,
+        lateral_colour=lateral_colour, illumination=illumination,
+    )  # fmt: skip
+    return blur(patches, kernels.to(patches))
+
+
+def patch_kernels(
+    lens: Lens,
+    points: Tensor,
+    *,
+    sensor: Sensor,
+    size: int,
+    order: int,
+    model: str = "gaussian",
+    object_distances: Tensor | None = None,
+    lateral_colour: bool = True,
+    illumination: bool = False,
+) -> Tensor:
+    """Kernels (B, C, size, size) of the channels at points (2, B) mm; arguments as for `render_patches`."""
+    if object_distances is not None:
+        _check_distances(torch.as_tensor(object_distances), points.shape[1])
+        lens = by_angle(lens)
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
     distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
     kernels = FieldKernels(lens, sensor, model, order, size, distances, weights, lateral_colour)
     kernels = kernels.at(points)[:, 0] if len(distances) == 1 else kernels.paired(points)
-    if illumination:
-        kernels = _illumination_at(lens, sensor, points)[:, None, None, None] * kernels
-    return blur(patches, kernels.to(patches))
+    return _illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
 
 
-def _check_pairs(patches: Tensor, points: Tensor, object_distances: Tensor | None) -> None:
-    count = len(patches)
-    if patches.dim() != 4 or points.shape != (2, count):
-        raise ValueError(
-            f"patches of shape {tuple(patches.shape)} at points of shape {tuple(points.shape)}: expected (B, C, H, W) "
-            "and (2, B) mm"
-        )
-    if object_distances is None:
-        return
-    distances = torch.as_tensor(object_distances)
+def _check_distances(distances: Tensor, count: int) -> None:
     if distances.numel() != 1 and distances.shape != (count,):
         raise ValueError(
             f"object_distances of shape {tuple(distances.shape)} of {count} patches: expected one distance in mm, or "
