@@ -444,6 +444,66 @@ def test_patches_have_the_kernels_of_their_places(triplet):
     torch.testing.assert_close(shaded, wanted[:, None, None, None] * found, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("model", ["gaussian", "paraxial", "drt"])
+def test_patches_have_the_kernels_of_their_object_distances(triplet, model, monkeypatch):
+    """Equal and different distances, infinite ones, more of them than one call computes."""
+    monkeypatch.setattr("raytrace.imaging.field_kernels._DISTANCES", 3)
+    distances = torch.tensor([800.0, 3000.0, math.inf, 800.0, 5000.0, 2000.0], dtype=torch.float64)
+    angle = torch.arange(6, dtype=torch.float64)
+    points, patches = 5 * torch.stack([torch.sin(angle), torch.cos(angle)]), random(6, 3, 20, 20)
+    how = {"sensor": FIELD, "size": 9, "order": rt.psf_models.MODELS[model].orders[:3][-1], "model": model}
+    found = render_patches(triplet, patches, points, object_distances=distances, **how)
+    for k, distance in enumerate(distances):
+        lens = triplet.at(object_distance=distance)
+        # The place of a field on the sensor moves a little with the distance: the field is that of the nominal one.
+        alone = render_patches(triplet, patches[[k]], points[:, [k]], object_distances=distance, **how)
+        # Gaussians of one batch share the rule for their pixels, quadrature or wide (1e-4 of the energy).
+        torch.testing.assert_close(found[[k]], alone, rtol=0, atol=1e-5 if model == "gaussian" else 1e-11)
+        other = render_patches(lens, patches[[k]], points[:, [k]], **how)
+        assert float((found[[k]] - other).abs().max()) < 2e-3
+
+
+def test_patches_have_derivatives_by_their_distances_and_the_lens(triplet):
+    variables = rt.Variables(triplet, "curvature:1-3 thickness:2")
+    points = torch.tensor([[0.0, -3.0, 3.0], [2.0, 4.0, 1.0]], dtype=torch.float64)
+    patches, weights = random(3, 3, 14, 14), random(3, 3, 8, 8, seed=1)
+    distances = torch.tensor([900.0, 2000.0, 2000.0], dtype=torch.float64, requires_grad=True)
+    how = {"sensor": FIELD, "size": 7, "order": 4}
+
+    def light(lens, distances):
+        return (weights * render_patches(lens, patches, points, object_distances=distances, **how)).sum()
+
+    light(variables(), distances).backward()
+    for k, step in enumerate((1.0, 5.0, 5.0)):
+        moved = step * torch.eye(3, dtype=torch.float64)[k]
+        with torch.no_grad():
+            two = [light(triplet, distances + sign * moved) for sign in (1, -1)]
+        assert float(distances.grad[k]) == pytest.approx(float(two[0] - two[1]) / (2 * step), rel=1e-4)
+    together = [parameter.grad.clone() for parameter in variables.parameters()]
+    variables.zero_grad()
+    for k in range(3):
+        some = weights[[k]] * render_patches(
+            variables(), patches[[k]], points[:, [k]], object_distances=distances[k].detach(), **how
+        )
+        some.sum().backward()
+    for parameter, wanted in zip(variables.parameters(), together, strict=True):
+        torch.testing.assert_close(parameter.grad, wanted, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"points": torch.zeros(2, 3)}, r"points of shape \(2, 3\).*expected \(B, C, H, W\) and \(2, B\)"),
+        ({"object_distances": [1e3, 1e3, 1e3]}, r"object_distances of shape \(3,\) of 2 patches"),
+        ({"object_distances": [1e3, math.nan]}, "nan or 0: expected distances in mm from surface 1"),
+    ],
+)
+def test_patches_that_do_not_fit_are_one_clear_error(triplet, changed, message):
+    how = {"points": torch.zeros(2, 2), "sensor": FIELD, "size": 7, "order": 4, **changed}
+    with pytest.raises(ValueError, match=message):
+        render_patches(triplet, random(2, 3, 20, 20), **how)
+
+
 @pytest.mark.parametrize("deviation", [1.0, 1.3, 2.5])
 def test_wide_gaussians_are_those_of_the_quadrature(deviation):
     pixels = rt.grid(1.0, 31)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.sensor import Sensor
-from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.numerics import safe_sqrt, varies
 from raytrace.maths.sampling import gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, model_of, psf
@@ -28,6 +28,7 @@ _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the l
 _RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
 _LARGEST = 401  # pixels of a window
 _TOGETHER = 48  # fields of a call of `psf`
+_DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
 
 
 class WindowTooLarge(ValueError):
@@ -58,6 +59,39 @@ class FieldKernels:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor; where no chief ray arrives, a point."""
         parts = [dataclasses.replace(self, object_distances=distance) for distance in self.object_distances.split(1)]
         return torch.cat([part._of_one_distance(points) for part in parts], 1)
+
+    def paired(self, points: Tensor) -> Tensor:
+        """Kernels (N, C, size, size) at places (2, N) mm, each of its own of the object distances (N,)."""
+        parts, order = [], []
+        for group in self._groups():
+            kernels = dataclasses.replace(self, object_distances=self.object_distances[group])
+            parts.append(kernels._paired(points[:, group]))
+            order.append(group)
+        return torch.cat(parts)[torch.cat(order).argsort()]
+
+    def _groups(self) -> list[Tensor]:
+        """Numbers of the places whose kernels one call computes: all finite or all infinite distances."""
+        distances = self.object_distances.detach()
+        if MODELS[self.model].traces and not (self.model == "gaussian" and is_round_about_axis(self.lens)):
+            return [torch.nonzero(distances == distance)[:, 0] for distance in distances.unique()]
+        sides = [torch.nonzero(side)[:, 0] for side in (distances.isfinite(), distances.isinf())]
+        near_first = (side[distances[side].argsort()] for side in sides if len(side))
+        return [some for side in near_first for some in side.split(_DISTANCES)]
+
+    def _paired(self, points: Tensor) -> Tensor:
+        """The same of a group."""
+        distances, which = self.object_distances, torch.arange(points.shape[1], device=points.device)
+        if not varies(distances):
+            distances, which = distances.unique(return_inverse=True)
+        kernels = dataclasses.replace(self, object_distances=distances)
+        if not MODELS[self.model].traces:
+            return kernels._computed(torch.zeros_like(points[:, :1]))[0, which]
+        if len(distances) == 1:
+            return kernels._of_one_distance(points)[:, 0]
+        # Moments of all radii and distances, pixels of the pairs: these cost more.
+        radii, places = self._distinct_radii(points)
+        moments = [moment[which, places][None] for moment in kernels._moments(radii)]
+        return self._gaussians(points, moments)[:, 0]
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
@@ -92,7 +126,7 @@ class FieldKernels:
         groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
         kernels = []
         for some, origin in zip(groups, self._origin(fields).unbind(-1), strict=True):
-            window = make_grid(points.new_tensor(self.sensor.pitch), self.size, origin[:, None])
+            window = make_grid(points.new_tensor(self.sensor.pitch), self.size, origin)
             kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=some, per_wavelength=True).kernel)
         kernels = torch.cat(kernels, 2)
         kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
@@ -101,13 +135,23 @@ class FieldKernels:
 
     def _turned(self, points: Tensor) -> Tensor:
         """Gaussians of the moments along a radius, turned to the azimuth of every place."""
-        radius = safe_sqrt((points * points).sum(0))
-        units, which = torch.unique((radius / self.sensor.pitch * 1e6).round(), return_inverse=True)
-        if len(units) <= self.nodes:
-            moments = [moment[:, which] for moment in self._moments(units * (1e-6 * self.sensor.pitch))]
+        distinct, which = self._distinct_radii(points)
+        if len(distinct) <= self.nodes:
+            moments = [moment[:, which] for moment in self._moments(distinct)]
         else:  # linear between radii: vignetting factors are, too, with a kink on the axis
             nodes = radii(points, self.nodes)
             moments = [along(nodes, moment.movedim(1, 0), points).movedim(0, 1) for moment in self._moments(nodes)]
+        return self._gaussians(points, moments)
+
+    def _distinct_radii(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Radii (K,) mm of places (2, N), to 1e-6 of a pixel, and the number of that of each place."""
+        radius = safe_sqrt((points * points).sum(0)) / self.sensor.pitch
+        units, which = torch.unique((radius * 1e6).round(), return_inverse=True)
+        return units * (1e-6 * self.sensor.pitch), which
+
+    def _gaussians(self, points: Tensor, moments: list[Tensor]) -> Tensor:
+        """Kernels (N, D, C, size, size) of shift, sagittal and tangential variance, (D, N, W), at places (2, N)."""
+        radius = safe_sqrt((points * points).sum(0))
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
         narrowest = torch.minimum(*moments[1:]).min()
@@ -137,15 +181,16 @@ class FieldKernels:
         return tuple(torch.where(known, moment, 0.0) for moment in moments)
 
     def _origin(self, fields: Tensor) -> Tensor:
-        return origin(self.lens, self.sensor, fields, self.object_distances[0], lateral_colour=self.lateral_colour)
+        """(2, D, N, 1 or W)."""
+        return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
 
 
-def origin(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, lateral_colour: bool) -> Tensor:
-    """Where the chief rays of fields (2, N) meet the sensor, mm: (2, N, 1), or without lateral colour (2, N, W).
+def origin(lens: Lens, sensor: Sensor, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:
+    """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1), or without lateral colour (2, D, N, W).
 
-    They come from an object at distance () mm and pass the centre of the pupil; vignetting factors are left out.
+    They come from objects at distances (D,) mm and pass the centre of the pupil; vignetting factors are left out.
     """
-    lens = with_object_distance(lens, distance)
+    lens = with_object_distance(lens, distances)
     return sensor.landing(lens, fields, lens.primary[None] if lateral_colour else lens.wavelengths)
 
 
@@ -194,7 +239,7 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
     """Largest distance in x or y, mm, of light from the origin of its kernel; tails: of Gaussians, too."""
     batch = scene(lens, fields, distance, lens.wavelengths)
     rays = trace_scene(batch, with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0])
-    centre = origin(lens, sensor, fields, distance[0], lateral_colour=lateral_colour)[:, None, :, :, None]
+    centre = origin(lens, sensor, fields, distance, lateral_colour=lateral_colour)[..., None]
     offset = torch.where(rays.valid, rays.position[:2] - centre, torch.nan)
     reach = offset.abs().nan_to_num(0.0).max()
     if tails:

@@ -408,6 +408,7 @@ def render_patches(
     size: int,
     order: int,
     model: str = "gaussian",
+    object_distances: Tensor | None = None,
     lateral_colour: bool = True,
     illumination: bool = False,
 ) -> Tensor:
@@ -415,15 +416,54 @@ def render_patches(
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
     change over a patch are left out. size, order: of the window and of the PSF model, as of `Optics.kernels` and
-    `Optics.order` of the initial lens. Differentiable in the numbers of the lens.
+    `Optics.order` of the initial lens. object_distances: (B,) mm from surface 1 to the object of each patch, or one of
+    all, inf allowed; by default that of the lens. Differentiable in the numbers of the lens and in the distances.
+    Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
-    distance = lens.surfaces[0].thickness.reshape(1)
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distance)
-    kernels = FieldKernels(lens, sensor, model, order, size, distance, weights, lateral_colour).at(points)[:, 0]
-    if illumination:
-        kernels = _illumination_at(lens, sensor, points)[:, None, None, None] * kernels
+    if patches.dim() != 4 or points.shape != (2, len(patches)):
+        raise ValueError(
+            f"patches of shape {tuple(patches.shape)} at points of shape {tuple(points.shape)}: expected (B, C, H, W) "
+            "and (2, B) mm"
+        )
+    kernels = patch_kernels(
+        lens, points, sensor=sensor, size=size, order=order, model=model, object_distances=object_distances,
+        lateral_colour=lateral_colour, illumination=illumination,
+    )  # fmt: skip
     return blur(patches, kernels.to(patches))
+
+
+def patch_kernels(
+    lens: Lens,
+    points: Tensor,
+    *,
+    sensor: Sensor,
+    size: int,
+    order: int,
+    model: str = "gaussian",
+    object_distances: Tensor | None = None,
+    lateral_colour: bool = True,
+    illumination: bool = False,
+) -> Tensor:
+    """Kernels (B, C, size, size) of the channels at points (2, B) mm; arguments as for `render_patches`."""
+    if object_distances is not None:
+        _check_distances(torch.as_tensor(object_distances), points.shape[1])
+    distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
+    distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
+    kernels = FieldKernels(lens, sensor, model, order, size, distances, weights, lateral_colour)
+    kernels = kernels.at(points)[:, 0] if len(distances) == 1 else kernels.paired(points)
+    return _illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
+
+
+def _check_distances(distances: Tensor, count: int) -> None:
+    if distances.numel() != 1 and distances.shape != (count,):
+        raise ValueError(
+            f"object_distances of shape {tuple(distances.shape)} of {count} patches: expected one distance in mm, or "
+            f"({count},), one of each patch"
+        )
+    if bool(distances.isnan().any()) or bool((distances == 0).any()):
+        raise ValueError("object_distances with nan or 0: expected distances in mm from surface 1; inf is allowed")
 
 
 def plane_distances(depth: Tensor, planes: int) -> Tensor:
