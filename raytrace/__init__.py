@@ -168,6 +168,7 @@ PUBLIC = {
     "RedNet": "imaging",
     "Run": "imaging.training",
     "Sensor": "imaging.sensor",
+    "UNet": "imaging.network",
     "Variables": "imaging",
     "render": "imaging.render",
     "train": "imaging.training",

@@ -35,6 +35,7 @@ from raytrace.imaging.image import count_electrons as count_electrons
 from raytrace.imaging.image import depth_masks as depth_masks
 from raytrace.imaging.image import digitise as digitise
 from raytrace.imaging.image import transfer_functions as transfer_functions
+from raytrace.imaging.network import UNet as UNet
 from raytrace.imaging.render import render as render
 from raytrace.imaging.restoration import depth_invariant_wiener as depth_invariant_wiener
 from raytrace.imaging.restoration import power_law as power_law

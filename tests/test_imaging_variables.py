@@ -13,9 +13,12 @@ from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
+from raytrace.optimization.optimize import NotReached
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import media
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
+from raytrace.tracing.compiled import prepare
+from raytrace.tracing.paraxial import first_order
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"
@@ -100,7 +103,8 @@ def test_a_diverging_lens_is_held(lens):
     ("vary", "hold", "bounds", "message"),
     [
         ("sensor", "efl", {}, "none of the variables changes the focal length; vary a thickness or a curvature"),
-        (SPACES, "f_number=3", {}, "hold 'f_number=3': expected efl, the focal length of the file, or one in mm"),
+        (SPACES, "focus=3", {}, "'focus=3': 'focus' is nothing to hold; expected one of efl"),
+        (SPACES, "efl total_track=x", {}, "'total_track=x': 'x' is no number"),
         (SPACES, "efl=x", {}, "hold 'efl=x': expected efl"),
         (SPACES, "efl=0", {}, "hold 'efl=0': expected efl, the focal length of the file, or one in mm"),
         (SPACES, "efl=1e400", {}, "hold 'efl=1e400': expected efl"),
@@ -163,3 +167,55 @@ def test_training_holds_it(lens, tmp_path):
     assert records[-1]["thickness_6"] != records[0]["thickness_6"]
     assert focal_length(own.variables()) == pytest.approx(focal_length(lens), abs=MICROMETRE)
     assert "variables.thickness_6" not in own.state_dict()
+
+
+def test_conditions_are_met_after_every_step_and_thicknesses_are_within_their_limits(lens):
+    """EFL, length and buildable thicknesses, exact to 1e-8 mm after random steps that violate all of them."""
+    prepare()
+    variables = Variables(
+        lens, "curvature thickness sensor", hold="efl total_track<=160 buildable", glass_thickness=(2.0, 15.0), edge=1.0
+    )
+    length = float(first_order(lens).effective_focal_length)
+    generator, violated = torch.Generator().manual_seed(0), 0.0
+    for _ in range(4):
+        with torch.no_grad():
+            for parameter in variables.parameters():
+                parameter.add_(0.3 * torch.randn((), generator=generator, dtype=parameter.dtype))
+        violated = max(violated, float(variables.violation().detach()))
+        variables.project()
+        changed = variables()
+        assert float(first_order(changed).effective_focal_length.detach()) == pytest.approx(length, abs=1e-8)
+        track = sum(float(surface.thickness.detach()) for surface in changed.surfaces[1:-1])
+        assert track <= 160 + 1e-7
+        assert float(variables.violation().detach()) < 1e-14
+    assert violated > 0.01
+
+
+def test_the_projection_is_the_nearest_lens(lens):
+    """Two thicknesses that are 1 mm too long together are shortened by half of that each."""
+    total = sum(float(surface.thickness) for surface in lens.surfaces[2:5])
+    variables = Variables(lens, "thickness:2,4", hold=f"thickness:2-4<={total!r} buildable")
+    with torch.no_grad():
+        variables.thickness_2.add_(1.0)
+    before = variables.numbers()
+    variables.project()
+    after = variables.numbers()
+    assert [before[name] - after[name] for name in before] == pytest.approx([0.5, 0.5], abs=1e-7)
+
+
+def test_lost_rays_are_brought_back(lens):
+    """A curvature at which marginal rays miss the surface: after the projection the rays of all fields arrive."""
+    prepare()
+    variables = Variables(lens, "curvature:1-4")
+    with torch.no_grad():
+        variables.curvature_1.fill_((0.06 - variables.variables[0].start) / variables.variables[0].unit)
+    lost = variables._constraints.problem.state(variables._values(), False).lost
+    assert lost > 0
+    variables.project()
+    assert variables._constraints.problem.state(variables._values(), False).lost == 0
+
+
+def test_a_condition_that_cannot_be_met_is_said(lens):
+    variables = Variables(lens, "thickness:2", hold="total_track<=20 buildable")
+    with pytest.warns(NotReached, match="total_track<=20"):
+        variables.project()

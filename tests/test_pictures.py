@@ -1,11 +1,17 @@
 """Pictures to train on: read, split by picture, cropped by keys."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from raytrace.imaging import pictures
 from raytrace.imaging.pictures import NoPictures, Pictures, crop, dead_leaves, digest, draws, files, order, read, split
+from raytrace.io.pictures import read_levels
+
+LEAVES = "2, blake2 25e579926550d3b2"  # of two grey pictures, before there were colours
 
 
 @pytest.fixture
@@ -90,11 +96,12 @@ def test_a_digest_distinguishes_pictures():
     assert digest([one, one + 1]) != digest([one + 1, one])
 
 
-def test_dead_leaves_laid_by_leaf_and_by_pixel_are_the_same(monkeypatch):
+@pytest.mark.parametrize("colour", [False, True])
+def test_dead_leaves_laid_by_leaf_and_by_pixel_are_the_same(monkeypatch, colour):
     found = []
     for few in (-1, 1000, 10**9):
         monkeypatch.setattr(pictures, "_FEW_BARE", few)
-        found.append(dead_leaves(2, size=48, seed=3, smallest=1.5).samples)
+        found.append(dead_leaves(2, size=48, seed=3, smallest=1.5, colour=colour).samples)
     np.testing.assert_array_equal(found[1], found[0])
     np.testing.assert_array_equal(found[2], found[0])
 
@@ -109,3 +116,123 @@ def test_dead_leaves_look_alike_at_every_scale():
     np.testing.assert_array_equal(
         dead_leaves(1, size=32, seed=7).samples[0], dead_leaves(2, size=32, seed=7).samples[0]
     )
+
+
+# -- colours
+
+
+def test_a_folder_is_read_in_colour(folder):
+    """Samples (H, W, 3), red first; of a grey file three equal channels, whose grey sample is unchanged."""
+    paths = [folder / "red.png", folder / "banded" / "banded_3.png", folder / "small.png"]
+    coloured, grey = read(paths, least=84, colour=True), read(paths, least=84)
+    assert coloured.names == grey.names
+    assert [sample.dtype for sample in coloured.samples] == [np.uint8] * 2
+    np.testing.assert_array_equal(coloured.samples[0], np.full((95, 95, 3), (255, 0, 0)))
+    np.testing.assert_array_equal(coloured.samples[1], np.repeat(grey.samples[1][..., None], 3, 2))
+    assert digest(coloured.samples) != digest(grey.samples)
+
+
+def test_crops_of_colours_are_those_of_every_channel():
+    """(size, size, 3): the same place and orientation of every channel, as of a grey picture of the same size."""
+    coloured = dead_leaves(3, size=40, seed=5, colour=True)
+    for channel in range(3):
+        one = Pictures(tuple(sample[..., channel] for sample in coloured.samples), coloured.names)
+        for sample in range(12):
+            patch = crop(coloured, sample, epoch=1, size=24, seed=2)
+            assert patch.shape == (24, 24, 3)
+            assert patch.dtype == np.float32
+            np.testing.assert_array_equal(patch[..., channel], crop(one, sample, epoch=1, size=24, seed=2))
+    train, test = split(coloured)
+    assert (len(train), len(test)) == (2, 1)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 1.0])
+def test_colours_of_dead_leaves_are_correlated(correlation):
+    """Levels of every channel are uniform, and have the correlation that is asked for."""
+    levels = pictures._colours(draws(0), 40_000, correlation)
+    assert levels.min() == 0
+    assert levels.max() == 255
+    for channel in levels.T:  # 256 equal bins: χ² of 255 ± √510
+        counts = np.bincount(channel, minlength=256)
+        assert abs(((counts - counts.mean()) ** 2 / counts.mean()).sum() - 255) < 4 * 510**0.5
+    found = np.corrcoef(levels.T)[np.triu_indices(3, 1)]
+    np.testing.assert_allclose(found, correlation, atol=4 * (1 - correlation**2) / 200 + 1e-12)
+    sample = dead_leaves(1, size=32, colour=True, correlation=correlation).samples[0]
+    assert sample.shape == (32, 32, 3)
+    edges = [np.diff(sample[..., channel].astype(int)) != 0 for channel in range(3)]  # of the same discs
+    assert (edges[0] == edges[1]).mean() > 0.98
+
+
+def test_grey_dead_leaves_are_those_of_earlier_versions():
+    assert digest(dead_leaves(2, size=48, seed=3).samples) == LEAVES
+
+
+def test_other_correlations_are_refused():
+    with pytest.raises(ValueError, match=r"correlation 1\.5 of colours: expected 0 to 1"):
+        dead_leaves(1, size=8, colour=True, correlation=1.5)
+
+
+# -- 16 bits
+
+
+def png(values: np.ndarray) -> bytes:
+    """A PNG file of levels (H, W, C) of 16 bits, written by the specification (ISO/IEC 15948)."""
+    height, width, channels = values.shape
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
+    header = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def tiff(values: np.ndarray, order: str, deflate: str = "") -> bytes:
+    """A TIFF file of levels (H, W, C ≥ 3) of 16 bits, of byte order "<" or ">" (TIFF 6.0), compressed or not."""
+    height, width, channels = values.shape
+    pixels = values.astype(f"{order}u2").tobytes()
+    pixels = zlib.compress(pixels) if deflate else pixels
+    after = 8 + len(pixels)
+    bits = struct.pack(f"{order}{channels}H", *[16] * channels)
+    entries = [
+        (256, 3, 1, width), (257, 3, 1, height), (258, 3, channels, after), (259, 3, 1, 8 if deflate else 1),
+        (262, 3, 1, 2), (273, 4, 1, 8), (277, 3, 1, channels), (278, 3, 1, height), (279, 4, 1, len(pixels)),
+    ]  # fmt: skip
+    if channels == 4:
+        entries.append((338, 3, 1, 2))  # alpha that is not premultiplied
+    listed = b""
+    for tag, kind, count, value in entries:
+        of_value = "H2x" if kind == 3 and count == 1 else "I"
+        listed += struct.pack(f"{order}HHI{of_value}", tag, kind, count, value)
+    directory = struct.pack(f"{order}H", len(entries)) + listed + struct.pack(f"{order}I", 0)
+    start = struct.pack(f"{order}HI", 42, after + len(bits))
+    return (b"II" if order == "<" else b"MM") + start + pixels + bits + directory
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("kind", ["png", "<", ">", "<deflate", ">deflate"])
+def test_colours_of_16_bits_keep_them(tmp_path, channels, kind):
+    """All 16 bits of red, green and blue, whose alpha is ignored; rounded to 8 for training; luma of 16 bits."""
+    values = draws(1).integers(0, 2**16, (90, 85, channels)).astype(np.uint16)
+    path = tmp_path / ("a.png" if kind == "png" else "a.tif")
+    path.write_bytes(png(values) if kind == "png" else tiff(values, kind[0], kind[1:]))
+    colours = values[..., :3]
+    levels = read_levels(path)
+    assert levels.dtype == np.uint16
+    np.testing.assert_array_equal(levels, colours.transpose(2, 0, 1))
+    luma = read_levels(path, 1)
+    assert luma.shape == (1, 90, 85)
+    np.testing.assert_allclose(luma[0], colours @ [0.299, 0.587, 0.114], atol=1.0)
+    (sample,) = read([path], least=84, colour=True).samples
+    assert sample.dtype == np.uint8
+    np.testing.assert_allclose(sample, colours / 257, atol=0.5)
+
+
+def test_layouts_of_16_bits_that_would_lose_bits_are_refused(tmp_path):
+    """Grey with alpha, of which PIL keeps 8 bits; as grey of 8 bits, which training takes, it is read."""
+    (tmp_path / "a.png").write_bytes(png(draws(3).integers(0, 2**16, (6, 7, 2)).astype(np.uint16)))
+    with pytest.raises(ValueError, match=r"a\.png: pixels of the layout LA with 16 bits; expected grey or RGB ones"):
+        read_levels(tmp_path / "a.png")
+    assert read([tmp_path / "a.png"], least=4).samples[0].shape == (6, 7)

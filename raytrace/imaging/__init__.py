@@ -7,7 +7,7 @@
 | image           | convolution with PSFs, layered scenes; noise and quantisation of the sensor             |
 | sensor          | pixels and their field points, Bayer mosaic, capture; spectral_response: of its channels |
 | restoration     | linear filters (Wiener) and their errors in closed form                                 |
-| network         | RED-Net                                                                                 |
+| network         | RED-Net and a small U-Net                                                               |
 | pictures        | folders of photographs, dead-leaves images                                              |
 | training        | runs that resume                                                                        |
 | closed_form     | a camera's error behind the best linear filter, and its minimum                         |

@@ -1,41 +1,50 @@
 """Camera: a lens with variables, a sensor and a restoration network as one module.
 
-A training step of lens and network:
+A training step of lens and network, in colour, at random places of the sensor:
 
-    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet())
-    optimizer = torch.optim.Adam(camera.parameters(), 1e-3)
+    sensor = rt.Sensor(size=(24, 16), pixels=(4800, 3200), response="rgb", full_well=2e4, read_noise=3)
+    camera = rt.Camera(rt.Variables(lens, "curvature thickness"), rt.UNet(channels=3), sensor=sensor)
+    optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
+    origins = sensor.random_patches(index, size=128)        # index (B,): global numbers of the samples
     distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
-    restored = camera(pictures, distances)                  # blurred, noisy, restored
+    where = {"points": sensor.patch_points(origins, 128), "origins": origins, "index": index}
+    restored = camera(pictures, distances, **where)         # (B, 3, H, W): blurred, recorded, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
     camera.variables.project()                              # onto the bounds, if there are any
+
+Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise.
 """
 
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
+from raytrace.imaging.field_kernels import order_of
 from raytrace.imaging.image import add_noise, as_picture, blur
-from raytrace.imaging.render import Rendering, render
+from raytrace.imaging.render import Rendering, linearised, patch_kernels, render
 from raytrace.imaging.sensor import Sensor
-from raytrace.imaging.variables import Variables, converted
+from raytrace.imaging.variables import KEY, OtherLens, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.numerics import safe_divide
+from raytrace.maths.result import plain
 from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import moments_of_rays
+from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import Tolerances
-from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
 from raytrace.words import named_value
 
@@ -44,12 +53,18 @@ _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
 class Camera(nn.Module):
-    """Simulated capture and restoration of images (B, H, W) in [0, 1], each at its own object distance.
+    """Simulated capture and restoration of images in [0, 1], each at its own object distance.
 
-    variables: of the lens; network: (B, 1, h, w) -> the same; model: a PSF model.
+    With a sensor the images are (B, C, H, W), linear in light, of the C channels of its response, each at its place on
+    the sensor; without one they are grey, (B, H, W), at one of the `fields`.
+
+    variables: of the lens; network: (B, C, h, w) -> the same, C = 1 without a sensor; model: a PSF model.
+    sensor: its response, noise, quantisation and mosaic are those of the images; whole pictures: see `render`.
     object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
-    on the axis by default.
-    pixels: the PSF window, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
+    on the axis by default; with a sensor they are those of its centre, of 0.7 and of 1 of its half diagonal.
+    pixels: the PSF window, a Grid, 21 × 21 of 5 µm by default, or its number of pixels of the sensor, 21 by default.
+    normalise: "window" or "energy", as for `psf`; illumination: images of a sensor have the relative illumination of
+    their places.
     noise: standard deviation of the sensor noise. tol: allowed error of the kernels: the order of the PSF model is
     chosen once, for the lens at the first call (`plan`). rho: of the paraxial model.
     network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
@@ -59,8 +74,9 @@ class Camera(nn.Module):
     error. tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
     for each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
-    sensor: of whole pictures, see `render`.
-    The object is planar and upright; image inversion and magnification are ignored.
+    pupil_points, center, tolerances, normalise and noise are those of cameras without a sensor.
+    The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
+    its variables and the sensor, and loads into a camera of the same ones alone.
     Warns UnfilledStop once, for the lens at construction.
     """
 
@@ -72,7 +88,7 @@ class Camera(nn.Module):
         model: str = "gaussian",
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
-        pixels: Grid | None = None,
+        pixels: Grid | int | None = None,
         normalise: str = "window",
         noise: float = 0.1,
         tol: float = 1e-2,
@@ -82,6 +98,7 @@ class Camera(nn.Module):
         center: Literal["chief", "centroid"] = "chief",
         tolerances: Tolerances | None = None,
         sensor: Sensor | None = None,
+        illumination: bool = False,
     ):
         super().__init__()
         if not isinstance(variables, Variables):
@@ -90,12 +107,17 @@ class Camera(nn.Module):
         self.variables, self.network, self.model = variables, network, model
         self.range = object_distances
         like = variables.lens.wavelengths
-        self.fields = like.new_zeros(2, 1) if fields is None else field_points(fields, like=variables.lens)
+        self.sensor, self.illumination = sensor, illumination
+        if fields is not None:
+            self.fields = field_points(fields, like=variables.lens)
+        else:
+            self.fields = like.new_zeros(2, 1) if sensor is None else self._fields_of_sensor()
         warn_of_filling(variables.lens, self.fields)
-        self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
+        pitch = like.new_tensor(0.005 if sensor is None else sensor.pitch)
+        self.pixels = pixels if isinstance(pixels, Grid) else grid(pitch, pixels or 21)
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self.pupil_points, self._order = pupil_points, None
-        self.center, self.tolerances, self.sensor = center, tolerances, sensor
+        self.center, self.tolerances = center, tolerances
         self._check()
         self._memo = Memo(object_distances=object_distances)
 
@@ -105,6 +127,11 @@ class Camera(nn.Module):
             raise ValueError(f"center {self.center!r}: expected chief or centroid")
         if self.center == "centroid" and self.pupil_points is not None:
             raise ValueError("windows of the rays of pupil_points are about the chief ray: give center chief")
+        if self.sensor is not None and self.pupil_points is not None:
+            raise ValueError("pupil_points and a sensor: the kernels of a sensor have as many rays as tol needs")
+        if self.sensor is not None and (self.pixels.rows, self.pixels.columns) != (self.size, self.size):
+            shape = f"{self.pixels.columns} × {self.pixels.rows}"
+            raise ValueError(f"pixels {shape}: expected a square window of an odd number of pixels of the sensor")
         if self.tolerances is None:
             return
         if not MODELS[self.model].traces:
@@ -117,6 +144,58 @@ class Camera(nn.Module):
         self.fields, self.pixels, self.pupil_points = converted(values, fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
+
+    def _fields_of_sensor(self, shares: Sequence[float] = (0.0, 0.7, 1.0)) -> Tensor:
+        """Field points (2, F) of shares of the way from the middle of the sensor to its corner, where there are any."""
+        corner = self.sensor.corners[:, 0]
+        middle = self.sensor.corners.mean(1)
+        points = torch.stack([middle + share * (corner - middle) for share in shares], 1)
+        with torch.no_grad():
+            fields = self.sensor.fields(self.variables.lens, points)
+        return fields[:, ~fields.isnan().any(0)]
+
+    @property
+    def size(self) -> int:
+        """Pixels across the PSF window."""
+        return self.pixels.rows - (self.pixels.rows + 1) % 2
+
+    def rates(self, *, optics: float, network: float) -> list[dict]:
+        """Groups of parameters for an optimiser of torch, with rates of their own: of the variables and the network."""
+        return [
+            {"params": [*self.variables.parameters()], "lr": optics},
+            {"params": [*self.network.parameters()], "lr": network},
+        ]
+
+    # -- states that describe themselves -------------------------------------------------------------------------------
+
+    def description(self) -> dict:
+        """Lens, variables, sensor, window, model, network and versions, as plain values for JSON."""
+        return {
+            **self.variables.identity(),
+            "sensor": None if self.sensor is None else plain(dataclasses.asdict(self.sensor)),
+            "window": [self.pixels.rows, self.pixels.columns, float(self.pixels.pitch)],
+            "model": self.model,
+            "object_distances": list(self.range),
+            "network": type(self.network).__name__,
+            "versions": {"raytrace": metadata.version("raytrace"), "torch": torch.__version__},
+        }
+
+    def get_extra_state(self) -> Tensor:
+        return encoded_text(self.description())
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Does nothing: a state is compared before it is loaded."""
+
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, missing, *lists) -> None:
+        stored = state_dict.get(prefix + KEY)
+        if stored is not None:
+            before, now = decoded_text(stored), self.description()
+            for name in ("sensor", "window"):
+                if not alike(before.get(name), now[name]):
+                    raise OtherLens(f"the state is of {_difference(name, before.get(name), now[name])}")
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *lists)
+        if stored is None and prefix + KEY in missing:  # of an older version
+            missing.remove(prefix + KEY)
 
     @property
     def margin(self) -> int:
@@ -142,14 +221,43 @@ class Camera(nn.Module):
         errors = None if self.tolerances is None else draw_errors(self.tolerances, len(distances))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
+            warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
+            if self.sensor is not None:
+                lens, places = self.variables(), self.sensor.landing(self.variables(), self.fields)
+                self._order = order_of(lens, self.sensor, self.model, places, distances, self.size, self.tol)
+                return self._order
             self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
         return self._order
 
-    def kernels(self, object_distances: Tensor, field: int = 0, errors: Tensor | None = None) -> Tensor:
+    def kernels(
+        self,
+        object_distances: Tensor,
+        field: int = 0,
+        errors: Tensor | None = None,
+        *,
+        points: Tensor | None = None,
+    ) -> Tensor:
         """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, in a window about its `center`.
 
-        errors: of manufacture, (N,) of one lens or (B, N).
+        errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, one for each distance: PSFs
+        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
         """
+        if (points is None) != (self.sensor is None):
+            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "a sensor"
+            raise ValueError(f"the camera has no {missing}")
+        if self.sensor is not None:
+            if errors is not None:
+                raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
+            return patch_kernels(
+                self.variables(),
+                points.to(self.fields),
+                sensor=self.sensor,
+                size=self.size,
+                order=self.plan() if self._order is None else self._order,
+                model=self.model,
+                object_distances=object_distances.to(self.fields),
+                illumination=self.illumination,
+            )
         if self.pupil_points is not None:
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
@@ -218,15 +326,39 @@ class Camera(nn.Module):
         chief = chief_landing(scene(lens, fields, distances, lens.primary[None], memo))[..., 0]
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
-    def image(self, picture: Tensor, object_distances: Tensor, field: int = 0, errors: Tensor | None = None) -> Tensor:
-        """The noise-free sensor image, (B, H - margin, W - margin).
+    def image(
+        self,
+        picture: Tensor,
+        object_distances: Tensor,
+        field: int = 0,
+        errors: Tensor | None = None,
+        *,
+        points: Tensor | None = None,
+    ) -> Tensor:
+        """The noise-free sensor image, (B, H - margin, W - margin), or (B, C, …) with a sensor.
 
         picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
+        With a sensor (B, C, H, W), centred at points (2, B) mm on it; integers are levels of sRGB (`linearised`).
         errors: of manufacture, (N,) of one lens or (B, N).
-        Raises ValueError for other shapes, as of colour images, and other ranges, as 0 to 255.
+        Raises ValueError for other shapes and other ranges, as 0 to 255.
         """
-        picture = _grey(picture, object_distances)
-        return blur(picture, self.kernels(object_distances, field, errors).to(picture.dtype))
+        if self.sensor is None:
+            picture = _grey(picture, object_distances)
+        else:
+            picture = self._of_channels(picture, object_distances)
+        kernels = self.kernels(object_distances, field, errors, points=points)
+        return blur(picture, kernels.to(picture.dtype))
+
+    def _of_channels(self, picture: Tensor, object_distances: Tensor) -> Tensor:
+        """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,)."""
+        light = linearised(picture)
+        expected = len(object_distances), len(self.sensor.channels)
+        if light.dim() != 4 or tuple(light.shape[:2]) != expected:
+            raise ValueError(
+                f"pictures of shape {tuple(light.shape)}: expected ({expected[0]}, {expected[1]}, H, W), one for each "
+                f"object distance, of the channels {', '.join(self.sensor.channels)} of the sensor"
+            )
+        return _in_range(light)
 
     def render(self, scene: Tensor, depth: Tensor | None = None, **options) -> Rendering:
         """The picture that the current lens projects onto the whole sensor, by the camera's PSF model: see `rt.render`.
@@ -237,12 +369,14 @@ class Camera(nn.Module):
         return render(self.variables(), scene, depth=depth, **{"sensor": self.sensor, "model": self.model, **options})
 
     def restore(self, image: Tensor) -> Tensor:
-        """The network's estimate (B, h, w) from a noisy image."""
+        """The network's estimate (B, h, w), or (B, C, h, w) with a sensor, from a noisy image."""
+        is_grey = self.sensor is None
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
             image = as_picture(image, "image")
             like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
-            stack = image[:, None].to(like, memory_format=torch.channels_last)
-            return self.network(stack)[:, 0].to(image.dtype)
+            stack = (image[:, None] if is_grey else image).to(like, memory_format=torch.channels_last)
+            restored = self.network(stack).to(image.dtype)
+            return restored[:, 0] if is_grey else restored
 
     def forward(
         self,
@@ -253,22 +387,49 @@ class Camera(nn.Module):
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
         errors: Tensor | None = None,
+        points: Tensor | None = None,
+        index: Tensor | Sequence[int] | None = None,
+        seed: int = 0,
     ) -> Tensor:
         """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise.
 
-        errors: of manufacture, (N,) of one lens or (B, N).
+        errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, of the images' centres;
+        index, seed: of its noise, see `Sensor.capture`.
         """
-        image = self.image(picture, object_distances, field, errors)
+        image = self.image(picture, object_distances, field, errors, points=points)
+        if self.sensor is not None:
+            return self.restore(self.recorded(image, points, index, seed))
         if noise is None:
             return self.restore(add_noise(image, self.noise, generator=generator))
         return self.restore(image + self.noise * noise)
 
+    def recorded(
+        self, image: Tensor, points: Tensor, index: Tensor | Sequence[int] | None = None, seed: int = 0
+    ) -> Tensor:
+        """The sensor's record (B, C, h, w) of noise-free images, interpolated where it has a mosaic.
+
+        points: (2, B) mm of their centres; index, seed: of the noise, see `Sensor.capture`.
+        """
+        size = image.new_tensor([image.shape[-1], image.shape[-2]], dtype=torch.float64)
+        first = self.sensor.pixel_of(points.detach()).T - 0.5 * (size - 1)
+        origin = (first + 1e-6).floor().long()
+        return self.sensor.demosaic(self.sensor.capture(image, index, seed, origin), origin)
+
     def target(self, picture: Tensor) -> Tensor:
-        """The ideal output: the image without its margin."""
-        picture = as_picture(picture)
+        """The ideal output: the image without its margin; with a sensor as light."""
+        picture = as_picture(picture) if self.sensor is None else linearised(picture)
         rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
         bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns
         return picture[..., rows : picture.shape[-2] - bottom, columns : picture.shape[-1] - right]
+
+
+def _difference(name: str, before: object, now: object) -> str:
+    """The first difference of a stored sensor or window from this one."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in now:
+            if not alike(before.get(key), now[key]):
+                return f"a sensor of {key} {before.get(key)}, not {now[key]}"
+    return f"a camera of {name} {before}, not {now}"
 
 
 def _grey(picture: Tensor, object_distances: Tensor) -> Tensor:
@@ -280,6 +441,11 @@ def _grey(picture: Tensor, object_distances: Tensor) -> Tensor:
             f"pictures of shape {shape} at {count} object distances: expected grey ones (B, H, W), one for each "
             "distance; colours are a batch, as picture.flatten(0, 1) with distances.repeat_interleave(3)"
         )
+    return _in_range(picture)
+
+
+def _in_range(picture: Tensor) -> Tensor:
+    """Raises ValueError for pictures far above 1."""
     if (most := float(picture.detach().max())) > _LARGEST:
         raise ValueError(
             f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"

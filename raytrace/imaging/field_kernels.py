@@ -25,8 +25,10 @@ from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, NotConverged, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
-from raytrace.system.lens import Lens, is_round_about_axis, with_object_distance
+from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.launch import field_of_object
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Memo, scene, trace_scene
 from raytrace.wave_optics import hybrid
 from raytrace.wave_optics.compute import psf as wave_psf
@@ -295,6 +297,18 @@ def check_model(model: str, elements: Sequence[Element]) -> None:
             f"model {model!r} with phase elements: only waves diffract at their heights; expected model 'wave', or a "
             "smooth element as a lens of its own: raytrace.wave_optics.hybrid.element_lens(element, …)"
         )
+
+
+def by_angle(lens: Lens) -> Lens:
+    """The lens with angles in place of object heights: the image of an angle is the same at all object distances.
+
+    Unchanged with other fields, and telecentric in object space, where the image of a height is.
+    """
+    if lens.fields.kind != "object_height" or lens.fields.telecentric:
+        return lens
+    angled = with_field_kind(lens, "angle")
+    x, y = field_of_object(angled, torch.stack([lens.fields.x, lens.fields.y]), first_order(lens))
+    return dataclasses.replace(angled, fields=dataclasses.replace(angled.fields, x=x, y=y))
 
 
 def origin(lens: Lens, sensor: Sensor, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtr
 
-from raytrace.io.pictures import SUFFIXES, PictureError, read_grey
+from raytrace.io.pictures import SUFFIXES, PictureError, read_colour, read_grey
 
 _SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # last numbers of keys
 #: Number of uncovered pixels of dead leaves above which a loop over leaves is faster than one over pixels.
@@ -25,7 +26,7 @@ class NoPictures(PictureError):
 
 @dataclasses.dataclass(frozen=True)
 class Pictures:
-    """Grey pictures, each (H, W) of 8 bits, and the name of each."""
+    """Pictures of 8 bits, each grey (H, W) or red, green and blue (H, W, 3), and the name of each."""
 
     samples: tuple[np.ndarray, ...]
     names: tuple[str, ...]
@@ -66,13 +67,16 @@ def files(folder: str | Path, most: int | None = None) -> list[Path]:
     return [paths[i * len(paths) // count] for i in range(count)]
 
 
-def read(paths: Sequence[str | Path], *, least: int, bar: Callable[[Iterable], Iterable] = iter) -> Pictures:
+def read(
+    paths: Sequence[str | Path], *, least: int, bar: Callable[[Iterable], Iterable] = iter, colour: bool = False
+) -> Pictures:
     """Pictures of at least `least` × `least` pixels; smaller ones are left out.
 
-    bar: wraps the paths. Raises PictureError with the name of a damaged file, NoPictures if none is left.
+    bar: wraps the paths. colour: samples (H, W, 3), red, green and blue, instead of luma (H, W); 16 bits are rounded to
+    8. Raises PictureError with the name of a damaged file, NoPictures if none is left.
     """
-    samples = [(read_grey(path), str(path)) for path in bar(paths)]
-    large = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
+    samples = [((read_colour if colour else read_grey)(path), str(path)) for path in bar(paths)]
+    large = [(sample, name) for sample, name in samples if min(sample.shape[:2]) >= least]
     if not large:
         raise NoPictures(f"none of {len(samples)} pictures has {least} × {least} pixels, a patch and its margin")
     return Pictures(*zip(*large, strict=True))
@@ -90,25 +94,52 @@ def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pic
     )
 
 
-def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float = 1.0) -> Pictures:
+def dead_leaves(
+    count: int,
+    *,
+    size: int = 256,
+    seed: int = 0,
+    smallest: float = 1.0,
+    colour: bool = False,
+    correlation: float = 0.9,
+) -> Pictures:
     """Opaque discs of density ∝ r⁻³ that cover the picture: natural statistics without a file.
 
-    smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang (Int. J. Comput. Vis. 41,
-    2001): occlusion alone gives the spectra of natural pictures.
+    smallest: radius in pixels; larger ones make smoother pictures. colour: pictures (size, size, 3) of the same discs,
+    whose red, green and blue levels have this correlation, 0 to 1; every channel is uniformly distributed, as grey
+    levels are. Lee, Mumford and Huang (Int. J. Comput. Vis. 41, 2001): occlusion alone gives the spectra of natural
+    pictures. Raises ValueError for another correlation.
     """
+    if not 0 <= correlation <= 1:
+        raise ValueError(f"correlation {correlation:g} of colours: expected 0 to 1")
     return Pictures(
-        tuple(_leaves(size, draws(seed, number, _LEAVES), smallest) for number in range(count)),
+        tuple(
+            _leaves(size, draws(seed, number, _LEAVES), smallest, correlation if colour else None)
+            for number in range(count)
+        ),
         tuple(f"dead leaves {number}" for number in range(count)),
     )
 
 
-def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarray:
-    picture, bare, largest = np.zeros((size, size), np.uint8), np.ones((size, size), bool), size / 2
+def _colours(random: np.random.Generator, count: int, correlation: float) -> np.ndarray:
+    """Levels (count, 3), each uniform in 0 … 255, of Gaussian numbers through their distribution function."""
+    # Ranks of two Gaussian numbers of correlation r are correlated by (6/π) asin(r/2) (Pearson, 1907).
+    of_gaussians = 2 * np.sin(np.pi * correlation / 6)
+    common, own = random.standard_normal((count, 1)), random.standard_normal((count, 3))
+    share = ndtr(np.sqrt(of_gaussians) * common + np.sqrt(1 - of_gaussians) * own)
+    return np.minimum(255, (256 * share).astype(int))
+
+
+def _leaves(size: int, random: np.random.Generator, smallest: float, correlation: float | None) -> np.ndarray:
+    """Grey for a correlation of None."""
+    grey = correlation is None
+    picture = np.zeros((size, size) if grey else (size, size, 3), np.uint8)
+    bare, largest = np.ones((size, size), bool), size / 2
     while bare.any():
         # The next discs, the topmost first; of density ∝ r⁻³, so that 1/r² is uniform.
         radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, 4096))
         x, y = random.uniform(-1, 1, (2, 4096)) * (size / 2 + radius) + size / 2
-        discs = radius, x, y, random.integers(0, 256, 4096)
+        discs = radius, x, y, random.integers(0, 256, 4096) if grey else _colours(random, 4096, correlation)
         cover = _cover_by_disc if bare.sum() > _FEW_BARE else _cover_by_pixel
         cover(picture, bare, *discs)
     return picture
@@ -116,7 +147,7 @@ def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarr
 
 def _cover_by_disc(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -> None:
     """Every disc, the topmost first, covers the bare pixels inside it; the pixels of 128 discs are computed at once."""
-    size, picture, bare = len(picture), picture.reshape(-1), bare.reshape(-1)
+    size, picture, bare = len(picture), picture.reshape(-1, *picture.shape[2:]), bare.reshape(-1)
     for radius, x, y, shade in zip(*(np.split(values, 32) for values in discs), strict=True):
         left, top = (np.maximum(0, (at - radius).astype(int)) for at in (x, y))
         right, bottom = (np.minimum(size, (at + radius).astype(int) + 2) for at in (x, y))
@@ -146,15 +177,17 @@ def _cover_by_pixel(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) -
 
 
 def crop(pictures: Pictures, sample: int, *, epoch: int, size: int, crops: int = 4, seed: int = 0) -> np.ndarray:
-    """Patch (size, size) in [0, 1] of a sample of an epoch of `crops` patches a picture, in one of eight orientations.
+    """Patch (size, size), or (size, size, 3) of a colour picture, of a sample of an epoch of `crops` patches a picture.
 
-    sample: 0 … crops · len(pictures) - 1; every epoch has another order of the pictures.
+    Its numbers in [0, 1] are the levels of the file, not linear in light (`imaging.render.linearised`); rows, columns
+    and colours are its axes, in this order. It has one of eight orientations. sample: 0 … crops · len(pictures) - 1;
+    every epoch has another order of the pictures.
     """
     number = int(order(len(pictures) * crops, epoch=epoch, seed=seed)[sample]) // crops
     picture, random = pictures.samples[number], draws(seed, epoch, sample, _CROP)
-    row, column = (int(random.integers(0, extent - size + 1)) for extent in picture.shape)
+    row, column = (int(random.integers(0, extent - size + 1)) for extent in picture.shape[:2])
     patch = np.rot90(picture[row : row + size, column : column + size], int(random.integers(4)))
-    return (patch.T if random.integers(2) else patch).astype(np.float32) / 255
+    return (patch.swapaxes(0, 1) if random.integers(2) else patch).astype(np.float32) / 255
 
 
 @functools.lru_cache(maxsize=4)

@@ -3,6 +3,7 @@
     variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
     changed = variables()                               # the lens with its variables, differentiable
     limits = limits_of(changed, glass=(2, 15), edge=1)  # thicknesses of glass, its edge thickness, mm
+    variables.project()                                 # after a step: onto bounds and constraints, rays brought back
     violation(changed, limits)                          # Σ (excess over a limit)², mm²; 0 can be fabricated
 
 Variable and bound syntax is that of `optimize` (`optimization.variables`). The parameters are offsets from the lens. A
@@ -17,20 +18,25 @@ power is finite where the lens is afocal.
 
 import abc
 import dataclasses
+import functools
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
+from raytrace.imaging.constraints import Constraints
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import to
+from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
     GLASS,
@@ -151,6 +157,22 @@ class OtherLens(ValueError):
     """A state of another lens or element, or one without an identity; the message names both."""
 
 
+def encoded_text(document: dict) -> Tensor:
+    """A document as the bytes of its JSON, a uint8 tensor, so that a state remains a dictionary of tensors."""
+    return torch.tensor(list(json.dumps(document).encode()), dtype=torch.uint8)
+
+
+def decoded_text(stored: Tensor) -> dict:
+    """The document of `encoded_text`. Raises OtherLens where it is damaged."""
+    try:
+        document = json.loads(bytes(stored.tolist()).decode())
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        raise OtherLens("the state does not say which lens or element it is of: its identity is damaged")
+    return document
+
+
 class Owned(nn.Module, abc.ABC):
     """A module of offsets, which are meaningless without the lens or element that they are offsets from.
 
@@ -169,7 +191,7 @@ class Owned(nn.Module, abc.ABC):
         """How an identity differs from this one, "" where it does not."""
 
     def get_extra_state(self) -> Tensor:
-        return torch.tensor(list(json.dumps(self.identity()).encode()), dtype=torch.uint8)
+        return encoded_text(self.identity())
 
     def set_extra_state(self, state: Tensor) -> None:
         """Does nothing: the identity of a module is constant."""
@@ -184,13 +206,7 @@ class Owned(nn.Module, abc.ABC):
                     f"{type(self).__name__}, first"
                 )
         else:
-            try:
-                before = json.loads(bytes(stored.tolist()).decode())
-            except (ValueError, TypeError, AttributeError, RecursionError):
-                before = None
-            if not isinstance(before, dict):
-                raise OtherLens("the state does not say which lens or element it is of: its identity is damaged")
-            if words := self.difference(before):
+            if words := self.difference(decoded_text(stored)):
                 raise OtherLens(f"the state is of {words}")
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *lists)
 
@@ -212,6 +228,7 @@ def _floating(values: tuple) -> Tensor:
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
+_NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
 
@@ -251,7 +268,9 @@ class Variables(Owned):
         without solves, pickups and exchangeable glasses.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
-        it is then not a parameter but solved for, and its bounds count in `violation`.
+        it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
+        constraint syntax of `optimize` as "total_track<=80", and "buildable", thicknesses within their limits, are met
+        by `project`.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
     `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
@@ -273,19 +292,25 @@ class Variables(Owned):
         super().__init__()
         self.lens = lens = as_lens(lens, "Variables")
         numbers, kinds = _named(lens, vary)
-        self._modelled = with_modelled(lens, numbers)
+        self._modelled, words = with_modelled(lens, numbers), constraint_words(hold)
+        efl = [word for word in words if re.fullmatch("efl(=.*)?", word)]
+        self.conditions = tuple(word for word in words if word not in efl)
         every = tuple(
             _variable(self._modelled, one.surface, kind, one.quantity) for one, kind in zip(numbers, kinds, strict=True)
         )
-        self.held = self._held(hold, every)
+        self.held = self._held(" ".join(efl), every)
         self.variables = tuple(one for one in every if self.held is None or one is not self.held.by)
         self.names = tuple(variable.name for variable in every)
-        ends = zip(self.names, *(end.tolist() for end in bounds_of(lens, numbers, bounds)), strict=True)
+        lower, upper = bounds_of(lens, numbers, bounds)
+        ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
+        self._ends, self._numbers, self._all = (lower, upper), numbers, every
+        self._held_to = self._conditions()
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
+        self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
                 f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
@@ -294,6 +319,7 @@ class Variables(Owned):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
         self.lens, self._modelled = converted((self.lens, self._modelled), fn)
+        self.__dict__.pop("_constraints", None)
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:
@@ -353,7 +379,8 @@ class Variables(Owned):
         """The lens (`identity.identity`), and each variable's number in it and unit."""
         starts = {variable.name: [variable.start, variable.unit] for variable in self._every()}
         held = None if self.held is None else ["efl", self.held.focal_length, self.held.by.name]
-        return {**identity(self.lens), "variables": starts, "hold": held}
+        further = {"constraints": [*self.conditions]} if self.conditions else {}
+        return {**identity(self.lens), "variables": starts, "hold": held, **further}
 
     def difference(self, before: dict) -> str:
         """The difference of a stored identity from this one, "" where there is none."""
@@ -365,6 +392,9 @@ class Variables(Owned):
                 return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
             if not alike(before["hold"], now["hold"]):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
+            if before.get("constraints") != now.get("constraints"):
+                stored, current = (" ".join(one.get("constraints", ["none"])) for one in (before, now))
+                return f"variables with the constraints {stored}, not {current}"
             for name, pair in before["variables"].items():
                 if not alike(pair, now["variables"][name]):
                     return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
@@ -401,11 +431,73 @@ class Variables(Owned):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Clamp variables to their bounds, after a step of an optimiser."""
+        """Move variables to the nearest ones within their bounds that meet the conditions of `hold`, after a step.
+
+        Rays of the rim of every field that fail are brought back. Warns NotReached for what is not met.
+        """
         for variable in self.variables:
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
                 self.get_parameter(variable.name).clamp_(min(low, high), max(low, high))
+        if self._constraints is None:
+            return
+        x = self._values()
+        nearest = self._constraints.nearest(x, self._before)
+        for variable, before, after in zip(self._all, x, nearest, strict=True):
+            if variable in self.variables and after != before:
+                self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
+        self._before = self._values()
+
+    @torch.no_grad()
+    def _values(self) -> np.ndarray:
+        return np.array([float(self.number(variable)) for variable in self._all])
+
+    def _load_from_state_dict(self, *arguments) -> None:
+        super()._load_from_state_dict(*arguments)
+        self._before = self._values()
+
+    def _conditions(self) -> tuple[Condition, ...]:
+        """The conditions of `hold` on the lens. Raises BadVariables."""
+        words = [word for word in self.conditions if word != "buildable"]
+        words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
+        try:
+            return conditions_in_unit(to(self._modelled, dtype=torch.float64, device="cpu"), words, 1.0)
+        except BadHold as error:
+            raise BadVariables(str(error)) from error
+
+    @functools.cached_property
+    def _constraints(self) -> Constraints | None:
+        """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
+        if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
+            return None
+        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        return Constraints(
+            lens,
+            self._numbers,
+            self._held_to,
+            unit=np.array([abs(variable.unit) for variable in self._all]),
+            lower=self._ends[0],
+            upper=self._ends[1],
+            limits=self._excess if "buildable" in self.conditions else None,
+        )
+
+    def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""
+        numbers = torch.tensor(x)
+        with torch.set_grad_enabled(derivatives):
+            numbers.requires_grad_(derivatives)
+            lens = to(self._modelled, dtype=torch.float64, device="cpu")
+            for variable, number in zip(self._all, numbers.unbind(), strict=True):
+                lens = _with_value(lens, variable, number)
+            each = [*_shortfalls(lens, self.limits)]
+        excess = np.array([float(one.detach()) for one in each])
+        if not derivatives:
+            return excess, None
+        slope = np.zeros((len(excess), len(x)))
+        for k, one in enumerate(each):
+            if excess[k] > -_NEAR and one.requires_grad:
+                slope[k] = torch.autograd.grad(one, numbers, retain_graph=True)[0].numpy()
+        return excess, slope
 
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
