@@ -259,10 +259,18 @@ class ElementKernels:
         whole = self.scene
         return (psf_by_depth(whole) if self.plan is None else wave_psf(whole, plan=self.plan, memo=self.memo)).kernel
 
+    def share(self, light: Tensor) -> Tensor:
+        """Share (D, C) of the light of `light` that lies in the window."""
+        return light.sum((-2, -1)) @ self.weights.to(light).T
+
+    def of_light(self, light: Tensor) -> Tensor:
+        """Kernels (D, C, size, size) of sum 1 of `light`."""
+        kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
+        return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
-        kernels = torch.einsum("cw,dwij->dcij", self.weights.to(points), self.light().to(points)).flip(-1)
-        kernels = safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+        kernels = self.of_light(self.light())
         return kernels.expand(points.shape[1], *kernels.shape)
 
     def paired(self, points: Tensor) -> Tensor:
@@ -353,7 +361,7 @@ def window_size(
 ) -> int:
     """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge.
 
-    Of elements: a window 1.5 times as large holds at most 1 % more.
+    Of elements: a window 1.5 times as large holds at most 1 % more; without a lens at most 401 pixels.
     """
     if elements and is_stop_alone(lens):
         return _window_of_elements(lens, sensor, model, points, object_distances, _SMALLEST, elements)
@@ -397,6 +405,8 @@ def _window_of_elements(
         inner, outer = (part.sum((-2, -1)) for part in (light[..., edge:-edge, edge:-edge], light))
         if bool((outer - inner <= _TAIL * outer).all()):
             return size
+        if larger == _LARGEST and isinstance(kernels, ElementKernels):
+            return _LARGEST
         if larger == _LARGEST:
             share = 100 * float((inner / outer).min())
             raise WindowTooLarge(

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
 from raytrace.imaging.field_kernels import (
+    FieldKernels,
     along,
     by_angle,
     check_model,
@@ -69,7 +70,8 @@ class ImageFormation:
     a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
-    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model.
+    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model; haze: (D, C), of elements
+    alone, the light beyond the window of the kernels, which is spread evenly over the image, or None.
     """
 
     sensor: Sensor
@@ -81,24 +83,32 @@ class ImageFormation:
     error: float
     order: int
     tol: float
+    haze: Tensor | None = None
 
     def __call__(
         self,
         picture: Tensor,
         depth: Tensor | None = None,
         *,
+        softness: float = 0.0,
         boundary: str = "reflect",
         progress: Callable[[int], object] | None = None,
     ) -> Tensor:
-        """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm, see `render`."""
+        """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm; others: see `render`."""
         picture = checked_picture(picture, self.sensor)
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
         depth = None if depth is None else checked_depth(depth, picture)
-        return self.image_of(picture, depth, boundary=boundary, progress=progress)
+        return self.image_of(picture, depth, softness=softness, boundary=boundary, progress=progress)
 
     def image_of(
-        self, picture: Tensor, depth: Tensor | None, *, boundary: str, progress: Callable[[int], object] | None
+        self,
+        picture: Tensor,
+        depth: Tensor | None,
+        *,
+        softness: float,
+        boundary: str,
+        progress: Callable[[int], object] | None,
     ) -> Tensor:
         """The same of a picture and a depth map that are checked."""
         inverse = None if depth is None else 1 / depth
@@ -108,19 +118,26 @@ class ImageFormation:
                 inverse = resampled(inverse[..., None, :, :], self.ideal, boundary, mode="nearest")[..., 0, :, :]
         how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": progress}
         flux = [enlarged(part, picture) for part in self.flux]
+        window, haze = [1.0] * len(self.planes), 0.0
+        if self.haze is not None:
+            share = self.haze.to(picture)[..., None, None]
+            window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
         if inverse is None:
-            return varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how)
+            return window[0] * varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how) + haze
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
-        masks = depth_masks(inverse, self.planes.to(inverse))
+        planes = self.planes.to(inverse)
+        step = float(planes.diff().min()) if len(planes) > 1 else 0.0
+        masks = depth_masks(inverse, planes, softness=softness * step)
 
         def layers():
             for d, mask in enumerate(masks.unbind(-3)):
                 cover = flux[d] * mask[..., None, :, :]
-                yield tuple(
+                light, coverage = (
                     varying_blur(part, self.kernels[:, :, d], **how) for part in (cover * picture, cover / shade)
                 )
+                yield window[d] * light, coverage
 
-        return occlusion(layers())
+        return occlusion(layers()) + haze
 
 
 def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
@@ -198,13 +215,17 @@ def optics(
     chosen = size or window_size(lens, sensor, model, corners, distances, **how)
     if order is None:
         order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol, elements=elements)
-    kernels = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how)
-    grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
+    kernels, haze = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how), None
+    if isinstance(kernels, FieldKernels):
+        grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
+    else:
+        light = kernels.light()
+        grid, haze, error = kernels.of_light(light)[None, None], 1 - kernels.share(light), 0.0
     along_radii = is_round_about_axis(lens) and (illumination or distortion)
     pixels = _every_pixel(sensor, like) if along_radii else None
     shade = _illumination(lens, sensor, pixels, like) if illumination else None
     ideal = _ideal(lens, sensor, pixels, like) if distortion and not is_stop_alone(lens) else None
-    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
+    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol, haze)
 
 
 def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
@@ -386,6 +407,8 @@ def render(
     model: str | None = None,
     tol: float = 1e-2,
     planes: int = _PLANES,
+    softness: float = 0.0,
+    size: int | None = None,
     boundary: str = "reflect",
     distortion: bool = True,
     lateral_colour: bool = True,
@@ -400,10 +423,12 @@ def render(
     sensor: its pixels are those of the picture; by default of the size that the largest field of the lens fills to its
         corners, one channel, or "rgb" of three.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
-        equally spaced reciprocal distances, of which near ones cover far ones.
+        equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
+        layers, a logistic function of so large a share of the difference of their reciprocal distances.
     elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
     model: of the PSF, see `rt.psf`, by default "gaussian"; with elements "wave".
-    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|.
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|; size: pixels across their window, an odd
+        number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call.
@@ -422,9 +447,9 @@ def render(
         distances = 1 / plane_distances(depth.double(), planes)
     ready = optics(
         lens, sensor, elements=elements, model=model, object_distances=distances, tol=tol, distortion=distortion,
-        lateral_colour=lateral_colour, illumination=illumination,
+        lateral_colour=lateral_colour, illumination=illumination, size=size,
     )  # fmt: skip
-    image = ready.image_of(light, depth, boundary=boundary, progress=progress)
+    image = ready.image_of(light, depth, softness=softness, boundary=boundary, progress=progress)
     return Rendering(image, light, lens, ready)
 
 
@@ -588,12 +613,13 @@ class Rendering(Result):
         picture: Tensor,
         depth: Tensor | None = None,
         *,
+        softness: float = 0.0,
         boundary: str = "reflect",
         progress: Callable[[int], object] | None = None,
     ) -> Self:
         """The rendering of another picture of the same size by the same optics; arguments as for `render`."""
         light = checked_picture(linearised(picture), self.optics.sensor)
-        image = self.optics(light, depth, boundary=boundary, progress=progress)
+        image = self.optics(light, depth, softness=softness, boundary=boundary, progress=progress)
         return dataclasses.replace(self, image=image, picture=light)
 
     def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
@@ -625,6 +651,8 @@ class Rendering(Result):
         ]
         if math.isfinite(ready.error):
             lines.append(f"estimated error between the places {ready.error:.1e} of the light")
+        if ready.haze is not None:
+            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.max()):.1f} %")
         if ready.illumination is not None:
             darkest = 100 * float(ready.illumination.min())
             lines.append(f"illumination of the darkest pixel {darkest:.1f} % of that of the axis")
