@@ -20,8 +20,10 @@ from raytrace.maths.sampling import gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
-from raytrace.system.lens import Lens, is_round_about_axis, with_object_distance
+from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.launch import field_of_object
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene, trace_scene
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
@@ -183,6 +185,18 @@ class FieldKernels:
     def _origin(self, fields: Tensor) -> Tensor:
         """(2, D, N, 1 or W)."""
         return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
+
+
+def by_angle(lens: Lens) -> Lens:
+    """The lens with angles in place of object heights: the image of an angle is the same at all object distances.
+
+    Unchanged with other fields, and telecentric in object space, where the image of a height is.
+    """
+    if lens.fields.kind != "object_height" or lens.fields.telecentric:
+        return lens
+    angled = with_field_kind(lens, "angle")
+    x, y = field_of_object(angled, torch.stack([lens.fields.x, lens.fields.y]), first_order(lens))
+    return dataclasses.replace(angled, fields=dataclasses.replace(angled.fields, x=x, y=y))
 
 
 def origin(lens: Lens, sensor: Sensor, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:

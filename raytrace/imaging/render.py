@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
-from raytrace.imaging.field_kernels import FieldKernels, along, order_of, radii, window_size
+from raytrace.imaging.field_kernels import FieldKernels, along, by_angle, order_of, radii, window_size
 from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
@@ -51,8 +51,8 @@ _MODEL, _BETWEEN, _LOW_RANK = 0.3, 0.5, 0.2
 
 
 @dataclasses.dataclass(frozen=True)
-class Optics:
-    """A lens in front of a sensor, prepared for any number of pictures by `optics`.
+class ImageFormation:
+    """Image formation of a lens on a sensor, for any number of pictures: kernels, light and distortion, from `optics`.
 
     kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
     a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
@@ -162,8 +162,8 @@ def optics(
     nodes: tuple[int, int] | None = None,
     order: int | None = None,
     size: int | None = None,
-) -> Optics:
-    """Prepare a lens and its sensor for `Optics.__call__`; arguments as for `render`.
+) -> ImageFormation:
+    """Prepare a lens and its sensor for `ImageFormation.__call__`; arguments as for `render`.
 
     object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of
     as many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
@@ -171,6 +171,7 @@ def optics(
     if model not in MODELS:
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
     like = lens.surfaces[-2].thickness
+    lens = lens if object_distances is None else by_angle(lens)
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
@@ -182,9 +183,11 @@ def optics(
         order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol)
     kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
     grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
-    shade = _illumination(lens, sensor, like) if illumination else None
-    ideal = _ideal(lens, sensor, like) if distortion else None
-    return Optics(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
+    along_radii = is_round_about_axis(lens) and (illumination or distortion)
+    pixels = _every_pixel(sensor, like) if along_radii else None
+    shade = _illumination(lens, sensor, pixels, like) if illumination else None
+    ideal = _ideal(lens, sensor, pixels, like) if distortion else None
+    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
 
 
 def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
@@ -270,12 +273,11 @@ def enlarged(light: Tensor, picture: Tensor) -> Tensor:
     return torch.nn.functional.interpolate(light.to(picture)[None], **how)[0]
 
 
-def _illumination(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
-    """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives."""
-    points = _every_pixel(sensor, like)
-    if is_round_about_axis(lens):
-        nodes = radii(points, _LIT)
-        return along(nodes, _illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), points)
+def _illumination(lens: Lens, sensor: Sensor, pixels: Tensor | None, like: Tensor) -> Tensor:
+    """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives. pixels: places of a round lens."""
+    if pixels is not None:
+        nodes = radii(pixels, _LIT)
+        return along(nodes, _illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), pixels)
     grid = _illumination_at(lens, sensor, _places(sensor, _FIT, _FIT, like)).reshape(_FIT, _FIT)
     across, down = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
     return down.T @ grid @ across
@@ -288,17 +290,16 @@ def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     return torch.where(arrives & ~values.isnan(), values, 0.0)
 
 
-def _ideal(lens: Lens, sensor: Sensor, like: Tensor) -> Tensor:
+def _ideal(lens: Lens, sensor: Sensor, pixels: Tensor | None, like: Tensor) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
-    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, linear between 257
-    radii; else polynomials of degree 13 through 25 × 25 chief rays.
+    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, whose pixels are given,
+    linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays.
     """
-    if is_round_about_axis(lens):
-        every = _every_pixel(sensor, like)
-        nodes = radii(every, _RADII)
+    if pixels is not None:
+        nodes = radii(pixels, _RADII)
         image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(nodes[1:]), nodes[1:]]))[1] / nodes[1:]
-        return sensor.pixel_of(along(nodes, torch.cat([torch.ones_like(image[:1]), image]), every) * every)
+        return sensor.pixel_of(along(nodes, torch.cat([torch.ones_like(image[:1]), image]), pixels) * pixels)
     points = _places(sensor, _FIT, _FIT, like)
     shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
     columns, rows = sensor.pixels
@@ -415,9 +416,10 @@ def render_patches(
     """Images (B, C, H - size + 1, W - size + 1) of patches (B, C, H, W) centred at points (2, B) mm: for training.
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
-    change over a patch are left out. size, order: of the window and of the PSF model, as of `Optics.kernels` and
-    `Optics.order` of the initial lens. object_distances: (B,) mm from surface 1 to the object of each patch, or one of
-    all, inf allowed; by default that of the lens. Differentiable in the numbers of the lens and in the distances.
+    change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
+    the `ImageFormation` of the initial lens. object_distances: (B,) mm from surface 1 to the object of each patch, or
+    one of all, inf allowed; by default that of the lens. Differentiable in the numbers of the lens and in the
+    distances.
     Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
@@ -448,6 +450,7 @@ def patch_kernels(
     """Kernels (B, C, size, size) of the channels at points (2, B) mm; arguments as for `render_patches`."""
     if object_distances is not None:
         _check_distances(torch.as_tensor(object_distances), points.shape[1])
+        lens = by_angle(lens)
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
     distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
@@ -528,7 +531,7 @@ class Rendering(Result):
     image: Tensor
     picture: Tensor
     lens: Lens
-    optics: Optics
+    optics: ImageFormation
 
     def another(
         self,
