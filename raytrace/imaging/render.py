@@ -437,7 +437,9 @@ def render(
     light = linearised(picture)
     light = light[None] if light.dim() == 2 else light
     if not isinstance(lens, Lens):
-        lens, elements = _alone(lens, sensor, elements, sensor_distance, wavelengths), lens
+        if elements:
+            raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
+        lens, elements = element_in_stop(lens, sensor, sensor_distance, wavelengths), lens
     elif sensor_distance is not None or wavelengths is not None:
         raise ValueError("a lens has a sensor distance and wavelengths: give lens.at(sensor_distance=…, wavelengths=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
@@ -453,17 +455,16 @@ def render(
     return Rendering(image, light, lens, ready)
 
 
-def _alone(
+def element_in_stop(
     elements: Element | Sequence[Element],
     sensor: Sensor | None,
-    others: Element | Sequence[Element],
     sensor_distance: float | Tensor | None,
     wavelengths: Sequence[float] | Tensor | None,
 ) -> Lens:
-    """The stop of elements without a lens. Raises ValueError for options that are missing."""
+    """The stop of elements without a lens; arguments as for `render`. Raises ValueError for a missing one."""
     parts = in_contact(elements)
-    if not parts or others:
-        raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
+    if not parts:
+        raise ValueError("no element: expected one or several in contact, of rt.elements or rt.element")
     if sensor is None or sensor_distance is None:
         raise ValueError("elements without a lens: give sensor=rt.Sensor(…) and sensor_distance=…, mm")
     if wavelengths is None:
