@@ -110,7 +110,7 @@ def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
 def _reader(parameter: inspect.Parameter) -> Callable | None:
     """What reads the values of a parameter, (verb, name, value) -> value; None if they pass as they are."""
     if parameter.name == "lens":
-        others = _kinds(parameter.annotation) - {Lens, str, os.PathLike}
+        others = _kinds(parameter.annotation) - {Lens, str, os.PathLike, Sequence}
         return functools.partial(_lens_or, tuple(others)) if others else _lens
     reader = _reader_of_values(parameter)
     optional = parameter.default is None or NoneType in get_args(parameter.annotation)
@@ -154,9 +154,9 @@ def _lens(verb: str, name: str, value: object) -> Lens:
 
 
 def _lens_or(kinds: tuple[type, ...], verb: str, name: str, value: object) -> object:
-    """A lens, or a value of other classes, as elements."""
-    is_other = isinstance(value, kinds) and not isinstance(value, (str, bytes))
-    return value if is_other else _lens(verb, name, value)
+    """A lens, or one or several values of other classes, as elements."""
+    several = value if isinstance(value, (list, tuple)) else [value]
+    return value if several and all(isinstance(one, kinds) for one in several) else _lens(verb, name, value)
 
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
