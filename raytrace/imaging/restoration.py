@@ -131,6 +131,7 @@ def joint_wiener(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> T
     of each channel, broadcast against (..., C, rows, columns). Spectra of full correlation and σ = 0 are allowed.
     Raises ValueError for a spectrum of other channels.
     """
+    _check_channels(transfer, spectrum)
     G = torch.zeros_like(spectrum, dtype=torch.promote_types(spectrum.dtype, transfer.dtype))
     for gain, row, combination in _joint_steps(transfer, spectrum, sigma)[1]:
         predicted = (row[..., :, None, :, :] * G).sum(-4)
@@ -143,6 +144,7 @@ def joint_errors(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float, *, f
 
     e_z = diag[(G H_z - 1) S (G H_z - 1)ᴴ + σ² G Gᴴ], arguments as for `joint_wiener`.
     """
+    _check_channels(transfer, spectrum)
     G = joint_wiener(transfer, spectrum, sigma) if filter is None else filter
     channels = torch.eye(spectrum.shape[-3], dtype=G.dtype, device=G.device)[:, :, None, None]
     left = G * transfer[..., None, :, :, :] - channels
@@ -169,6 +171,7 @@ def joint_kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float)
 
     Kernels of all channels must have a common centre: lateral colour shifts them.
     """
+    _check_channels(kernels, spectrum)
     transfer, weight = _half_transfer(kernels, spectrum)
     return (weight * joint_density(transfer, spectrum[..., : len(weight)], sigma)).mean((-2, -1))
 
@@ -189,12 +192,8 @@ def _joint_steps(
 
     It needs no inverse of S or D, and squares no small difference.
     """
+    _check_channels(transfer, spectrum)
     count = transfer.shape[-3]
-    if spectrum.dim() < 4 or spectrum.shape[-4:-2] != (count, count):
-        raise ValueError(
-            f"a cross spectrum of shape {tuple(spectrum.shape)} for transfer functions {tuple(transfer.shape)}: "
-            f"expected (..., {count}, {count}, rows, columns), as `cross_spectrum` gives it"
-        )
     mean = transfer.mean(0)
     identity = torch.eye(count, dtype=mean.dtype, device=mean.device)[:, :, None, None]
     spread = transfer - mean
@@ -224,6 +223,17 @@ def _joint_steps(
                 for matrix in (D, rows, combinations)
             )
     return root, steps
+
+
+def _check_channels(transfer: Tensor, spectrum: Tensor) -> None:
+    """Raise ValueError unless a cross spectrum has the channels of transfer functions or kernels."""
+    count = transfer.shape[-3] if transfer.dim() > 3 else 0
+    if not count or spectrum.dim() < 4 or spectrum.shape[-4:-2] != (count, count):
+        raise ValueError(
+            f"a cross spectrum of shape {tuple(spectrum.shape)} and transfer functions or kernels of shape "
+            f"{tuple(transfer.shape)}: expected (..., C, C, rows, columns), as of `cross_spectrum`, and (Z, ..., C, "
+            "rows, columns)"
+        )
 
 
 def _noise(transfer: Tensor, sigma: Tensor | float) -> Tensor:
