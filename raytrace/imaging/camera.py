@@ -263,6 +263,20 @@ class Camera(nn.Module):
         order = self.plan() if self._order is None else self._order
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
 
+    def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
+        """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
+
+        points: by default those of `fields`. Of sum 1, or the relative illumination.
+        """
+        lens = self.variables()
+        if points is None:
+            points = self.sensor.landing(lens, self.fields).detach()
+        order, distances = self.plan() if self._order is None else self._order, object_distances.to(self.fields)
+        about = {"sensor": self.sensor, "size": self.size, "order": order, "model": self.model}
+        about["illumination"] = self.illumination
+        pairs = points.repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
+        return patch_kernels(lens, pairs[0], object_distances=pairs[1], **about).unflatten(0, (len(distances), -1))
+
     def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
         """The current lens with its stored rays, or as built, whose rays are of one call."""
         return (self.variables(), self._memo) if errors is None else (self.as_built(errors), None)
