@@ -36,7 +36,7 @@ EXAMPLES = """examples:
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
-  raytrace codesign cooke_triplet --sensor 24x16 --vary curvature thickness --hold efl buildable --preset unet -o colour
+  raytrace codesign cooke_triplet --sensor 24x16 --vary thickness sensor curvature --hold efl buildable --preset unet -o colour
   raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
   raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal"""
 
