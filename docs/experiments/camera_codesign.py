@@ -120,7 +120,7 @@ def for_spots(lens: Lens, settings: CodesignSettings) -> tuple[Lens, float]:
     kinds = {"hold": "efl", "bounds": "thickness:0.5..30", "cycles": 40, "seconds": 20}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        optimised = rt.optimize(initial, "spot", vary=settings.vary, **kinds).lens
+        optimised = rt.optimize(initial, merit="spot", vary=settings.vary, **kinds).lens
     return optimised, time.process_time() - start
 
 

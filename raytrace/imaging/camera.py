@@ -112,6 +112,7 @@ class Camera(nn.Module):
             self.fields = field_points(fields, like=variables.lens)
         else:
             self.fields = like.new_zeros(2, 1) if sensor is None else self._fields_of_sensor()
+        self._places = None if sensor is None else sensor.landing(variables.lens, self.fields).detach()
         warn_of_filling(variables.lens, self.fields)
         pitch = like.new_tensor(0.005 if sensor is None else sensor.pitch)
         self.pixels = pixels if isinstance(pixels, Grid) else grid(pitch, pixels or 21)
@@ -140,8 +141,8 @@ class Camera(nn.Module):
         sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        values = self.fields, self.pixels, self.pupil_points
-        self.fields, self.pixels, self.pupil_points = converted(values, fn)
+        values = self.fields, self.pixels, self.pupil_points, self._places
+        self.fields, self.pixels, self.pupil_points, self._places = converted(values, fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
 
@@ -223,8 +224,8 @@ class Camera(nn.Module):
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
             if self.sensor is not None:
-                lens, places = self.variables(), self.sensor.landing(self.variables(), self.fields)
-                self._order = order_of(lens, self.sensor, self.model, places, distances, self.size, self.tol)
+                about = self.sensor, self.model, self._places, distances, self.size
+                self._order = order_of(self.variables(), *about, self.tol)
                 return self._order
             self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
         return self._order
@@ -243,7 +244,7 @@ class Camera(nn.Module):
         (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
         """
         if (points is None) != (self.sensor is None):
-            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "a sensor"
+            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
             raise ValueError(f"the camera has no {missing}")
         if self.sensor is not None:
             if errors is not None:
@@ -266,11 +267,11 @@ class Camera(nn.Module):
     def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
 
-        points: by default those of `fields`. Of sum 1, or the relative illumination.
+        points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
         """
         lens = self.variables()
         if points is None:
-            points = self.sensor.landing(lens, self.fields).detach()
+            points = self._places
         order, distances = self.plan() if self._order is None else self._order, object_distances.to(self.fields)
         about = {"sensor": self.sensor, "size": self.size, "order": order, "model": self.model}
         about["illumination"] = self.illumination
