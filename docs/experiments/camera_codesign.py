@@ -1,13 +1,13 @@
-"""Colour cameras over the whole sensor: does the Gaussian PSF survive, and are lens and network better learned together?
+"""Colour cameras over the whole sensor: does the Gaussian PSF survive, and are lens and network better together?
 
     python docs/experiments/camera_codesign.py models --data DIR -o FOLDER --docs docs
     python docs/experiments/camera_codesign.py apart --data DIR -o FOLDER --docs docs
 
 `models`: step 1 of the first work with Gaussian and with DRT PSFs, of three lenses, all curvatures and air spaces.
-`apart`: a lens for its spot size and one for the closed form, each with a network trained behind it, against training of
-both together. Every training has `--seconds` of processor time, lens and network together: its number of steps follows
-from the measured time of a step. Step 2 freezes the lens and trains the network further with DRT PSFs; the test takes
-held-out photographs at the middle, at 0.7 and at the corner of the sensor. A second call resumes.
+`apart`: a lens for its spot size and one for the closed form, each with a network trained behind it, against training
+of both together. Every training has `--seconds` of processor time, lens and network together: its number of steps
+follows from the measured time of a step. Step 2 freezes the lens and trains the network further with DRT PSFs; the test
+takes held-out photographs at the middle, at 0.7 and at the corner of the sensor. A second call resumes.
 """
 
 import argparse
@@ -51,8 +51,8 @@ from raytrace.tracing.compiled import prepare
 
 BASE = CodesignSettings(
     vary="thickness sensor curvature", hold="efl buildable", spread="reciprocal", start="rms", noise=0.02,
-    wavelengths=(0.5876, 0.4861, 0.6563), wavelength_weights=(1.0, 1.0, 1.0), network="u-net", depth=2, width=16, size=21,
-    patch=64, batch=8, crops=1, rate_network=2e-3, rate_optics=5e-3, decay="cosine",
+    wavelengths=(0.5876, 0.4861, 0.6563), wavelength_weights=(1.0, 1.0, 1.0), network="u-net", depth=2, width=16,
+    size=21, patch=64, batch=8, crops=1, rate_network=2e-3, rate_optics=5e-3, decay="cosine",
 )  # fmt: skip
 #: Lens, sensor and objects: blur discs of about 20 pixels at the ends of the range.
 LENSES = {
@@ -73,8 +73,9 @@ ARMS = {
     "apart": ("spot", "closed form", "closed form, together", "together"),
 }
 WORDS = {
-    "gaussian": "Gaussian DRT", "drt": "DRT", "spot": "least spots, then network", "closed form": "closed form, then network",
-    "closed form, together": "closed form, then both", "together": "both from the start",
+    "gaussian": "Gaussian DRT", "drt": "DRT", "spot": "least spots, then network",
+    "closed form": "closed form, then network", "closed form, together": "closed form, then both",
+    "together": "both from the start",
 }  # fmt: skip
 
 
@@ -117,7 +118,8 @@ def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, *, 
 def for_spots(lens: Lens, settings: CodesignSettings) -> tuple[Lens, float]:
     """The lens of least spots at the focus distance, with the same variables and limits; processor time in s."""
     start, initial = time.process_time(), lens_at_start(lens, settings)
-    kinds = {"hold": "efl", "bounds": "thickness:0.5..30", "cycles": 40, "seconds": 20}
+    length = float(rt.first_order(initial).effective_focal_length)
+    kinds = {"hold": f"efl={length!r}", "bounds": "thickness:1..15 sensor:60..90", "cycles": 40, "seconds": 20}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         optimised = rt.optimize(initial, merit="spot", vary=settings.vary, **kinds).lens
@@ -208,7 +210,7 @@ def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, setti
     samples, row = batch(test_pictures, settings, [*range(len(test_pictures))], TEST_EPOCH), {}
     target = one.target(samples.picture)
     for place, filter in zip(PLACES, filters, strict=True):
-        points = place * one.sensor.corners[:, torch.arange(len(test_pictures)) % 4]
+        points = place * one.sensor.corners[:, :1].expand(2, len(test_pictures))
         kernels = kernels_of(one, points, samples.distance)
         recorded = one.recorded(blur(samples.picture, kernels), points, samples.index, settings.seed)
         behind = {
@@ -269,7 +271,7 @@ def draw(study: Study, rows: list[dict], reference: str):
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     keys = {f"{kind}_{place:g}": (kind, place) for kind in ("network", "wiener") for place in PLACES}
     for axis, (lens, arm) in zip(axes, panels, strict=True):
-        for number, (key, (kind, place)) in enumerate(keys.items()):
+        for number, (key, (kind, _)) in enumerate(keys.items()):
             colour = FIELD_COLOURS[0] if kind == "network" else FIELD_COLOURS[1]
             at = number % 3 + (0.16 if kind == "wiener" else -0.16)
             pairs = {}

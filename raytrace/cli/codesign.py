@@ -36,7 +36,7 @@ EXAMPLES = """examples:
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
-  raytrace codesign cooke_triplet --sensor 24x16 --vary thickness sensor curvature --hold efl buildable --preset unet -o colour
+  raytrace codesign cooke_triplet --sensor 24x16 --vary thickness curvature --hold efl buildable --preset unet -o colour
   raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
   raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal"""
 
@@ -46,8 +46,8 @@ ROWS = {
     "vary": option("variables: sensor (default), thickness:5,6 curvature:1-4 conic:3, of surfaces", "WHAT", nargs="+"),
     "bounds": option("of variables: sensor:57.5,58 curvature_3:-0.04,0 (mm, 1/mm)", "NAME:LOW,HIGH", nargs="+"),
     "hold": option(
-        "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions of "
-        "optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step",
+        "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "
+        "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step",
         "NAME=VALUE",
         nargs="+",
     ),
@@ -100,8 +100,8 @@ ROWS = {
     ),
     "ray_aiming": option(**OPTIONS["ray_aiming"]),
     "sensor": option(
-        "width and height in mm, as 24x16: pictures in colour at random places of the sensor, with the PSFs, the lateral "
-        "colour and the noise there (default: grey pictures of --field)",
+        "width and height in mm, as 24x16: pictures in colour at random places of the sensor, with the PSFs, the "
+        "lateral colour and the noise there (default: grey pictures of --field)",
         "WxH",
         type=extent,
         nargs=None,

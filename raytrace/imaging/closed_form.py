@@ -51,7 +51,7 @@ def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
 
     spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. With a sensor the
-    mean over its channels and `camera.fields`, each with a filter of its own.
+    mean over its channels and the camera's field points, each with a filter of its own.
     """
     if camera.sensor is not None:
         kernels = camera.kernels_over_field(distances)

@@ -352,7 +352,7 @@ def held_out_error(
 ) -> float:
     """Mean |restored - picture| of all test samples, at random object distances or at one.
 
-    place: all patches at this share of the way from the middle of the sensor to its corners; filters: (C, rows,
+    place: all patches at this share of the way from the middle of the sensor to its upper left corner; filters: (C, rows,
     columns) instead of the network; progress: wraps the batches, for a bar.
     """
     count, total = len(pictures) * settings.crops, 0.0
@@ -361,7 +361,8 @@ def held_out_error(
         if distance is not None:
             samples = dataclasses.replace(samples, distance=torch.full_like(samples.distance, distance))
         if place is not None:
-            samples = dataclasses.replace(samples, points=place * camera.sensor.corners[:, samples.index % 4])
+            points = place * camera.sensor.corners[:, :1].expand(2, len(samples.index))
+            samples = dataclasses.replace(samples, points=points)
         if filters is None:
             total += float(absolute_error(camera, samples).sum())
         else:
