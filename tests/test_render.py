@@ -11,9 +11,18 @@ import torch
 import raytrace as rt
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge
 from raytrace.imaging.image import blur, blur_layers, depth_masks
-from raytrace.imaging.render import Optics, default_sensor, encoded, linearised, optics, render_patches, resampled
+from raytrace.imaging.render import (
+    ImageFormation,
+    default_sensor,
+    encoded,
+    linearised,
+    optics,
+    render_patches,
+    resampled,
+)
 from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
+from raytrace.system.lens import with_field_kind
 
 COLUMNS, ROWS = 48, 32
 SENSOR = rt.Sensor(size=(2.4, 1.6), pixels=(COLUMNS, ROWS), response="rgb")  # 50 µm
@@ -403,7 +412,7 @@ def test_the_grid_is_refined_to_the_tolerance(triplet):
 
 def test_no_error_is_estimated_of_requested_nodes(triplet):
     system = ready(triplet, nodes=(2, 2))
-    assert isinstance(system, Optics)
+    assert isinstance(system, ImageFormation)
     assert np.isnan(system.error)
 
 
@@ -461,6 +470,16 @@ def test_patches_have_the_kernels_of_their_object_distances(triplet, model, monk
         torch.testing.assert_close(found[[k]], alone, rtol=0, atol=1e-5 if model == "gaussian" else 1e-11)
         other = render_patches(lens, patches[[k]], points[:, [k]], **how)
         assert float((found[[k]] - other).abs().max()) < 2e-3
+
+
+def test_object_heights_are_scaled_with_the_object_distance(triplet):
+    """The image of a place stays there: of a height of 1 m it moves to twice the image height at 0.5 m."""
+    near = triplet.at(object_distance=1000.0, fields=[10.0])
+    points, patches = torch.tensor([[0.0], [4.0]], dtype=torch.float64), random(1, 3, 20, 20)
+    same = with_field_kind(near, "object_height")
+    how = {"sensor": FIELD, "size": 9, "order": 4, "object_distances": torch.tensor([500.0])}
+    wanted = render_patches(near, patches, points, **how)
+    torch.testing.assert_close(render_patches(same, patches, points, **how), wanted, rtol=0, atol=1e-10)
 
 
 def test_patches_have_derivatives_by_their_distances_and_the_lens(triplet):

@@ -20,7 +20,7 @@ from raytrace.bench.report import Measured, Request, in_words
 from raytrace.cli.progress import progress
 from raytrace.imaging.field_kernels import FieldKernels
 from raytrace.imaging.pictures import dead_leaves
-from raytrace.imaging.render import Optics, enlarged, optics, render_patches
+from raytrace.imaging.render import ImageFormation, enlarged, optics, render_patches
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
@@ -91,7 +91,7 @@ def scene() -> Tensor:
 
 
 @torch.no_grad()
-def direct(lens: Lens, system: Optics, picture: Tensor, top: int, left: int) -> Tensor:
+def direct(lens: Lens, system: ImageFormation, picture: Tensor, top: int, left: int) -> Tensor:
     """Pixels (C, _CROP, _CROP) by superposition: every point of the scene with the kernel of its own place."""
     size, weights = system.kernels.shape[-1], SENSOR.weights(lens.wavelengths)
     half = size // 2
@@ -115,7 +115,7 @@ def direct(lens: Lens, system: Optics, picture: Tensor, top: int, left: int) -> 
     return total
 
 
-def error(lens: Lens, system: Optics, picture: Tensor, image: Tensor) -> float:
+def error(lens: Lens, system: ImageFormation, picture: Tensor, image: Tensor) -> float:
     """Largest relative L1 error of the image at three places."""
     rows, columns = picture.shape[-2:]
     places = (rows // 2, columns // 2), (rows // 2, columns - _CROP), (rows - _CROP, columns - _CROP)

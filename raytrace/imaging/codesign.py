@@ -352,8 +352,8 @@ def held_out_error(
 ) -> float:
     """Mean |restored - picture| of all test samples, at random object distances or at one.
 
-    place: all patches at this share of the way from the middle of the sensor to its upper left corner; filters: (C, rows,
-    columns) instead of the network; progress: wraps the batches, for a bar.
+    place: all patches at this share of the way from the middle of the sensor to its upper left corner; filters: (C,
+    rows, columns) instead of the network; progress: wraps the batches, for a bar.
     """
     count, total = len(pictures) * settings.crops, 0.0
     for first in progress(range(0, count, settings.batch)):
