@@ -128,6 +128,7 @@ class Camera(nn.Module):
             self.fields = field_points(fields, like=lens)
         else:
             self.fields = like.new_zeros(2, 1) if sensor is None else self._fields_of_sensor()
+        self._places = None if sensor is None else sensor.landing(lens, self.fields).detach()
         warn_of_filling(lens, self.fields)
         pitch = like.new_tensor(0.005 if sensor is None else sensor.pitch)
         self.pixels = pixels if isinstance(pixels, Grid) else grid(pitch, pixels or 21)
@@ -185,8 +186,8 @@ class Camera(nn.Module):
         sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        values = self.fields, self.pixels, self.pupil_points
-        self.fields, self.pixels, self.pupil_points = converted(values, fn)
+        values = self.fields, self.pixels, self.pupil_points, self._places
+        self.fields, self.pixels, self.pupil_points, self._places = converted(values, fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
 
@@ -276,9 +277,7 @@ class Camera(nn.Module):
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
             if self.sensor is not None:
-                lens = self.lens()
-                places = self.sensor.landing(lens, self.fields)
-                about = lens, self.sensor, self.model, places, distances, self.size, self.tol
+                about = self.lens(), self.sensor, self.model, self._places, distances, self.size, self.tol
                 self._order = order_of(*about, elements=self.elements())
                 return self._order
             self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
@@ -298,26 +297,39 @@ class Camera(nn.Module):
         (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
         """
         if (points is None) != (self.sensor is None):
-            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "a sensor"
+            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
             raise ValueError(f"the camera has no {missing}")
         if self.sensor is not None:
             if errors is not None:
                 raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
-            return patch_kernels(
-                self.lens(),
-                points.to(self.fields),
-                sensor=self.sensor,
-                size=self.size,
-                order=self.plan() if self._order is None else self._order,
-                elements=self.elements(),
-                model=self.model,
-                object_distances=object_distances.to(self.fields),
-                illumination=self.illumination,
-            )
+            return self._kernels_of_places(points.to(self.fields), object_distances.to(self.fields))
         if self.pupil_points is not None:
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
+
+    def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
+        """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
+
+        points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
+        """
+        points, distances = self._places if points is None else points, object_distances.to(self.fields)
+        pairs = points.to(distances).repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
+        return self._kernels_of_places(*pairs).unflatten(0, (len(distances), -1))
+
+    def _kernels_of_places(self, points: Tensor, distances: Tensor) -> Tensor:
+        """PSFs (B, C, rows, columns) of pairs of points (2, B) and distances (B,) mm."""
+        return patch_kernels(
+            self.lens(),
+            points,
+            sensor=self.sensor,
+            size=self.size,
+            order=self.plan() if self._order is None else self._order,
+            model=self.model,
+            object_distances=distances,
+            illumination=self.illumination,
+            elements=self.elements(),
+        )
 
     def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
         """The current lens with its stored rays, or as built, whose rays are of one call."""

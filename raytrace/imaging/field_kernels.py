@@ -200,18 +200,22 @@ class FieldKernels:
         radius = safe_sqrt((points * points).sum(0))
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        narrowest = torch.minimum(*moments[1:]).min()
-        pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
-        parts = []
-        for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
-            shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
-            x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
-            pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
-            covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-            kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
-            kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
-            parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
-        return torch.cat(parts)
+        narrowest = torch.minimum(*moments[1:]).amin((0, 2))  # of each place: kernels do not depend on other places
+        order, parts = torch.argsort((narrowest >= self.sensor.pitch**2).to(torch.int8), stable=True), []
+        narrow = int((narrowest < self.sensor.pitch**2).sum())
+        for group, pixels in ((order[:narrow], gaussian_pixels), (order[narrow:], wide_gaussian_pixels)):
+            for some in group.split(_TOGETHER):
+                if not len(some):
+                    continue
+                shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
+                x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
+                pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
+                covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
+                kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
+                kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
+                parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
+        kernels = torch.cat(parts)
+        return kernels if narrow in (0, len(order)) else kernels[torch.argsort(order)]
 
     def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Centroid from the origin, mm, sagittal and tangential variance, mm², (D, K, W) at radii (K,) along +y."""

@@ -588,7 +588,11 @@ def linearised(picture: Tensor | np.ndarray) -> Tensor:
     picture = torch.as_tensor(picture)
     if picture.is_floating_point():
         return picture
-    level = as_picture(picture)
+    return decoded(as_picture(picture))
+
+
+def decoded(level: Tensor) -> Tensor:
+    """Light of sRGB levels from 0 to 1: the inverse of `encoded` (IEC 61966-2-1)."""
     return torch.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
 
 
