@@ -22,6 +22,7 @@ from raytrace.imaging.codesign import (
     camera,
     held_out_error,
     light_of,
+    optimise,
     outcome,
     run_model,
     steps_per_epoch,
@@ -138,10 +139,11 @@ def test_a_mosaic_is_that_of_the_place(triplet):
     assert not torch.equal(recorded[0], sensor.demosaic(sensor.sample(image[0])[None], (1, 0))[0])
 
 
-@pytest.mark.parametrize("model", ["gaussian", "drt"])
+@pytest.mark.parametrize("model", ["gaussian", pytest.param("drt", marks=pytest.mark.slow)])
 def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     """Curvatures, spaces and sensor through PSFs, noise and a network, float64."""
     one = made(triplet, "sensor thickness:2 curvature:1,6", model=model, tol=1e-4)
+    torch.manual_seed(0)
     one.network = torch.nn.Conv2d(3, 3, 3, padding=1).double()
     picture, distances, points, index = samples(3)
     one.plan()
@@ -281,6 +283,25 @@ def test_losses_of_shares_add_up_and_samples_have_places(triplet, pictures):
     assert steps_per_epoch(pictures[0], settings) == 2
 
 
+def test_step_1_in_colour_resumes_bit_identically(triplet, pictures, tmp_path):
+    """Stopped after three steps and resumed: variables, network and log of a run that was never stopped."""
+
+    def run(folder, stop=None):
+        one = camera(triplet, SETTINGS)
+        one.plan()
+        for count, _ in enumerate(optimise(one, pictures[0], SETTINGS, Run(tmp_path / folder, {}), every=1), 1):
+            if count == stop:
+                return None
+        return one.state_dict()
+
+    run("parts", 3)
+    parts, whole = run("parts"), run("whole")
+    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    logs = [(tmp_path / folder / "log.csv").read_bytes() for folder in ("whole", "parts")]
+    assert logs[0] == logs[1]
+
+
+@pytest.mark.slow
 def test_a_run_in_colour_resumes_bit_identically_and_reports_places(triplet, pictures, tmp_path):
     def run(folder, stop=None):
         data = triplet, *pictures, SETTINGS, tmp_path / folder

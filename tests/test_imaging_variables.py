@@ -13,7 +13,9 @@ from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
+from raytrace.materials.glass import abbe_number, nd
 from raytrace.optimization.optimize import NotReached
+from raytrace.optimization.variables import VariedGlass
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import media
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
@@ -219,3 +221,45 @@ def test_a_condition_that_cannot_be_met_is_said(lens):
     variables = Variables(lens, "thickness:2", hold="total_track<=20 buildable")
     with pytest.warns(NotReached, match="total_track<=20"):
         variables.project()
+
+
+def test_model_glasses_stay_within_the_catalog_and_snap_to_its_glasses():
+    """Index and Abbe number beyond every glass come back to the hull; the nearest catalog glasses replace them."""
+    prepare()
+    lens = read_lens("cooke_triplet")
+    with pytest.warns(VariedGlass):
+        variables = Variables(
+            lens, "index:1,3 abbe_number:1,3 curvature:1-7", hold="buildable catalog", catalog=["SCHOTT"]
+        )
+    with torch.no_grad():
+        variables.index_1.add_(40.0)  # + 0.4
+        variables.abbe_number_3.add_(-15.0)
+    assert variables._glasses(variables._values(), False)[0].max() > 0.05
+    variables.project()
+    excess, slope = variables._glasses(variables._values(), True)
+    assert -1e-9 < excess.max() < 1e-8
+    numbers = variables._values()
+    for column in range(4):
+        moved = numbers.copy()
+        moved[column] += 1e-3
+        change = (variables._glasses(moved, False)[0] - excess) / 1e-3
+        assert change.tolist() == pytest.approx(slope[:, column].tolist(), abs=1e-8)
+    snapped = variables.snapped()
+    assert {snapped.surfaces[k].glass.catalog for k in (1, 3)} == {"SCHOTT"}
+    assert snapped.surfaces[6].glass.name == lens.surfaces[6].glass.name
+    with pytest.raises(BadVariables, match="no glass varies"):
+        Variables(lens, "curvature:1", hold="catalog")
+    with pytest.raises(BadVariables, match="no glass varies"):
+        Variables(lens, "curvature:1").snapped()
+
+
+def test_glasses_of_the_file_snap_to_the_nearest_of_the_catalog():
+    """SK4 and SF2 of the file are no longer made: current glasses have nearly the same numbers."""
+    lens = read_lens("cooke_triplet")
+    with pytest.warns(VariedGlass):
+        variables = Variables(lens, "index:1,3 abbe_number:1,3", hold="catalog", catalog=["SCHOTT"])
+    for k in (1, 3):
+        one, other = (found.surfaces[k].glass for found in (variables.snapped(), lens))
+        assert one.catalog == "SCHOTT"
+        assert float(nd(one)) == pytest.approx(float(nd(other)), abs=3e-3)
+        assert float(abbe_number(one)) == pytest.approx(float(abbe_number(other)), abs=1.0)

@@ -64,8 +64,8 @@ LENSES = {
     },
 }  # fmt: skip
 PLACES = (0.0, 0.7, 1.0)  # shares of the half diagonal
-BANK = 96  # places and distances whose DRT PSFs train the network of a frozen lens
-REFINED = 120  # steps of step 2
+BANK = 48  # places and distances whose DRT PSFs train the network of a frozen lens
+REFINED = 80  # steps of step 2
 SEEDS = range(5)
 DISTANCES = 5  # of the closed form
 ARMS = {

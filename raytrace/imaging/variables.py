@@ -32,10 +32,11 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from raytrace.imaging.constraints import Constraints
+from raytrace.imaging.constraints import Constraints, GlassLimits, joined_limits
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import to
+from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
@@ -269,8 +270,9 @@ class Variables(Owned):
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
-        constraint syntax of `optimize` as "total_track<=80", and "buildable", thicknesses within their limits, are met
-        by `project`.
+        constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
+        "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`.
+    catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
     `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
@@ -288,8 +290,10 @@ class Variables(Owned):
         glass_thickness: tuple[float, float] | None = None,
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
+        catalog: Sequence[str | os.PathLike] = (),
     ):
         super().__init__()
+        self.catalog = tuple(catalog)
         self.lens = lens = as_lens(lens, "Variables")
         numbers, kinds = _named(lens, vary)
         self._modelled, words = with_modelled(lens, numbers), constraint_words(hold)
@@ -307,6 +311,8 @@ class Variables(Owned):
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
         self._ends, self._numbers, self._all = (lower, upper), numbers, every
         self._held_to = self._conditions()
+        if "catalog" in self.conditions:
+            self._glasses  # noqa: B018 - refuses lenses whose glasses do not vary
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
@@ -320,6 +326,7 @@ class Variables(Owned):
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
         self.lens, self._modelled = converted((self.lens, self._modelled), fn)
         self.__dict__.pop("_constraints", None)
+        self.__dict__.pop("_glasses", None)
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:
@@ -458,7 +465,7 @@ class Variables(Owned):
 
     def _conditions(self) -> tuple[Condition, ...]:
         """The conditions of `hold` on the lens. Raises BadVariables."""
-        words = [word for word in self.conditions if word != "buildable"]
+        words = [word for word in self.conditions if word not in ("buildable", "catalog")]
         words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
         try:
             return conditions_in_unit(to(self._modelled, dtype=torch.float64, device="cpu"), words, 1.0)
@@ -470,7 +477,11 @@ class Variables(Owned):
         """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
         if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
             return None
-        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        lens, limits = to(self._modelled, dtype=torch.float64, device="cpu"), []
+        if "buildable" in self.conditions:
+            limits.append(self._excess)
+        if "catalog" in self.conditions:
+            limits.append(self._glasses)
         return Constraints(
             lens,
             self._numbers,
@@ -478,8 +489,28 @@ class Variables(Owned):
             unit=np.array([abs(variable.unit) for variable in self._all]),
             lower=self._ends[0],
             upper=self._ends[1],
-            limits=self._excess if "buildable" in self.conditions else None,
+            limits=joined_limits(limits),
         )
+
+    @functools.cached_property
+    def _glasses(self) -> GlassLimits:
+        """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
+        columns = [(one.surface, GLASS[one.kind]) if one.kind in GLASS else None for one in self._all]
+        surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
+        if not surfaces:
+            raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
+        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        pool = pool_of(lens, catalogs_of(lens, self.catalog))
+        start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
+        return GlassLimits(pool, start, columns)
+
+    @torch.no_grad()
+    def snapped(self) -> Lens:
+        """The current lens with the nearest glasses of the catalogs instead of its model glasses. Raises BadVariables.
+
+        Train it again without the numbers of the glasses: its image has changed.
+        """
+        return with_glasses(self(), self._glasses.nearest(self._values()))
 
     def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""
