@@ -25,7 +25,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
@@ -35,7 +35,8 @@ from torch.utils import _pytree as pytree
 from raytrace.imaging.constraints import Constraints, GlassLimits, joined_limits
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
-from raytrace.maths.numerics import to
+from raytrace.maths.numerics import safe_divide, to
+from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
@@ -53,11 +54,12 @@ from raytrace.optimization.variables import (
     with_modelled,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
 from raytrace.system.surface import Surface, medium_surfaces, sag, sag_at
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
 
 # -- thickness limits --------------------------------------------------------------------------------------------------
@@ -229,6 +231,7 @@ def _floating(values: tuple) -> Tensor:
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
+_BLUR_RAYS, _DIFFERENCE = (4, 8), 1e-4  # rays and differences, in sag, of units of blur
 _NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
@@ -240,7 +243,7 @@ class Variable:
     kind: its quantity, or "sensor" for the last thickness; start: its value in the lens; unit: of the parameter, in
     that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the change that moves the
     surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them. The system aperture, of
-    surface 0, is in tenths of its number at the start.
+    surface 0, is in tenths of its number at the start. `Variables(step="blur")` takes other units.
     """
 
     kind: str
@@ -273,6 +276,8 @@ class Variables(Owned):
         constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
         "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`.
     catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT.
+    step: unit of the parameters: "sag" as of `Variable`, or "blur": the change that spreads the rays of all fields by
+        1 mm, RMS about their centroids, so that a rate of an optimiser means the same blur for all numbers of any lens.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
     `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
@@ -291,8 +296,11 @@ class Variables(Owned):
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
         catalog: Sequence[str | os.PathLike] = (),
+        step: Literal["sag", "blur"] = "sag",
     ):
         super().__init__()
+        if step not in ("sag", "blur"):
+            raise BadVariables(f"step {step!r}: expected sag or blur")
         self.catalog = tuple(catalog)
         self.lens = lens = as_lens(lens, "Variables")
         numbers, kinds = _named(lens, vary)
@@ -316,11 +324,42 @@ class Variables(Owned):
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
+        if step == "blur":
+            self._rescale()
         self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
                 f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
             )
+
+    @torch.no_grad()
+    def _rescale(self) -> None:
+        """Units of equal blur: the RMS distance from the centroid by which rays of all fields move, by differences."""
+        like = self.lens.wavelengths
+        pupil, weights = gauss_rings(*_BLUR_RAYS, dtype=like.dtype, device=like.device)
+        fields = field_points(None, like=self.lens)
+
+        def hits() -> tuple[Tensor, Tensor]:
+            rays = image_rays(self(), pupil, fields=fields)
+            return rays.position[:2], rays.valid
+
+        scaled = {}
+        for variable in self.variables:
+            parameter, ends = self.get_parameter(variable.name), []
+            for shift in (_DIFFERENCE, -_DIFFERENCE):
+                parameter.fill_(shift)
+                ends.append(hits())
+            parameter.zero_()
+            (above, arrives), (below, also) = ends
+            weight = weights * (arrives & also)
+            moved = (above - below) / (2 * _DIFFERENCE)
+            total = weight.sum(-1, keepdim=True)
+            about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), total)
+            blur = safe_divide((weight * about.square().sum(0)).sum(), weight.sum()).sqrt()
+            if float(blur) > _NEGLIGIBLE:
+                scaled[variable.name] = dataclasses.replace(variable, unit=variable.unit / float(blur))
+        self.variables = tuple(scaled.get(one.name, one) for one in self.variables)
+        self._all = tuple(scaled.get(one.name, one) for one in self._all)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
