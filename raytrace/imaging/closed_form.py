@@ -123,10 +123,12 @@ class Course:
     no_optimum: str
 
 
-def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> Course:
+def optimise_closed_form(
+    camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None, steps: int | None = None
+) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
-    By L-BFGS-B with exact gradients (scipy).
+    By L-BFGS-B with exact gradients (scipy). steps: at most so many iterations, by default until it has settled.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, parts = camera.variables, []
@@ -143,11 +145,17 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
 
     def descend() -> TensorDescent:
         # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-        return minimise_tensors(list(variables.parameters()), loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
+        most = {} if steps is None else {"steps": steps}
+        how = {"unit": _FIRST_STEP, "bounds": bounds, "tolerance": 1e-11, **most}
+        return minimise_tensors(list(variables.parameters()), loss, **how)
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.
-    while variables.held is not None and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]:
+    while (
+        steps is None
+        and variables.held is not None
+        and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]
+    ):
         descent = descend()
     names = tuple(variable.name for variable, at_end in zip(variables.variables, descent.at_end, strict=True) if at_end)
     names += (variables.held.by.name,) if variables.beyond() else ()
