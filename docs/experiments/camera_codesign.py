@@ -120,7 +120,12 @@ def for_spots(lens: Lens, settings: CodesignSettings) -> tuple[Lens, float]:
     """The lens of least spots at the focus distance, with the same variables and limits; processor time in s."""
     start, initial = time.process_time(), lens_at_start(lens, settings)
     length = float(rt.first_order(initial).effective_focal_length)
-    kinds = {"hold": f"efl={length!r}", "bounds": "thickness:1..15 sensor:60..90", "cycles": 40, "seconds": 20}
+    kinds = {
+        "hold": f"efl={length!r}",
+        "bounds": "thickness:1..15 thickness_6:4..15 sensor:60..90",
+        "cycles": 40,
+        "seconds": 20,
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         optimised = rt.optimize(initial, merit="spot", vary=settings.vary, **kinds).lens
