@@ -27,7 +27,9 @@ from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene, trace_scene
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
-_RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
+#: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
+#: 2/(π² R) of its light farther away than R λN (Born & Wolf, Principles of Optics, §8.5.2).
+_RINGS = 6.0, 40.0
 _LARGEST = 401  # pixels of a window
 _TOGETHER = 48  # fields of a call of `psf`
 _DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
@@ -230,16 +232,27 @@ def _point(kernels: Tensor) -> Tensor:
 
 
 def window_size(
-    lens: Lens, sensor: Sensor, model: str, points: Tensor, object_distances: Tensor, *, lateral_colour: bool = True
+    lens: Lens,
+    sensor: Sensor,
+    model: str,
+    points: Tensor,
+    object_distances: Tensor,
+    *,
+    lateral_colour: bool = True,
+    tol: float = math.inf,
 ) -> int:
-    """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge."""
+    """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge.
+
+    tol: share of the light of diffraction that may lie outside.
+    """
     with torch.no_grad():
         fields = sensor.fields(lens, points)
         fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
         how = {"tails": model != "drt", "lateral_colour": lateral_colour}
         reach = max(_reach(lens, sensor, fields, distance, **how) for distance in object_distances.split(1))
         if MODELS[model].waves:
-            reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
+            rings = min(max(2 / (math.pi**2 * tol), _RINGS[0]), _RINGS[1])
+            reach = reach + rings * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
     size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
     if size > _LARGEST:
         raise WindowTooLarge(

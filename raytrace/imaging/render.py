@@ -178,7 +178,7 @@ def optics(
     distances = distances[nearer]
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
     corners = _places(sensor, 5, 5, like)
-    chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour)
+    chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour, tol=tol)
     if order is None:
         order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol)
     kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
