@@ -37,11 +37,14 @@ from raytrace.imaging.image import digitise as digitise
 from raytrace.imaging.image import transfer_functions as transfer_functions
 from raytrace.imaging.network import UNet as UNet
 from raytrace.imaging.render import render as render
+from raytrace.imaging.restoration import cross_spectrum as cross_spectrum
 from raytrace.imaging.restoration import depth_invariant_wiener as depth_invariant_wiener
+from raytrace.imaging.restoration import joint_wiener as joint_wiener
 from raytrace.imaging.restoration import power_law as power_law
 from raytrace.imaging.restoration import power_spectrum as power_spectrum
 from raytrace.imaging.restoration import psnr as psnr
 from raytrace.imaging.restoration import restore as restore
+from raytrace.imaging.restoration import restore_jointly as restore_jointly
 from raytrace.imaging.restoration import wiener as wiener
 from raytrace.imaging.sensor import Sensor as Sensor
 from raytrace.imaging.training import Run as Run

@@ -66,7 +66,7 @@ def test_a_decoder_layer_is_the_deconvolution_that_holds_its_weights():
 
 @pytest.mark.parametrize(
     ("network", "steps"),
-    [(RedNet(RedNetShape(6, 16)), 30), (RedNet(RedNetShape(6, 16), channels=3), 60), (UNet(width=8, channels=3), 30)],
+    [(RedNet(RedNetShape(6, 16)), 30), (RedNet(RedNetShape(6, 16), channels=3), 60), (UNet(width=8, channels=3), 60)],
 )
 def test_it_learns_to_remove_noise(network, steps):
     """A few steps on one noisy picture reduce its error by a fifth."""

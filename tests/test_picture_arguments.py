@@ -28,13 +28,16 @@ TAKEN = {
     "count_electrons": lambda x: rt.count_electrons(x, 100, generator=generator(0)),
     "digitise": lambda x: rt.digitise(x, 4),
     "power_spectrum": rt.power_spectrum,
+    "cross_spectrum": lambda x: rt.cross_spectrum(x[None]).real,
     "restore": lambda x: rt.restore(x, FILTER),
+    "restore_jointly": lambda x: rt.restore_jointly(x, FILTER.expand(2, 2, 24, 24)),
     "mean_square_error": lambda x: mean_square_error(x, x.flip(0)),
     "Camera.image": lambda x: camera().image(x, torch.tensor([10e3, 20e3])),
     "Camera.forward": lambda x: camera()(x, torch.tensor([10e3, 20e3]), generator=generator(0)),
     "Camera.restore": lambda x: camera().restore(x),
     "Camera.target": lambda x: camera().target(x),
     "RedNet": lambda x: rt.RedNet()(x[:, None]),
+    "UNet": lambda x: rt.UNet()(x[:, None]),
 }
 
 
@@ -53,7 +56,7 @@ def test_integers_are_read_as_0_to_1(name):
 @pytest.mark.parametrize("name", TAKEN)
 def test_double_precision_is_kept(name):
     """Of floating-point pictures; the network keeps its own."""
-    if name != "RedNet":  # which is a torch module in the precision of its weights
+    if name not in ("RedNet", "UNet"):  # which are torch modules in the precision of its weights
         assert TAKEN[name](GREY.double() / 255).dtype == torch.float64
     assert TAKEN[name](GREY.float() / 255).dtype == torch.float32
 

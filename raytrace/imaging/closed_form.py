@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, crop
-from raytrace.imaging.restoration import kernel_error, power_spectrum
+from raytrace.imaging.render import decoded
+from raytrace.imaging.restoration import depth_invariant_wiener, kernel_error, power_spectrum
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
@@ -33,23 +35,54 @@ _RINGS = 12  # of the pupil, for focus
 def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int = 0) -> Tensor:
     """S (size, size) of patches of pictures, ordered as by `fft2`: its mean is the mean square of a pixel.
 
-    A Hann window suppresses the borders of patches, which would look like texture.
+    A Hann window suppresses the borders of patches, which would look like texture. Of colour pictures (3, size, size),
+    of their light.
     """
-    total = torch.zeros(size, size, dtype=torch.float64)
+    total = 0.0
     count = crops * len(pictures)
     for sample in range(count):
         patch = torch.as_tensor(crop(pictures, sample, epoch=0, size=size, crops=crops, seed=seed)).to(torch.float64)
-        total += power_spectrum(patch[None])
+        patch = decoded(patch.movedim(-1, 0)) if patch.dim() == 3 else patch
+        total = total + power_spectrum(patch[None])
     return total / count
 
 
 def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
 
-    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens.
+    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. With a sensor the
+    mean over its channels and the camera's field points, each with a filter of its own.
     """
+    if camera.sensor is not None:
+        kernels = camera.kernels_over_field(distances)
+        return kernel_error(kernels, spectrum.to(kernels.dtype), noise_deviation(camera, spectrum)).mean()
     kernels = [camera.kernels(distances, field) for field in range(camera.fields.shape[1])]
     return kernel_error(torch.cat(kernels), spectrum.to(kernels[0].dtype), camera.noise)
+
+
+def noise_deviation(camera: Camera, spectrum: Tensor) -> float | Tensor:
+    """Standard deviation of the noise of a pixel of mean level, of every channel (C, 1, 1) with a sensor."""
+    if camera.sensor is None:
+        return camera.noise
+    rows, columns = spectrum.shape[-2:]
+    mean = (spectrum[..., 0, 0] / (rows * columns)).sqrt()
+    well, read = camera.sensor.full_well, camera.sensor.read_noise
+    variance = torch.full_like(mean, read**2) if well is None else mean / well + (read / well) ** 2
+    return variance.sqrt()[..., None, None]
+
+
+@torch.no_grad()
+def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], distances: Tensor | None = None) -> Tensor:
+    """Depth-invariant Wiener filters (N, C, rows, columns) of a sensor's channels at places on its diagonal.
+
+    places: (N,) shares of the way from the middle of the sensor to its corner; distances: (Z,) mm, by default evenly
+    over the camera's range; spectrum: (C, rows, columns) of the scene.
+    """
+    distances = even_distances(camera) if distances is None else distances
+    points = camera.sensor.corners[:, :1] * camera.sensor.corners.new_tensor(places)
+    kernels = camera.kernels_over_field(distances, points)
+    transfer = transfer_functions(kernels, tuple(spectrum.shape[-2:]))
+    return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), noise_deviation(camera, spectrum))
 
 
 def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:

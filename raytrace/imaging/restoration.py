@@ -7,15 +7,21 @@ An image x is blurred by one of the kernels h_z; the sensor adds white noise n o
 S is the power spectrum of the images, ordered as by `fft2`; its mean is the mean square of a pixel. Transfer functions
 (Z, ..., rows, columns) have the kernels to be averaged over (depths) on the first axis, then colours or fields, each
 with its own filter (..., rows, columns). S and σ broadcast against (..., rows, columns).
+
+Joint filters restore all channels of an image from all recorded channels: S and G are then matrices (..., C, C, rows,
+columns), and H is diagonal: every channel has a kernel of its own. With cross spectra S_cd = E[X_c X_d*] that vanish
+for c ≠ d they are the filters of each channel alone. (Hunt and Kübler, IEEE Trans. ASSP 32, 1984; Galatsanos and Chin,
+IEEE Trans. ASSP 37, 1989.)
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.imaging.image import EXTENSIONS, as_picture, check_axes, check_fit, extend
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import safe_divide, safe_sqrt
 
 
 def wiener(transfer: Tensor, noise_to_signal: Tensor | float) -> Tensor:
@@ -92,19 +98,212 @@ def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Te
     Images and kernels are real, so that S and |H| are equal at f and -f; the position of the kernels' centre is
     irrelevant as long as it is the same for all Z.
     """
+    transfer, weight = _half_transfer(kernels, spectrum)
+    density = depth_invariant_density(transfer, spectrum[..., : len(weight)], sigma)
+    return (weight * density).mean((-2, -1))
+
+
+def _half_transfer(kernels: Tensor, spectrum: Tensor) -> tuple[Tensor, Tensor]:
+    """Transfer functions (..., rows, half) as by `rfft2`, and weights (half,) of columns, whose mean is 1."""
     rows, columns = spectrum.shape[-2:]
     check_fit(kernels.shape[-2:], (rows, columns))
     half = columns // 2 + 1
     place = torch.arange(half, device=spectrum.device)
     # Every column counts for its mirror image too, except 0 and the Nyquist frequency.
-    weight = torch.where((place == 0) | (2 * place == columns), 1.0, 2.0).to(spectrum.dtype) * (half / columns)
-    transfer = torch.fft.rfft2(kernels, s=(rows, columns))
-    return (weight * depth_invariant_density(transfer, spectrum[..., :half], sigma)).mean((-2, -1))
+    weight = torch.where((place == 0) | (2 * place == columns), 1.0, 2.0).to(spectrum.real.dtype) * (half / columns)
+    return torch.fft.rfft2(kernels, s=(rows, columns)), weight
 
 
 def errors_knowing(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
     """Mean square error (Z, ...) if the transfer function is known: the minimum over linear filters."""
     return depth_invariant_error(transfer[None], spectrum, sigma)
+
+
+# -- joint filters of several channels
+
+
+def joint_wiener(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """The joint, depth-invariant Wiener filter (..., C, C, rows, columns): restored by recorded channel.
+
+        G = S ⟨H⟩ᴴ (⟨H S Hᴴ⟩ + σ²)⁻¹,   matrices of C × C at every frequency, ⟨·⟩ the mean over the first axis
+
+    transfer: (Z, ..., C, rows, columns), the diagonals of H; spectrum: `cross_spectrum` (..., C, C, rows, columns); σ:
+    of each channel, broadcast against (..., C, rows, columns). Spectra of full correlation and σ = 0 are allowed.
+    Raises ValueError for a spectrum of other channels.
+    """
+    _check_channels(transfer, spectrum)
+    G = torch.zeros_like(spectrum, dtype=torch.promote_types(spectrum.dtype, transfer.dtype))
+    for gain, row, combination in _joint_steps(transfer, spectrum, sigma)[1]:
+        predicted = (row[..., :, None, :, :] * G).sum(-4)
+        G = G + gain[..., :, None, :, :] * (combination - predicted)[..., None, :, :, :]
+    return G
+
+
+def joint_errors(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float, *, filter: Tensor | None = None) -> Tensor:
+    """Mean square error (Z, ..., C) of each channel, for each transfer function; filter: `joint_wiener` by default.
+
+    e_z = diag[(G H_z - 1) S (G H_z - 1)ᴴ + σ² G Gᴴ], arguments as for `joint_wiener`.
+    """
+    _check_channels(transfer, spectrum)
+    G = joint_wiener(transfer, spectrum, sigma) if filter is None else filter
+    channels = torch.eye(spectrum.shape[-3], dtype=G.dtype, device=G.device)[:, :, None, None]
+    left = G * transfer[..., None, :, :, :] - channels
+    noise = (_square(G) * _noise(transfer, sigma)[..., None, :, :, :]).sum(-3)
+    remaining = sum(_square((left * column[..., None, :, :, :]).sum(-3)) for column in _cholesky(spectrum))
+    return (remaining + noise).mean((-2, -1))
+
+
+def joint_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """Mean of `joint_errors` over the transfer functions (..., C), in a form that keeps the precision of small errors.
+
+    E = S - S ⟨H⟩ᴴ (⟨H S Hᴴ⟩ + σ²)⁻¹ ⟨H⟩ S, of which these are the diagonal elements.
+    """
+    return joint_density(transfer, spectrum, sigma).mean((-2, -1))
+
+
+def joint_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """Diagonals of E (..., C, frequencies), whose means over all frequencies are `joint_error`."""
+    return sum(_square(column) for column in _joint_steps(transfer, spectrum, sigma)[0])
+
+
+def joint_kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """`joint_error` (..., C) of kernels (Z, ..., C, h, w), from half of the frequencies, as `kernel_error`.
+
+    Kernels of all channels must have a common centre: lateral colour shifts them.
+    """
+    _check_channels(kernels, spectrum)
+    transfer, weight = _half_transfer(kernels, spectrum)
+    return (weight * joint_density(transfer, spectrum[..., : len(weight)], sigma)).mean((-2, -1))
+
+
+def _joint_steps(
+    transfer: Tensor, spectrum: Tensor, sigma: Tensor | float
+) -> tuple[list[Tensor], list[tuple[Tensor, Tensor, Tensor]]]:
+    """Columns L (..., C, frequencies) of a root of E = L Lᴴ, and the steps that lead to it.
+
+    Recorded channels are measurements y = ⟨H⟩ X + n, of which n, noise and the spread of H, has the covariance D. In
+    turn each one, less its part that is correlated with the noise of those before, updates the estimate of X and its
+    covariance. A step: gain (..., C, frequencies), the measurement's row of ⟨H⟩, and its combination of channels.
+
+    The root, S = L Lᴴ at the start, is updated by Carlson's formula (AIAA J. 11, 1973), of a measurement a X + n, n of
+    variance δ, and g = a L:
+
+        d_k = δ + Σ_(i≤k) |g_i|²,   L_k ← L_k √(d_(k-1)/d_k) - g_k Σ_(i<k) L_i g_i* / √(d_(k-1) d_k)
+
+    It needs no inverse of S or D, and squares no small difference.
+    """
+    _check_channels(transfer, spectrum)
+    count = transfer.shape[-3]
+    mean = transfer.mean(0)
+    identity = torch.eye(count, dtype=mean.dtype, device=mean.device)[:, :, None, None]
+    spread = transfer - mean
+    D = spectrum * (spread[..., :, None, :, :] * spread[..., None, :, :, :].conj()).mean(0)
+    D = D + _noise(transfer, sigma)[..., None, :, :] * identity
+    rows, combinations = mean[..., :, None, :, :] * identity, identity.expand(D.shape)
+    scale, root, steps = _diagonal(D), _cholesky(spectrum), []
+    for i in range(count):
+        row, variance = rows[..., i, :, :, :], _pivot(D, i, scale)
+        before, total, shift = safe_sqrt(variance), variance, torch.zeros_like(row)
+        updated = []
+        for column in root:
+            g = (row * column).sum(-3)
+            total = total + _square(g)
+            after = safe_sqrt(total)
+            kept = torch.where(after > 0, safe_divide(before, after), 1.0)
+            moved = safe_divide(g, before * after)
+            updated.append(column * kept[..., None, :, :] - shift * moved[..., None, :, :])
+            shift, before = shift + column * g.conj()[..., None, :, :], after
+        steps.append((safe_divide(shift, total[..., None, :, :]), row, combinations[..., i, :, :, :]))
+        root = updated
+        if len(transfer) > 1:  # otherwise D is diagonal
+            later = (torch.arange(count, device=D.device) > i)[:, None, None]
+            factor = torch.where(later, safe_divide(D[..., :, i, :, :], variance[..., None, :, :]), 0.0)
+            D, rows, combinations = (
+                matrix - factor[..., :, None, :, :] * matrix[..., i, None, :, :, :]
+                for matrix in (D, rows, combinations)
+            )
+    return root, steps
+
+
+def _check_channels(transfer: Tensor, spectrum: Tensor) -> None:
+    """Raise ValueError unless a cross spectrum has the channels of transfer functions or kernels."""
+    count = transfer.shape[-3] if transfer.dim() > 3 else 0
+    if not count or spectrum.dim() < 4 or spectrum.shape[-4:-2] != (count, count):
+        raise ValueError(
+            f"a cross spectrum of shape {tuple(spectrum.shape)} and transfer functions or kernels of shape "
+            f"{tuple(transfer.shape)}: expected (..., C, C, rows, columns), as of `cross_spectrum`, and (Z, ..., C, "
+            "rows, columns)"
+        )
+
+
+def _noise(transfer: Tensor, sigma: Tensor | float) -> Tensor:
+    """σ² (..., C, rows, columns)."""
+    return torch.zeros_like(transfer[0].real) + sigma**2
+
+
+def _cholesky(matrix: Tensor) -> list[Tensor]:
+    """Columns L (..., C, frequencies) of matrices (..., C, C, frequencies) = L Lᴴ, lower triangular; 0 for singular
+    parts.
+
+    `torch.linalg.cholesky` refuses singular matrices, and wants frequencies first.
+    """
+    count, scale, columns = matrix.shape[-3], _diagonal(matrix), []
+    for k in range(count):
+        lower = (torch.arange(count, device=matrix.device) >= k)[:, None, None]
+        side = safe_sqrt(_pivot(matrix, k, scale))
+        column = torch.where(lower, safe_divide(matrix[..., :, k, :, :], side[..., None, :, :]), 0.0)
+        matrix = matrix - column[..., :, None, :, :] * column[..., None, :, :, :].conj()
+        columns.append(column)
+    return columns
+
+
+def _diagonal(matrix: Tensor) -> Tensor:
+    """Diagonals (..., C, frequencies) of Hermitian matrices (..., C, C, frequencies)."""
+    return matrix.real.diagonal(dim1=-4, dim2=-3).movedim(-1, -3).detach()
+
+
+def _pivot(matrix: Tensor, k: int, scale: Tensor) -> Tensor:
+    """The pivot k (..., frequencies) of what elimination leaves; 0 where it is the rounding of the diagonal."""
+    pivot = matrix[..., k, k, :, :].real
+    return torch.where(pivot > 8 * torch.finfo(pivot.dtype).eps * scale[..., k, :, :], pivot, 0.0)
+
+
+def restore_jointly(image: Tensor, filter: Tensor, *, boundary: str = "circular") -> Tensor:
+    """Images (..., C, H, W) filtered by joint filters (..., C, C, rows, columns), restored by recorded channel.
+
+    Size and boundary as for `restore`. Raises ValueError for a filter of other channels.
+    """
+    image = as_picture(image, "image")
+    if image.dim() < 3 or filter.dim() < 4 or filter.shape[-4:-2] != (image.shape[-3],) * 2:
+        raise ValueError(
+            f"an image of shape {tuple(image.shape)} and a filter of shape {tuple(filter.shape)}: expected an image "
+            "(..., C, H, W) and a filter (..., C, C, rows, columns), as `joint_wiener` gives it"
+        )
+    return _filtered(image, lambda spectrum: (filter * spectrum[..., None, :, :, :]).sum(-3), filter.shape, boundary)
+
+
+def cross_spectrum(pictures: Tensor, *, window: str = "hann") -> Tensor:
+    """S (..., C, C, rows, columns) of images (B, ..., C, rows, columns): the mean of X_c X_d*/(rows·columns) over B.
+
+    The diagonal is `power_spectrum` of every channel, with the same windows. S_cd/√(S_cc S_dd) is the correlation of
+    channels at every frequency, of modulus 1 if B is 1. Raises ValueError for images without the axes B and C.
+    """
+    pictures = as_picture(pictures, "set of pictures")
+    if pictures.dim() < 4:
+        raise ValueError(
+            f"pictures of shape {tuple(pictures.shape)}: expected (B, ..., channels, rows, columns); add an axis by "
+            "picture[None]"
+        )
+    X, mean = _fluctuations(pictures, window)
+    return (_products(X) + _constants(_products(mean), X)).mean(0)
+
+
+def _products(channels: Tensor) -> Tensor:
+    """x_c x_d* (..., C, C, rows, columns)."""
+    return channels[..., :, None, :, :] * channels[..., None, :, :, :].conj()
+
+
+# -- images
 
 
 def restore(image: Tensor, filter: Tensor, *, boundary: str = "circular") -> Tensor:
@@ -115,15 +314,20 @@ def restore(image: Tensor, filter: Tensor, *, boundary: str = "circular") -> Ten
     """
     image = as_picture(image, "image")
     check_axes(image=image, filter=filter)
-    size, shape = image.shape[-2:], filter.shape[-2:]
+    return _filtered(image, lambda spectrum: filter * spectrum, filter.shape, boundary)
+
+
+def _filtered(image: Tensor, filter: Callable[[Tensor], Tensor], shape: Sequence[int], boundary: str) -> Tensor:
+    """Images (..., H, W) whose spectrum is filtered, extended to the last two numbers of a shape."""
+    size, shape = image.shape[-2:], tuple(shape[-2:])
     if boundary in EXTENSIONS:
-        image = extend(image, (shape[0], shape[1]), boundary=boundary)
+        image = extend(image, shape, boundary=boundary)
     elif boundary != "circular" or size != shape:
         raise ValueError(
             f"boundary {boundary!r}, an image of {size[0]} × {size[1]} pixels, a filter of {shape[0]} × {shape[1]}: "
             f"expected equal sizes for 'circular', or {', '.join(EXTENSIONS)} and a larger filter"
         )
-    return torch.fft.ifft2(torch.fft.fft2(image) * filter).real[..., : size[0], : size[1]]
+    return torch.fft.ifft2(filter(torch.fft.fft2(image))).real[..., : size[0], : size[1]]
 
 
 def power_spectrum(pictures: Tensor, *, window: str = "hann") -> Tensor:
@@ -137,6 +341,12 @@ def power_spectrum(pictures: Tensor, *, window: str = "hann") -> Tensor:
         raise ValueError(
             f"pictures of shape {tuple(pictures.shape)}: expected (B, ..., rows, columns); add an axis by picture[None]"
         )
+    X, mean = _fluctuations(pictures, window)
+    return (_square(X) + _constants(mean**2, X)).mean(0)
+
+
+def _fluctuations(pictures: Tensor, window: str) -> tuple[Tensor, Tensor]:
+    """Spectra X/√(rows·columns) of images (..., rows, columns) about their means, windowed, and the means."""
     if window not in ("hann", "none"):
         raise ValueError(f"window {window!r}: expected hann, none")
     rows, columns = pictures.shape[-2:]
@@ -146,10 +356,13 @@ def power_spectrum(pictures: Tensor, *, window: str = "hann") -> Tensor:
         lines = [torch.hann_window(n, dtype=pictures.dtype, device=pictures.device) for n in (rows, columns)]
         fade = lines[0][:, None] * lines[1]
         centred = centred * (fade / fade.square().mean().sqrt())
-    power = _square(torch.fft.fft2(centred)) / (rows * columns)
-    constant = torch.zeros_like(power)
-    constant[..., 0, 0] = mean[..., 0, 0] ** 2 * (rows * columns)
-    return (power + constant).mean(0)
+    return torch.fft.fft2(centred, norm="ortho"), mean
+
+
+def _constants(square: Tensor, like: Tensor) -> Tensor:
+    """The power (..., rows, columns) of constant images of a mean square (..., 1, 1)."""
+    rows, columns = like.shape[-2:]
+    return torch.nn.functional.pad(square * (rows * columns), (0, columns - 1, 0, rows - 1))
 
 
 def power_law(
