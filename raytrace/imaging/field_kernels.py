@@ -368,7 +368,8 @@ def window_size(
 ) -> int:
     """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge.
 
-    tol: share of the light of diffraction that may lie outside. Of elements: a window 1.5 times as large holds at most 1 % more; without a lens at most 401 pixels.
+    tol: share of the light of diffraction that may lie outside. Of elements: a window 1.5 times as large holds at most
+    1 % more; without a lens at most 401 pixels.
     """
     if elements and is_stop_alone(lens):
         return _window_of_elements(lens, sensor, model, points, object_distances, _SMALLEST, elements)
