@@ -278,6 +278,8 @@ def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tenso
     bright as its exit pupil is large, whatever the aberrations. v: the fixed point of v + E - A v, A the blur, from E
     on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
     """
+    if illumination is None and kernels.shape[:2] == (1, 1):
+        return kernels.new_ones(*kernels.shape[2:4], 1, 1)
     columns, rows = sensor.pixels
     factor = max(1, 2 * math.ceil(max(rows, columns) / _COARSE / 2) - 1)
     coarse = _pooled(kernels, factor)
