@@ -307,14 +307,18 @@ def write_csv(path: Path, rows: list[dict]) -> None:
         writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lens")
     parser.add_argument("--data", required=True, help="folder of pictures")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the tables and the figure")
     parser.add_argument("--seeds", type=int, default=5)
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     prepare()
