@@ -38,7 +38,9 @@ class CodesignSettings(Settings):
     sensor: width and height; () for a grey camera of field points. Pictures of a sensor have the channels of its
     response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
     `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
-    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; glass_thickness,
+    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step:
+    unit of the variables, "sag" or "blur"; relearn: epochs of step 1 again with the nearest glasses of the catalogs, in
+    place of model glasses that vary; filters: of the closed form, "separate" or "joint", of colours; glass_thickness,
     air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far, spread: range and
     distribution of object distances; fields: points in y, one after the other for successive samples; pixel, size:
     window of the PSF; network: "red-net" or "u-net"; depth, width: its layers, or poolings, and maps; rays, drt_rays,
@@ -56,6 +58,9 @@ class CodesignSettings(Settings):
     air_thickness: str = ""
     edge: float | None = None
     hold: str = ""
+    step: str = "sag"
+    relearn: int = 0
+    filters: str = "separate"
     start: str = "paraxial"
     focus_distance: float = 25e3
     f_number: float | None = None

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -22,9 +23,12 @@ from raytrace.imaging.codesign import (
     camera,
     held_out_error,
     light_of,
+    optimise,
     outcome,
     run_model,
+    spectrum_of,
     steps_per_epoch,
+    with_catalog_glasses,
 )
 from raytrace.imaging.image import blur, transfer_functions
 from raytrace.imaging.pictures import dead_leaves, split
@@ -32,6 +36,7 @@ from raytrace.imaging.render import decoded, linearised, render_patches
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import OtherLens
+from raytrace.optimization.variables import VariedGlass
 from raytrace.settings import CodesignSettings
 from raytrace.shards import Share
 
@@ -138,10 +143,11 @@ def test_a_mosaic_is_that_of_the_place(triplet):
     assert not torch.equal(recorded[0], sensor.demosaic(sensor.sample(image[0])[None], (1, 0))[0])
 
 
-@pytest.mark.parametrize("model", ["gaussian", "drt"])
+@pytest.mark.parametrize("model", ["gaussian", pytest.param("drt", marks=pytest.mark.slow)])
 def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     """Curvatures, spaces and sensor through PSFs, noise and a network, float64."""
     one = made(triplet, "sensor thickness:2 curvature:1,6", model=model, tol=1e-4)
+    torch.manual_seed(0)
     one.network = torch.nn.Conv2d(3, 3, 3, padding=1).double()
     picture, distances, points, index = samples(3)
     one.plan()
@@ -250,6 +256,56 @@ def test_the_closed_form_is_over_fields_colours_and_distances(triplet, pictures)
     assert float(error) == pytest.approx(sum(single) / len(single), rel=1e-9)
 
 
+def test_joint_filters_leave_less_error_of_correlated_colours(triplet, pictures):
+    """Dead leaves of a correlation of 0.9: the joint filter is better, and equal where the spectra are diagonal."""
+    one = camera(triplet, SETTINGS)
+    separate = spectrum_of(pictures[0], SETTINGS)
+    joint = spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="joint"))
+    assert joint.shape == (3, 3, 26, 26)
+    distances = even_distances(one, 3)
+    errors = [float(camera_error(one, spectrum, distances).detach()) for spectrum in (separate, joint)]
+    assert errors[1] < 0.97 * errors[0]
+    diagonal = torch.diag_embed(joint.diagonal(dim1=0, dim2=1)).movedim((-2, -1), (0, 1))
+    assert float(camera_error(one, diagonal, distances).detach()) == pytest.approx(errors[0], rel=1e-9)
+    slope = torch.autograd.grad(camera_error(one, joint, distances), one.variables.sensor)[0]
+    values = []
+    for shift in (1e-3, -1e-3):
+        with torch.no_grad():
+            one.variables.sensor += shift
+        values.append(float(camera_error(one, joint, distances).detach()))
+        with torch.no_grad():
+            one.variables.sensor -= shift
+    assert float(slope) == pytest.approx((values[0] - values[1]) / 2e-3, rel=1e-3)
+    filters = field_filters(one, joint, (0.0, 1.0), distances)
+    assert filters.shape == (2, 3, 3, 26, 26)
+    assert 0 < held_out_error(one, pictures[1], SETTINGS, place=1.0, filters=filters[1]) < 0.3
+    with pytest.raises(ValueError, match="joint filters are those of the colours of a sensor"):
+        spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="joint", sensor=()))
+    with pytest.raises(ValueError, match="filters 'both': expected separate or joint"):
+        spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="both"))
+
+
+def test_glasses_that_vary_snap_to_the_catalog_and_the_rest_is_learned_again(triplet, pictures):
+    """The camera of step 1 with catalog glasses: its other variables go on, its network goes with it."""
+    settings = dataclasses.replace(
+        SETTINGS, vary="index:1,3 abbe_number:1,3 sensor curvature:1,6", hold="efl catalog", relearn=1
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VariedGlass)
+        one = camera(triplet, settings)
+    with torch.no_grad():
+        one.variables.index_1.add_(1.0)
+        one.variables.curvature_1.add_(0.01)
+        [*one.network.parameters()][-1].fill_(0.5)
+    other, again = with_catalog_glasses(one, settings)
+    assert (again.vary, again.hold, again.epochs) == ("sensor curvature:1,6", "efl", 1)
+    glasses = [other.variables().surfaces[k].glass for k in (1, 3)]
+    assert all(glass.catalog for glass in glasses)
+    assert glasses[0].name != triplet.surfaces[1].glass.name
+    assert other.variables.numbers()["sensor"] == pytest.approx(one.variables.numbers()["sensor"], abs=1e-12)
+    assert torch.equal([*other.network.parameters()][-1], [*one.network.parameters()][-1])
+
+
 def test_filters_of_places_are_wiener_filters_of_their_kernels(triplet, pictures):
     one = camera(triplet, SETTINGS)
     spectrum, distances = patch_spectrum(pictures[0], 26, crops=1), even_distances(one, 3)
@@ -281,6 +337,25 @@ def test_losses_of_shares_add_up_and_samples_have_places(triplet, pictures):
     assert steps_per_epoch(pictures[0], settings) == 2
 
 
+def test_step_1_in_colour_resumes_bit_identically(triplet, pictures, tmp_path):
+    """Stopped after three steps and resumed: variables, network and log of a run that was never stopped."""
+
+    def run(folder, stop=None):
+        one = camera(triplet, SETTINGS)
+        one.plan()
+        for count, _ in enumerate(optimise(one, pictures[0], SETTINGS, Run(tmp_path / folder, {}), every=1), 1):
+            if count == stop:
+                return None
+        return one.state_dict()
+
+    run("parts", 3)
+    parts, whole = run("parts"), run("whole")
+    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    logs = [(tmp_path / folder / "log.csv").read_bytes() for folder in ("whole", "parts")]
+    assert logs[0] == logs[1]
+
+
+@pytest.mark.slow
 def test_a_run_in_colour_resumes_bit_identically_and_reports_places(triplet, pictures, tmp_path):
     def run(folder, stop=None):
         data = triplet, *pictures, SETTINGS, tmp_path / folder

@@ -51,6 +51,20 @@ ROWS = {
         "NAME=VALUE",
         nargs="+",
     ),
+    "step": option(
+        "unit of the variables, of which --rate-optics is a part in mm: sag at the edge (default), or blur, the RMS "
+        "spread of the rays of all fields: the same for every number of any lens",
+        choices=("sag", "blur"),
+    ),
+    "relearn": option(
+        "epochs of step 1 again, with the nearest catalog glasses in place of varied ones (index:1 abbe_number:1)",
+        type=count,
+    ),
+    "filters": option(
+        "of the closed form and of the comparison: a Wiener filter of each colour (separate, default), or one of all "
+        "colours (joint)",
+        choices=("separate", "joint"),
+    ),
     "glass_thickness": option(
         "centre thickness of elements: minimum, or minimum and maximum (default 1/50 of the largest diameter)",
         "MIN[:MAX]",
@@ -194,6 +208,7 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
         "folder of the same name without suffix",
         type=folder_or_lens,
     )(parser)
+    parser.add_argument("--device", metavar="NAME", default="cpu", help="of the training, cpu or cuda (default cpu)")
     parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
     defaults = defaults_of(CodesignSettings)
     group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")

@@ -16,7 +16,6 @@ from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.files import write_json
-from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.codesign import (
     LENS,
     STEPS,
@@ -29,6 +28,7 @@ from raytrace.imaging.codesign import (
     outcome,
     run_model,
     sensor_at_start,
+    spectrum_of,
     steps_per_epoch,
     variables,
 )
@@ -62,6 +62,7 @@ class Experiment:
     about: dict[str, str]
     kind: str
     catalogs: tuple[Path, ...] = ()
+    device: str = "cpu"
 
     @property
     def steps_per_epoch(self) -> int:
@@ -70,8 +71,7 @@ class Experiment:
 
     def spectrum(self) -> Tensor:
         """Power spectrum of the training pictures, at the size of a patch with its margin."""
-        size = self.settings.patch + self.settings.size - 1
-        return patch_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
+        return spectrum_of(self.train, self.settings)
 
 
 def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:
@@ -100,7 +100,7 @@ def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
         "pictures": digest(samples.samples),
     }
-    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments))
+    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments), arguments.device)
 
 
 def _leaves(count: int, size: int, colour: bool) -> Pictures:
@@ -208,7 +208,7 @@ def focus_of(lens: Lens, settings: CodesignSettings) -> Callable[[float], float]
 def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, label: str) -> Outcome:
     """Train both steps of a run, or their remaining epochs, with a bar and a line for every epoch."""
     per_epoch, focus = experiment.steps_per_epoch, focus_of(experiment.lens, settings)
-    length, losses, bar = settings.epochs * per_epoch, [], None
+    length, losses, bar = (settings.epochs + settings.relearn) * per_epoch, [], None
 
     def testing(batches: Sequence[int]) -> Iterator[int]:
         for number, first in enumerate(batches, 1):
@@ -216,16 +216,18 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
                 bar.set_postfix_str(f"testing, batch {number} of {len(batches)}")
             yield first
 
+    total = length + settings.epochs * per_epoch
     distances = np.linspace(settings.near, settings.far, _DISTANCES).tolist()
     data = (experiment.train, experiment.test, settings, folder)
     more = {"about": experiment.about, "distances": tuple(distances), "catalogs": experiment.catalogs}
+    more["device"] = experiment.device
     try:
         for name, step, record in run_model(experiment.lens, *data, **more, progress=testing):
             if bar is None:
                 done = STEPS.index(name) * length + step
                 if done:
-                    say(f"{label}: resumes after step {done} of {2 * length}")
-                bar = progress(2 * length, what=label, initial=done)
+                    say(f"{label}: resumes after step {done} of {total}")
+                bar = progress(total, what=label, initial=done)
             losses.append(record["loss"])
             words = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
             if "sensor" in record:
@@ -234,7 +236,8 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
             bar.set_postfix_str(f"{name}, loss {record['loss']:.4f}{words}", refresh=False)
             bar.update()
             if (step + 1) % per_epoch == 0:
-                epoch = f"epoch {(step + 1) // per_epoch} of {settings.epochs}"
+                epochs = settings.epochs + (settings.relearn if name == STEPS[0] else 0)
+                epoch = f"epoch {(step + 1) // per_epoch} of {epochs}"
                 bar.write(f"raytrace: {label}, {name}, {epoch}: loss {sum(losses) / len(losses):.4f}{words}")
                 losses.clear()
     finally:

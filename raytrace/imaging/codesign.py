@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from raytrace.imaging.closed_form import (
 from raytrace.imaging.network import RedNet, RedNetShape, UNet
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.render import decoded
-from raytrace.imaging.restoration import psnr, restore
+from raytrace.imaging.restoration import psnr, restore, restore_jointly
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
 from raytrace.imaging.variables import Variables
@@ -41,6 +42,7 @@ from raytrace.io import write_lens
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import grid, hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
+from raytrace.optimization.variables import GLASS
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
@@ -100,6 +102,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,
+        step=settings.step,
     )
 
 
@@ -180,6 +183,25 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     )
 
 
+def with_catalog_glasses(trained: Camera, settings: CodesignSettings) -> tuple[Camera, CodesignSettings]:
+    """The camera with the nearest glasses of the catalogs, and the settings to train it again for `relearn` epochs.
+
+    Its variables are the others, from their current numbers on; the network goes with it. Raises BadVariables where no
+    glass varies.
+    """
+    lens = trained.variables.snapped()
+    words = [word for word in settings.vary.split() if word.partition(":")[0] not in GLASS]
+    hold = " ".join(word for word in settings.hold.split() if word != "catalog")
+    sensor = float(lens.surfaces[-2].thickness)
+    again = dataclasses.replace(
+        settings, vary=" ".join(words), hold=hold, epochs=settings.relearn, start=repr(sensor), relearn=0
+    )
+    one = camera(lens, again)
+    one.network.load_state_dict(trained.network.state_dict())
+    one.plan()
+    return one, again
+
+
 def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
     """Prepare step 2: a fixed lens and its DRT PSFs, over the whole pupil or of the `drt_rays`."""
     camera.variables.requires_grad_(False)
@@ -205,6 +227,14 @@ class Batch:
     points: Tensor | None = None
     index: Tensor | None = None
     seed: int = 0
+
+    def to(self, device: torch.device) -> Self:
+        """The same on a device; index and seed remain plain numbers."""
+        if self.picture.device == device:
+            return self
+        names = ("picture", "distance", "noise", "errors", "points")
+        moved = {name: getattr(self, name).to(device) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **moved)
 
     def part(self, where: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Picture, distance, noise and errors of some samples."""
@@ -244,6 +274,17 @@ def batch(
         drawn = draw_errors(tolerances, last - first + 1, settings.seed, first=epoch * count + first)
         errors = drawn[torch.tensor(samples) - first]
     return Batch(picture, distance, noise, [sample % len(settings.fields) for sample in samples], errors)
+
+
+def spectrum_of(pictures: Pictures, settings: CodesignSettings) -> Tensor:
+    """`patch_spectrum` of the patches of an experiment with their margin; cross spectra for joint filters."""
+    if settings.filters not in ("separate", "joint"):
+        raise ValueError(f"filters {settings.filters!r}: expected separate or joint")
+    size = settings.patch + settings.size - 1
+    joint = settings.filters == "joint"
+    if joint and not settings.sensor:
+        raise ValueError("joint filters are those of the colours of a sensor: give sensor, as 24x16")
+    return patch_spectrum(pictures, size, crops=settings.crops, seed=settings.seed, joint=joint)
 
 
 def light_of(levels: Tensor) -> Tensor:
@@ -290,6 +331,7 @@ def absolute_error(camera: Camera, batch: Batch) -> Tensor:
 
 def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor]) -> list[Tensor]:
     """Σ over pixels of measures of restored - picture, each (B,); of several channels their mean."""
+    batch = batch.to(camera.fields.device)
     if camera.sensor is not None:
         where = {"points": batch.points, "index": batch.index, "seed": batch.seed}
         difference = camera(batch.picture, batch.distance, **where) - camera.target(batch.picture)
@@ -353,7 +395,7 @@ def held_out_error(
     """Mean |restored - picture| of all test samples, at random object distances or at one.
 
     place: all patches at this share of the way from the middle of the sensor to its upper left corner; filters: (C,
-    rows, columns) instead of the network; progress: wraps the batches, for a bar.
+    rows, columns), or joint ones (C, C, rows, columns), instead of the network; progress: wraps the batches, for a bar.
     """
     count, total = len(pictures) * settings.crops, 0.0
     for first in progress(range(0, count, settings.batch)):
@@ -374,7 +416,8 @@ def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
     """Σ |filtered - picture| of every sample behind linear filters (C, rows, columns), (B,)."""
     image = camera.image(batch.picture, batch.distance, points=batch.points)
     recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
-    restored = restore(recorded, filters.to(torch.complex64), boundary="taper")
+    apply = restore_jointly if filters.dim() == 4 else restore
+    restored = apply(recorded, filters.to(torch.complex64), boundary="taper")
     return (restored - camera.target(batch.picture)).abs().mean(-3).sum((-2, -1))
 
 
@@ -450,13 +493,14 @@ def run_model(
     about: dict,
     distances: tuple[float, ...],
     catalogs: Sequence[str | Path] = (),
+    device: str | torch.device = "cpu",
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
     folder: of this run, resumed if started; about: whatever else decides the result (lens file, pictures); progress:
-    wraps the batches of every test; catalogs: of glass, with which the lens was read. At the end the optimised lens is
-    written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
+    wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the training. At the
+    end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
     """
     folder = Path(folder)
 
@@ -467,16 +511,20 @@ def run_model(
     joint = run(STEPS[0])
     if (folder / "outcome.json").exists():
         return
-    trained = camera(lens, settings)
+    trained = camera(lens, settings).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
     if settings.start in ("spectral", GAUSSIAN) and not joint.checkpoint.exists():
-        size = settings.patch + settings.size - 1
-        spectrum = patch_spectrum(train_pictures, size, crops=settings.crops, seed=settings.seed)
-        course = to_closed_form(trained, settings, spectrum)
+        course = to_closed_form(trained, settings, spectrum_of(train_pictures, settings))
         if course.no_optimum:
             warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
     for step, record in optimise(trained, train_pictures, settings, joint):
         yield STEPS[0], step, record
+    if settings.relearn:
+        trained, again = with_catalog_glasses(trained, settings)
+        trained.to(device)
+        done = settings.epochs * steps_per_epoch(train_pictures, settings)
+        for step, record in optimise(trained, train_pictures, again, run("glasses")):
+            yield STEPS[0], done + step, record
     l1_joint = held_out_error(trained, test_pictures, settings, progress=progress)
     freeze_lens(trained, settings)
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
@@ -488,10 +536,7 @@ def run_model(
         built = [{str(number): error for number, error in enumerate(errors.tolist(), 1)} for errors in found]
     of_places = {}
     if trained.sensor is not None:
-        spectrum = patch_spectrum(
-            train_pictures, settings.patch + settings.size - 1, crops=settings.crops, seed=settings.seed
-        )
-        filters = field_filters(trained, spectrum, PLACES)
+        filters = field_filters(trained, spectrum_of(train_pictures, settings), PLACES)
         of_places = {
             "l1_by_place": {
                 f"{place:g}": held_out_error(trained, test_pictures, settings, place=place, progress=progress)

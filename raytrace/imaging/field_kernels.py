@@ -40,7 +40,9 @@ from raytrace.wave_optics.scene import WaveScene
 from raytrace.words import calling_level
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
-_RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
+#: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
+#: 2/(π² R) of its light farther away than R λN (Born & Wolf, Principles of Optics, §8.5.2).
+_RINGS = 6.0, 40.0
 _LARGEST = 401  # pixels of a window
 _SMALLEST = 21  # pixels of a window of elements
 _TAIL = 1e-2  # of the light that a window 1.5 times as large adds
@@ -362,10 +364,12 @@ def window_size(
     *,
     lateral_colour: bool = True,
     elements: Sequence[Element] = (),
+    tol: float = math.inf,
 ) -> int:
     """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge.
 
-    Of elements: a window 1.5 times as large holds at most 1 % more; without a lens at most 401 pixels.
+    tol: share of the light of diffraction that may lie outside. Of elements: a window 1.5 times as large holds at most
+    1 % more; without a lens at most 401 pixels.
     """
     if elements and is_stop_alone(lens):
         return _window_of_elements(lens, sensor, model, points, object_distances, _SMALLEST, elements)
@@ -375,7 +379,8 @@ def window_size(
         how = {"tails": model != "drt", "lateral_colour": lateral_colour}
         reach = max(_reach(lens, sensor, fields, distance, **how) for distance in object_distances.split(1))
         if MODELS[model].waves:
-            reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
+            rings = min(max(2 / (math.pi**2 * tol), _RINGS[0]), _RINGS[1])
+            reach = reach + rings * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
     size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
     if size > _LARGEST:
         raise WindowTooLarge(

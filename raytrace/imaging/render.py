@@ -212,7 +212,7 @@ def optics(
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
     corners = _places(sensor, 5, 5, like)
     how = {"lateral_colour": lateral_colour, "elements": elements}
-    chosen = size or window_size(lens, sensor, model, corners, distances, **how)
+    chosen = size or window_size(lens, sensor, model, corners, distances, **how, tol=tol)
     if order is None:
         order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol, elements=elements)
     kernels, haze = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how), None
