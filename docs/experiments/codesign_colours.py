@@ -452,13 +452,17 @@ def lines_of(found: dict[tuple, dict]) -> list[dict]:
     return rows
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lenses", nargs="+", choices=[*VARY])
     parser.add_argument("--data", required=True, help="folder of colour pictures")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
     parser.add_argument("--seeds", type=int, default=5)
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     prepare()
