@@ -81,6 +81,7 @@ _COLOUR = 0.4  # mm between the foci of blue and red of the second start
 _INDEX, _ABBE, _ABBES = 0.05, 15.0, (20.0, 85.0)  # changes of model glasses, and bounds
 _GAUSSIAN, _DRT = 6, 2  # orders
 _AXIAL, _SHIFTS = (0.0, 0.1, 0.2, 0.3), 0.05  # specified axial colour and steps of the sensor distance, mm
+_WIDE, _WIDE_SIZE = 96, 61  # period and kernels of specified axial colour
 
 
 def distances(scene: str, count: int) -> Tensor:
@@ -310,24 +311,23 @@ def specified(name: str, pictures: Pictures) -> list[dict]:
 
     Red, green and blue have sensor distances that differ by the axial colour; their common shift is the best one.
     """
-    measured = cross_spectrum(patches(pictures, 2 * _PERIOD, _CROPS))
+    measured = cross_spectrum(patches(pictures, _WIDE, _CROPS))
     spectra = {r: synthetic(measured, float(r)) for r in CORRELATIONS} | {"pictures": measured}
     lens = rt.focus(rt.read_lens(name).at(wavelengths=[WAVELENGTHS[1]], object_distance=24e3), fields=[0]).lens
     rows, steps = [], round(max(_AXIAL) / _SHIFTS)
-    window = grid(lens.wavelengths.new_tensor(SENSOR.pitch), 2 * _SIZE - 1)
+    window = grid(lens.wavelengths.new_tensor(SENSOR.pitch), _WIDE_SIZE)
     for scene in SCENES:
-        at, model = distances(scene, 9), model_of("drt", order=_DRT)
+        at, model = distances(scene, _TESTED), model_of("drt", order=_DRT)
         how = {"fields": [0], "object_distances": at, "normalise": "window", "grid": window, "center": "chief"}
         shifts = _SHIFTS * torch.arange(-2 * steps, 2 * steps + 1, dtype=torch.float64)
         focus = lens.surfaces[-2].thickness
         kernel = [rt.psf(lens.at(sensor_distance=focus + shift), model, **how).kernel[:, 0] for shift in shifts]
-        kernel = torch.stack(kernel)  # (shifts, Z, h, w)
         for axial in _AXIAL:
             apart = round(axial / _SHIFTS)
-            middles = range(apart, len(kernel) - apart)
+            middles = range(steps, 3 * steps + 1, 2)
             sets = [torch.stack([kernel[m - apart], kernel[m], kernel[m + apart]], 1) for m in middles]
             for spectrum, S in spectra.items():
-                for filters in ("apart", "joint"):
+                for filters in ("joint",) if axial else ("joint", "apart"):
                     errors = [float(closed_form(one, S, filters).mean()) for one in sets]
                     row = {"scene": scene, "axial_colour": axial, "spectrum": spectrum, "filters": filters}
                     rows.append({**row, "mse": min(errors)})
