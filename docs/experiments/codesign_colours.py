@@ -9,6 +9,7 @@ its own noise; differences are paired by seed. A second call resumes, and comput
 """
 
 import argparse
+import functools
 import itertools
 import math
 import time
@@ -60,15 +61,12 @@ SCENES = {"16 to 48 m": (16e3, 48e3), "24 m": (24e3, 24e3)}
 #: Places along +y of the sensor, relative to half of its diagonal.
 FIELDS = {"axis": (0.0,), "field": (0.0, 0.7, 1.0)}
 CORRELATIONS = ("0", "0.9", "0.97")
-#: Conditions of a lens, in this order: (fields, scene, criterion); synthetic spectra for the first seed alone.
+#: Groups of runs, in this order: fields, scene, criteria; synthetic spectra for the first seed alone.
 RUNS = (
-    ("axis", "16 to 48 m", "apart"),
-    ("axis", "16 to 48 m", "joint"),
-    ("field", "16 to 48 m", "apart"),
-    ("field", "16 to 48 m", "joint"),
-    *(("axis", "16 to 48 m", correlation) for correlation in CORRELATIONS),
-    ("axis", "24 m", "apart"),
-    ("axis", "24 m", "joint"),
+    ("axis", "16 to 48 m", ("apart", "joint")),
+    ("axis", "16 to 48 m", CORRELATIONS),
+    ("field", "16 to 48 m", ("apart", "joint")),
+    ("axis", "24 m", ("apart", "joint")),
 )
 BANDS = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5)  # of frequency, 1/pixel
 
@@ -142,6 +140,7 @@ def correlations(spectrum: Tensor) -> list[list[float]]:
 # -- optimisation
 
 
+@functools.cache
 def lens_of(name: str) -> Lens:
     """The lens in best focus for the middle of the range, at the wavelengths of the study; green is primary."""
     lens = rt.read_lens(name).at(
@@ -350,9 +349,7 @@ def comparisons(found: dict[tuple, dict], names: list[str]) -> list[dict]:
     """
     rows = []
     for name in names:
-        for fields, scene, criterion in RUNS:
-            if criterion in ("apart", "0"):
-                continue
+        for fields, scene, criterion in ((*group, one) for *group, criteria in RUNS for one in criteria[1:]):
             before = "apart" if criterion == "joint" else "0"
             keys = [(fields, scene, one) for one in (before, criterion)]
             seeds = sorted(seed for n, *key, seed in found if n == name and tuple(key) == keys[1])
@@ -475,10 +472,12 @@ def main(words: list[str] | None = None) -> None:
         write_json(stored, {"rows": specified("double_gauss", pictures)})
     given, found = read_json(stored)["rows"], {}
     print(table_specified(given), flush=True)
-    for of_run in RUNS:
-        for seed in range(1 if of_run[-1] in CORRELATIONS else chosen.seeds):
-            for name in chosen.lenses:
-                found[name, *of_run, seed] = run(name, *of_run, seed, pictures, chosen.folder)
+    for fields, scene, criteria in RUNS:
+        for name, seed in itertools.product(chosen.lenses, range(1 if criteria == CORRELATIONS else chosen.seeds)):
+            for criterion in criteria:
+                found[name, fields, scene, criterion, seed] = run(
+                    name, fields, scene, criterion, seed, pictures, chosen.folder
+                )
         print(table(comparisons(found, chosen.lenses)), flush=True)
     rows = comparisons(found, chosen.lenses)
     if chosen.docs:
