@@ -74,7 +74,7 @@ _DEPTHS, _TESTED = 4, 5  # of an optimisation and of its test
 _SIZE, _PERIOD = 41, 64  # pixels of a kernel and of the period of closed forms
 _PATCH, _FILTER, _MARGIN = 96, 128, 8  # pixels of a recorded patch, of the filter of its extension, and left out
 _CROPS, _TESTS = 4, 4  # of every picture of training and of test
-_EVALUATIONS, _FIRST = 40, 0.05  # of an optimisation, from two starts; length of the first step
+_FIRST = 0.05  # length of the first step of a descent, in units of the variables
 _COLOUR = 0.4  # mm between the foci of blue and red of the second start
 _INDEX, _ABBE, _ABBES = 0.05, 15.0, (20.0, 85.0)  # changes of model glasses, and bounds
 _GAUSSIAN, _DRT = 6, 2  # orders
@@ -192,7 +192,7 @@ def closed_form(kernels: Tensor, spectrum: Tensor, filters: str) -> Tensor:
     return kernel_error(kernels, spectrum.real.diagonal().movedim(-1, 0), NOISE)
 
 
-def optimised(name: str, fields: str, scene: str, loss: Callable[[Tensor], Tensor]) -> dict:
+def optimised(name: str, fields: str, scene: str, loss: Callable[[Tensor], Tensor], evaluations: int) -> dict:
     """Descend from the lens of the file and from one with axial colour, with half of the evaluations each."""
     ends = []
     for start in ("file", "colour"):
@@ -221,7 +221,7 @@ def optimised(name: str, fields: str, scene: str, loss: Callable[[Tensor], Tenso
             return value, _FIRST * slope
 
         first = np.array([float(parameter.detach()) for parameter in parameters]) / _FIRST
-        budget = _EVALUATIONS // 2
+        budget = evaluations // 2
         minimize(evaluate, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": budget, "ftol": 1e-12})
         value, x = min(course[:budget], key=lambda entry: entry[0])
         with torch.no_grad():
@@ -270,7 +270,9 @@ def restored(lens: Lens, fields: str, scene: str, spectrum: Tensor, unseen: Tens
     return found
 
 
-def run(name: str, fields: str, scene: str, criterion: str, seed: int, pictures: Pictures, folder: Path) -> dict:
+def run(
+    name: str, fields: str, scene: str, criterion: str, seed: int, pictures: Pictures, folder: Path, evaluations: int
+) -> dict:
     """A lens optimised and tested, or its stored results. criterion: "apart", "joint", or a correlation."""
     path = folder / f"{name}_{fields}_{scene.replace(' ', '_')}_{criterion}_{seed}.json"
     if path.exists():
@@ -281,7 +283,7 @@ def run(name: str, fields: str, scene: str, criterion: str, seed: int, pictures:
     controlled = criterion not in ("apart", "joint")
     spectrum = synthetic(measured, float(criterion)) if controlled else measured
     filters = criterion if criterion == "apart" else "joint"
-    end = optimised(name, fields, scene, lambda kernel: closed_form(kernel, spectrum, filters).mean())
+    end = optimised(name, fields, scene, lambda kernel: closed_form(kernel, spectrum, filters).mean(), evaluations)
     lens = rebuilt(name, end["numbers"])
     document = {**end, "axial_colour": axial_colour(lens), "seconds": time.perf_counter() - start}
     if controlled:
@@ -379,15 +381,15 @@ def table(rows: list[dict]) -> str:
     """The table of the page."""
     lines = [
         "| lens | fields | objects at | spectra | lens and filters apart, 10⁻⁴ | lens apart, joint filter | "
-        "lens and filter joint | difference of the joint lens, % | axial colour, mm: apart | joint |",
+        "lens and filter joint | difference of the joint lens, % | axial colour (modulus), mm: apart | joint |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        errors, colour = 1e4 * np.mean(row["errors"], 0), np.mean(row["colour"], 0)
+        errors, colour = 1e4 * np.mean(row["errors"], 0), np.mean(np.abs(row["colour"]), 0)
         mean, width = interval(row["difference"])
         change = f"{mean:+.1f} ± {width:.1f}" if row["seeds"] > 1 else f"{mean:+.1f}"
         words = [row["lens"], row["fields"], row["scene"], row["spectrum"], *(f"{error:.3f}" for error in errors)]
-        words += [change, *(f"{one:+.3f}" for one in colour)]
+        words += [change, *(f"{one:.2f}" for one in colour)]
         lines.append("| " + " | ".join(words) + " |")
     return "\n".join(lines)
 
@@ -455,6 +457,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--evaluations", type=int, default=40, help="of an optimisation, half of them from each start")
+    parser.add_argument("--groups", type=int, default=len(RUNS), help="the first groups of runs alone")
 
 
 def main(words: list[str] | None = None) -> None:
@@ -472,11 +476,11 @@ def main(words: list[str] | None = None) -> None:
         write_json(stored, {"rows": specified("double_gauss", pictures)})
     given, found = read_json(stored)["rows"], {}
     print(table_specified(given), flush=True)
-    for fields, scene, criteria in RUNS:
+    for fields, scene, criteria in RUNS[: chosen.groups]:
         for name, seed in itertools.product(chosen.lenses, range(1 if criteria == CORRELATIONS else chosen.seeds)):
             for criterion in criteria:
                 found[name, fields, scene, criterion, seed] = run(
-                    name, fields, scene, criterion, seed, pictures, chosen.folder
+                    name, fields, scene, criterion, seed, pictures, chosen.folder, chosen.evaluations
                 )
         print(table(comparisons(found, chosen.lenses)), flush=True)
     rows = comparisons(found, chosen.lenses)
