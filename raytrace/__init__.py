@@ -174,6 +174,7 @@ PUBLIC = {
     "UNet": "imaging.network",
     "Variables": "imaging",
     "render": "imaging.render",
+    "slanted_edge_mtf": "imaging.slanted_edge",
     "train": "imaging.training",
 }
 

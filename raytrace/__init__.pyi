@@ -47,6 +47,7 @@ from raytrace.imaging.restoration import restore as restore
 from raytrace.imaging.restoration import restore_jointly as restore_jointly
 from raytrace.imaging.restoration import wiener as wiener
 from raytrace.imaging.sensor import Sensor as Sensor
+from raytrace.imaging.slanted_edge import slanted_edge_mtf as slanted_edge_mtf
 from raytrace.imaging.training import Run as Run
 from raytrace.imaging.training import train as train
 from raytrace.io import LensFileError as LensFileError

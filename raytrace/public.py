@@ -110,7 +110,8 @@ def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
 def _reader(parameter: inspect.Parameter) -> Callable | None:
     """What reads the values of a parameter, (verb, name, value) -> value; None if they pass as they are."""
     if parameter.name == "lens":
-        return _lens
+        others = _kinds(parameter.annotation) - {Lens, str, os.PathLike, Sequence}
+        return functools.partial(_lens_or, tuple(others)) if others else _lens
     reader = _reader_of_values(parameter)
     optional = parameter.default is None or NoneType in get_args(parameter.annotation)
     if reader is None or not optional:
@@ -150,6 +151,12 @@ def _lens(verb: str, name: str, value: object) -> Lens:
     if verb not in BATCHED and value.count is not None:
         raise ValueError(f"{verb} takes one lens, not a batch of {value.count}: call it for each, `for one in lenses`")
     return value
+
+
+def _lens_or(kinds: tuple[type, ...], verb: str, name: str, value: object) -> object:
+    """A lens, or one or several values of other classes, as elements."""
+    several = value if isinstance(value, (list, tuple)) else [value]
+    return value if several and all(isinstance(one, kinds) for one in several) else _lens(verb, name, value)
 
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:

@@ -35,10 +35,16 @@ GAUSSIAN = "gaussian"
 class CodesignSettings(Settings):
     """Settings of co-design (`imaging.codesign`). Lengths in mm, wavelengths in µm, angles in degrees.
 
-    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; glass_thickness,
+    sensor: width and height; () for a grey camera of field points. Pictures of a sensor have the channels of its
+    response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
+    `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
+    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step:
+    unit of the variables, "sag" or "blur"; relearn: epochs of step 1 again with the nearest glasses of the catalogs, in
+    place of model glasses that vary; filters: of the closed form, "separate" or "joint", of colours; glass_thickness,
     air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far, spread: range and
     distribution of object distances; fields: points in y, one after the other for successive samples; pixel, size:
-    window of the PSF; depth, width: of the network; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
+    window of the PSF; network: "red-net" or "u-net"; depth, width: its layers, or poolings, and maps; rays, drt_rays,
+    sampling: fixed pupil points instead of `tol`.
     as_built: training draws a perturbed lens for each sample; grade, limits: its tolerances, by default those of the
     file; refocus: "sensor", or "none"; cameras: perturbed ones of the test; center: of the PSF window, "" for the
     centroid of the light with tolerances and the chief ray without.
@@ -52,6 +58,9 @@ class CodesignSettings(Settings):
     air_thickness: str = ""
     edge: float | None = None
     hold: str = ""
+    step: str = "sag"
+    relearn: int = 0
+    filters: str = "separate"
     start: str = "paraxial"
     focus_distance: float = 25e3
     f_number: float | None = None
@@ -65,6 +74,7 @@ class CodesignSettings(Settings):
     size: int = 21
     normalise: str = "window"
     noise: float = 0.1
+    network: str = "red-net"
     depth: int = 10
     width: int = 32
     epochs: int = 30
@@ -88,6 +98,12 @@ class CodesignSettings(Settings):
     refocus: str = "sensor"
     cameras: int = 32
     center: str = ""
+    sensor: tuple[float, ...] = ()
+    response: str = "rgb"
+    mosaic: str = "none"
+    full_well: float | None = None
+    read_noise: float = 0.0
+    bits: int | None = None
 
     @property
     def is_toleranced(self) -> bool:

@@ -13,12 +13,16 @@ from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
+from raytrace.materials.glass import abbe_number, nd
+from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.optimize import NotReached
+from raytrace.optimization.variables import VariedGlass
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import media
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"
@@ -219,3 +223,79 @@ def test_a_condition_that_cannot_be_met_is_said(lens):
     variables = Variables(lens, "thickness:2", hold="total_track<=20 buildable")
     with pytest.warns(NotReached, match="total_track<=20"):
         variables.project()
+
+
+def test_model_glasses_stay_within_the_catalog_and_snap_to_its_glasses():
+    """Index and Abbe number beyond every glass come back to the hull; the nearest catalog glasses replace them."""
+    prepare()
+    lens = read_lens("cooke_triplet")
+    with pytest.warns(VariedGlass):
+        variables = Variables(
+            lens, "index:1,3 abbe_number:1,3 curvature:1-7", hold="buildable catalog", catalog=["SCHOTT"]
+        )
+    with torch.no_grad():
+        variables.index_1.add_(40.0)  # + 0.4
+        variables.abbe_number_3.add_(-15.0)
+    assert variables._glasses(variables._values(), False)[0].max() > 0.05
+    variables.project()
+    excess, slope = variables._glasses(variables._values(), True)
+    assert -1e-9 < excess.max() < 1e-8
+    numbers = variables._values()
+    for column in range(4):
+        moved = numbers.copy()
+        moved[column] += 1e-3
+        change = (variables._glasses(moved, False)[0] - excess) / 1e-3
+        assert change.tolist() == pytest.approx(slope[:, column].tolist(), abs=1e-8)
+    snapped = variables.snapped()
+    assert {snapped.surfaces[k].glass.catalog for k in (1, 3)} == {"SCHOTT"}
+    assert snapped.surfaces[6].glass.name == lens.surfaces[6].glass.name
+    with pytest.raises(BadVariables, match="no glass varies"):
+        Variables(lens, "curvature:1", hold="catalog")
+    with pytest.raises(BadVariables, match="no glass varies"):
+        Variables(lens, "curvature:1").snapped()
+
+
+def test_glasses_of_the_file_snap_to_the_nearest_of_the_catalog():
+    """SK4 and SF2 of the file are no longer made: current glasses have nearly the same numbers."""
+    lens = read_lens("cooke_triplet")
+    with pytest.warns(VariedGlass):
+        variables = Variables(lens, "index:1,3 abbe_number:1,3", hold="catalog", catalog=["SCHOTT"])
+    for k in (1, 3):
+        one, other = (found.surfaces[k].glass for found in (variables.snapped(), lens))
+        assert one.catalog == "SCHOTT"
+        assert float(nd(one)) == pytest.approx(float(nd(other)), abs=3e-3)
+        assert float(abbe_number(one)) == pytest.approx(float(abbe_number(other)), abs=1.0)
+
+
+@pytest.mark.parametrize("name", ["double_gauss", "phone"])
+def test_a_step_means_the_same_blur_for_every_variable(name):
+    """A parameter of 1e-4 spreads the rays of all fields by 0.1 µm RMS, whether it is a space, a curvature or a4."""
+    lens = read_lens(name)
+    vary = {"double_gauss": "sensor thickness:2,5 curvature:1,7,11", "phone": "sensor thickness:3 curvature:4,11 a4:4"}
+    variables = Variables(lens, vary[name], step="blur")
+    pupil, weights = gauss_rings(6, 16)
+
+    def hits():
+        with torch.no_grad():
+            found = image_rays(variables(), pupil)
+        return found.position[:2], found.valid
+
+    start, arrives = hits()
+    for variable in variables.variables:
+        with torch.no_grad():
+            variables.get_parameter(variable.name).fill_(1e-4)
+        moved, also = hits()
+        weight = weights * (arrives & also)
+        change = moved - start
+        about = change - (weight * change).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True)
+        blur = ((weight * about.square().sum(0)).sum() / weight.sum()).sqrt()
+        assert float(blur) == pytest.approx(1e-4, rel=0.05), variable.name
+        with torch.no_grad():
+            variables.get_parameter(variable.name).zero_()
+    ratio = [
+        abs(one.unit / other.unit)
+        for one, other in zip(variables.variables, Variables(lens, vary[name]).variables, strict=True)
+    ]
+    assert max(ratio) > 3 * min(ratio)
+    with pytest.raises(BadVariables, match="step 'mm': expected sag or blur"):
+        Variables(lens, "sensor", step="mm")

@@ -5,6 +5,7 @@ import math
 import re
 
 import pytest
+import torch
 
 import raytrace as rt
 from raytrace import analysis
@@ -27,6 +28,8 @@ def results() -> dict[str, tuple]:
     colours, fields = {"wavelengths": [0.5, 0.6]}, {"fields": [0, 10]}
     double, single = rt.read_lens("double_gauss"), rt.read_lens("singlet")
     over_field = {"samples": 3, **colours}
+    row, column = torch.meshgrid(torch.arange(64.0), torch.arange(48.0), indexing="ij")
+    edge = torch.sigmoid(column - 24 - 0.09 * (row - 32))
     return {
         "distortion": (lambda: rt.distortion(double, **over_field), "height f_tan_percent f_theta_percent"),
         "field_curvature": (lambda: rt.field_curvature(double, **over_field), "tangential sagittal"),
@@ -44,6 +47,7 @@ def results() -> dict[str, tuple]:
             lambda: rt.mtf(double, frequencies=[10], through_focus=0.1, geometric=True),
             "sensor_distance tangential sagittal",
         ),
+        "slanted edge": (lambda: rt.slanted_edge_mtf(edge, 0.004), "frequency mtf"),
         "rms of wavefronts": (lambda: rt.rms_over_field(double, samples=3), "rms"),
         "rms of spots": (lambda: rt.rms_over_field(double, samples=3, spot=True), "rms_um"),
         "seidel": (lambda: rt.seidel(double), "S1 S2 S3 S4 S5 marginal_yni chief_yni"),

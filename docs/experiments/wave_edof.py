@@ -10,7 +10,6 @@ prescriptions differ, so that gains over the Fresnel lens are compared.
 
 import argparse
 import dataclasses
-import math
 import sys
 import tempfile
 import textwrap
@@ -33,9 +32,11 @@ from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
 from raytrace.experiments import publish, published
 from raytrace.files import table as csv
-from raytrace.imaging.image import blur_layers, depth_masks
+from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
+from raytrace.imaging.render import ImageFormation, render
 from raytrace.imaging.restoration import depth_invariant_wiener, psnr, restore
+from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.wave_camera import (
     FILTERS,
     ElementReport,
@@ -248,22 +249,31 @@ def deep(elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *,
     rise = torch.linspace(min(dioptres), max(dioptres), size, dtype=picture.dtype)
     depth = torch.cat([rise.new_full((half,), float(rise[0])), rise, rise.new_full((half,), float(rise[-1]))])
     depth = depth[:, None].expand(picture.shape[1:])
-    planes = torch.linspace(min(dioptres), max(dioptres), _LAYERS, dtype=picture.dtype)
-    masks = depth_masks(depth, planes, softness=0.1 * float(planes[1] - planes[0]))
+    pixels = picture.shape[2], picture.shape[1]
+    response = {"wavelengths": config.wavelengths, "sensitivities": np.eye(len(config.wavelengths))}
+    sensor = Sensor(tuple(config.pixel * count for count in pixels), pixels, response=response)
+    how = {"sensor": sensor, "sensor_distance": config.sensor_distance, "wavelengths": config.wavelengths}
+    how |= {"depth": 1e3 / depth, "planes": _LAYERS, "softness": 0.1, "size": config.size}
     truth, S = picture[:, half:-half, half:-half], spectrum(picture)
     seen, back = {}, {}
-    depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
     for name, own in elements.items():
-        found = kernels(own, config, depths=depths)
-        # What misses the window comes back as haze, even over the scene.
-        haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
-        image = blur_layers(picture, masks, found.kernel) + haze
+        # Columns of a sensor grow towards -x, those of the page towards +x.
+        rendering = render(own, picture.flip(-1), **how, illumination=False, boundary="zero")
+        image = rendering.image.flip(-1)[:, half:-half, half:-half]
         image = image + noise_like(image, config, seed)
-        G = depth_invariant_wiener(transfer(found, picture.shape[-1]), S, config.noise)
+        G = depth_invariant_wiener(transfer_of(rendering.optics), S, config.noise)
         estimate = restore(image, G, boundary="taper")
         seen[name] = shown(image)
         back[name] = shown(estimate), float(psnr((estimate - truth).square().mean()))
     return Deep(shown(truth), depth[half:-half, half:-half].numpy(), seen, back)
+
+
+def transfer_of(formation: ImageFormation) -> Tensor:
+    """H (D, C, rows, columns) of the kernels of elements, columns towards +x; light beyond the window is haze."""
+    window = (1 - formation.haze)[..., None, None]
+    H = transfer_functions(window * formation.kernels[0, 0].flip(-1), formation.sensor.pixels[::-1])
+    H[..., 0, 0] += formation.haze
+    return H
 
 
 def noise_like(like: Tensor, config: WaveCameraConfig, seed: int) -> Tensor:

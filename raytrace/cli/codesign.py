@@ -5,7 +5,16 @@ import argparse
 from raytrace.cli.options import ROWS as OPTIONS
 from raytrace.cli.options import catalog, json, output_folder, plot, substitute
 from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
-from raytrace.cli.types import count, field_point, file_name, folder_or_lens, positive, positive_finite
+from raytrace.cli.types import (
+    count,
+    extent,
+    field_point,
+    file_name,
+    folder_or_lens,
+    not_negative,
+    positive,
+    positive_finite,
+)
 from raytrace.settings import GRADES, MODELS, CodesignSettings
 
 SUMMARY = "optimise a lens together with a restoration network"
@@ -27,6 +36,7 @@ EXAMPLES = """examples:
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
+  raytrace codesign cooke_triplet --sensor 24x16 --vary thickness curvature --hold efl buildable --preset unet -o colour
   raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
   raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal"""
 
@@ -36,9 +46,24 @@ ROWS = {
     "vary": option("variables: sensor (default), thickness:5,6 curvature:1-4 conic:3, of surfaces", "WHAT", nargs="+"),
     "bounds": option("of variables: sensor:57.5,58 curvature_3:-0.04,0 (mm, 1/mm)", "NAME:LOW,HIGH", nargs="+"),
     "hold": option(
-        "constraint that the last variable with power is solved for: efl (the file's focal length) or efl=100",
+        "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "
+        "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step",
         "NAME=VALUE",
         nargs="+",
+    ),
+    "step": option(
+        "unit of the variables, of which --rate-optics is a part in mm: sag at the edge (default), or blur, the RMS "
+        "spread of the rays of all fields: the same for every number of any lens",
+        choices=("sag", "blur"),
+    ),
+    "relearn": option(
+        "epochs of step 1 again, with the nearest catalog glasses in place of varied ones (index:1 abbe_number:1)",
+        type=count,
+    ),
+    "filters": option(
+        "of the closed form and of the comparison: a Wiener filter of each colour (separate, default), or one of all "
+        "colours (joint)",
+        choices=("separate", "joint"),
     ),
     "glass_thickness": option(
         "centre thickness of elements: minimum, or minimum and maximum (default 1/50 of the largest diameter)",
@@ -88,8 +113,27 @@ ROWS = {
         choices=("none", "semi-diameters"),
     ),
     "ray_aiming": option(**OPTIONS["ray_aiming"]),
-    "depth": option("layers, an even number, instead of the preset's (default 10 or 30)"),
-    "width": option("maps of a layer, instead of the preset's (default 32 or 64)"),
+    "sensor": option(
+        "width and height in mm, as 24x16: pictures in colour at random places of the sensor, with the PSFs, the "
+        "lateral colour and the noise there (default: grey pictures of --field)",
+        "WxH",
+        type=extent,
+        nargs=None,
+        between="x",
+    ),
+    "response": option(
+        "rgb (default), grey, a table wavelength_nm,r,g,b (.csv), or a measured camera: 'Nikon 5100 (NPL)'", "NAME"
+    ),
+    "mosaic": option(
+        "Bayer pattern, RGGB, BGGR, GRBG or GBRG; missing colours are interpolated (default none)", "PATTERN"
+    ),
+    "full_well": option(
+        "electrons of white: adds shot noise, and --read-noise instead of --noise", "E", type=positive_finite
+    ),
+    "read_noise": option("standard deviation in electrons, with --full-well", "E", type=not_negative),
+    "bits": option("of the quantisation (default: none)", type=count),
+    "depth": option("layers, an even number, or poolings of the U-Net, instead of the preset's"),
+    "width": option("maps of a layer, instead of the preset's"),
     "epochs": option("of each step"),
     "batch": option("patches of a training step"),
     "seed": SEED,
@@ -136,7 +180,8 @@ _PICTURES = ("patch", "crops")
 _TRAINING = ("depth", "width", "epochs", "batch", "rate_network", "rate_optics", "decay", "precision")
 _OF_ONE_RUN = ("model", "seed")
 _AS_BUILT = ("as_built", "grade", "limits", "refocus", "cameras")
-_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING, *_AS_BUILT))
+_SENSOR = ("sensor", "response", "mosaic", "full_well", "read_noise", "bits")
+_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING, *_AS_BUILT, *_SENSOR))
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -163,6 +208,7 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
         "folder of the same name without suffix",
         type=folder_or_lens,
     )(parser)
+    parser.add_argument("--device", metavar="NAME", default="cpu", help="of the training, cpu or cuda (default cpu)")
     parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
     defaults = defaults_of(CodesignSettings)
     group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
@@ -172,6 +218,12 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     scene.add_argument(
         "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
     )
+    sensor = parser.add_argument_group(
+        "sensor",
+        "With --sensor the camera is that of a product: colour, the whole field, its noise. The pixels are those of\n"
+        "--pixel; the wavelengths are those of the file unless --wavelength names others.",
+    )
+    add_options(sensor, defaults, ROWS, *_SENSOR)
     built = parser.add_argument_group(
         "lens as built",
         "Errors of manufacture are drawn by the number of the sample: a run resumes\n"
@@ -182,8 +234,8 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     training = parser.add_argument_group("network and training")
     training.add_argument(
         "--preset",
-        choices=("cpu", "paper"),
+        choices=("cpu", "paper", "unet"),
         default="cpu",
-        help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
+        help="RED-Net of 10 layers of 32 maps (cpu, default), of 30 layers of 64 maps (paper), or a small U-Net (unet)",
     )
     add_options(training, defaults, ROWS, *_TRAINING)

@@ -16,7 +16,6 @@ from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.files import write_json
-from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.codesign import (
     LENS,
     STEPS,
@@ -25,12 +24,15 @@ from raytrace.imaging.codesign import (
     camera,
     closed_form,
     lens_at_start,
+    network,
     outcome,
     run_model,
+    sensor_at_start,
+    spectrum_of,
     steps_per_epoch,
     variables,
 )
-from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
+from raytrace.imaging.network import PRESETS, UNetShape
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import read_json, read_log
 from raytrace.io import FORMATS, read_lens, write_lens
@@ -60,6 +62,7 @@ class Experiment:
     about: dict[str, str]
     kind: str
     catalogs: tuple[Path, ...] = ()
+    device: str = "cpu"
 
     @property
     def steps_per_epoch(self) -> int:
@@ -68,8 +71,7 @@ class Experiment:
 
     def spectrum(self) -> Tensor:
         """Power spectrum of the training pictures, at the size of a patch with its margin."""
-        size = self.settings.patch + self.settings.size - 1
-        return patch_spectrum(self.train, size, crops=self.settings.crops, seed=self.settings.seed)
+        return spectrum_of(self.train, self.settings)
 
 
 def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:
@@ -90,17 +92,21 @@ def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -
         raise CommandError(f"{path}: {error}") from error
     FORMATS[".zmx"].write(initial, str(path), catalogs=catalogs(arguments))  # refuses what the file cannot hold
     least = settings.patch + settings.size - 1
-    samples, kind = pictures_of(arguments, least, lambda: _leaves(arguments.limit or _LEAVES, max(256, least)))
+    sensor = sensor_at_start(settings)
+    colour = sensor is not None and len(sensor.channels) == 3
+    leaves = arguments.limit or _LEAVES, max(256, least), colour
+    samples, kind = pictures_of(arguments, least, lambda: _leaves(*leaves), colour=colour)
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
         "pictures": digest(samples.samples),
     }
-    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments))
+    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments), arguments.device)
 
 
-def _leaves(count: int, size: int) -> Pictures:
+def _leaves(count: int, size: int, colour: bool) -> Pictures:
     say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
-    leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in progress(range(count), "dead leaf")]
+    seeds = progress(range(count), "dead leaf")
+    leaves = [dead_leaves(1, size=size, seed=seed, colour=colour).samples[0] for seed in seeds]
     return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
 
 
@@ -114,8 +120,10 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
     """Settings from the options. stored: `settings.json` of a run, whose choice for precision "auto" is kept; None
     without training of a network."""
     preset = PRESETS[arguments.preset]
+    is_unet = isinstance(preset, UNetShape)
     options = {name: value for name, value in vars(arguments).items() if value is not None}
-    options = {"depth": preset.depth, "width": preset.width} | options | _wavelengths(arguments)
+    shape = {"depth": preset.levels if is_unet else preset.depth, "width": preset.width}
+    options = {"network": "u-net" if is_unet else "red-net"} | shape | options | _wavelengths(arguments)
     options |= {name: " ".join(options[name]) for name in ("vary", "bounds", "hold", "limits") if name in options}
     if "fields" in options:
         if any(x for x, _ in options["fields"]):
@@ -128,7 +136,9 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
         chosen = [""]
         if share().rank == 0:
             before = read_json(stored) if stored.exists() else {}
-            chosen = [before.get("precision") or faster_precision(RedNetShape(options["depth"], options["width"]))]
+            chosen = [
+                before.get("precision") or faster_precision(CodesignSettings.of(options | {"precision": "float32"}))
+            ]
         if share().processes > 1:
             distributed.broadcast_object_list(chosen)
         options["precision"] = chosen[0]
@@ -138,10 +148,11 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
 def _wavelengths(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
     """Wavelengths and weights of the options, or those of the file, its primary one first."""
     wavelengths, weights = arguments.wavelengths, arguments.wavelength_weights
-    if not arguments.file_wavelengths:
+    of_file = arguments.file_wavelengths or (arguments.sensor and not wavelengths)
+    if not of_file:
         wavelengths = wavelengths or CodesignSettings.wavelengths
         return {"wavelengths": wavelengths, "wavelength_weights": weights or [1.0] * len(wavelengths)}
-    if wavelengths or weights:
+    if arguments.file_wavelengths and (wavelengths or weights):
         raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
     lens = _file_lens(arguments)
     order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength - 1)
@@ -157,19 +168,20 @@ def recorded_settings(path: Path) -> CodesignSettings:
     return read_settings(CodesignSettings, {name: value for name, value in read_json(path).items() if name in known})
 
 
-def faster_precision(shape: RedNetShape, *, size: int = 64, count: int = 4) -> str:
+def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int = 4) -> str:
     """The precision in which this machine's processor trains the network faster, "bfloat16" or "float32", measured.
 
     Processors without instructions for bfloat16 emulate it, ten times slower.
     """
-    network = RedNet(shape).to(memory_format=torch.channels_last)
-    picture = torch.rand(count, 1, size, size)
+    channels = 1 if not settings.sensor else 3
+    trained = network(settings, channels).to(memory_format=torch.channels_last)
+    picture = torch.rand(count, channels, size, size)
     seconds = {}
     for name, enabled in (("float32", False), ("bfloat16", True)):
         for _ in range(2):  # the first call prepares
             start = time.perf_counter()
             with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
-                restored = network(picture)
+                restored = trained(picture)
             restored.float().abs().mean().backward()
             seconds[name] = time.perf_counter() - start
     return min(seconds, key=seconds.get)
@@ -196,7 +208,7 @@ def focus_of(lens: Lens, settings: CodesignSettings) -> Callable[[float], float]
 def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, label: str) -> Outcome:
     """Train both steps of a run, or their remaining epochs, with a bar and a line for every epoch."""
     per_epoch, focus = experiment.steps_per_epoch, focus_of(experiment.lens, settings)
-    length, losses, bar = settings.epochs * per_epoch, [], None
+    length, losses, bar = (settings.epochs + settings.relearn) * per_epoch, [], None
 
     def testing(batches: Sequence[int]) -> Iterator[int]:
         for number, first in enumerate(batches, 1):
@@ -204,16 +216,18 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
                 bar.set_postfix_str(f"testing, batch {number} of {len(batches)}")
             yield first
 
+    total = length + settings.epochs * per_epoch
     distances = np.linspace(settings.near, settings.far, _DISTANCES).tolist()
     data = (experiment.train, experiment.test, settings, folder)
     more = {"about": experiment.about, "distances": tuple(distances), "catalogs": experiment.catalogs}
+    more["device"] = experiment.device
     try:
         for name, step, record in run_model(experiment.lens, *data, **more, progress=testing):
             if bar is None:
                 done = STEPS.index(name) * length + step
                 if done:
-                    say(f"{label}: resumes after step {done} of {2 * length}")
-                bar = progress(2 * length, what=label, initial=done)
+                    say(f"{label}: resumes after step {done} of {total}")
+                bar = progress(total, what=label, initial=done)
             losses.append(record["loss"])
             words = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
             if "sensor" in record:
@@ -222,7 +236,8 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
             bar.set_postfix_str(f"{name}, loss {record['loss']:.4f}{words}", refresh=False)
             bar.update()
             if (step + 1) % per_epoch == 0:
-                epoch = f"epoch {(step + 1) // per_epoch} of {settings.epochs}"
+                epochs = settings.epochs + (settings.relearn if name == STEPS[0] else 0)
+                epoch = f"epoch {(step + 1) // per_epoch} of {epochs}"
                 bar.write(f"raytrace: {label}, {name}, {epoch}: loss {sum(losses) / len(losses):.4f}{words}")
                 losses.clear()
     finally:
@@ -278,6 +293,7 @@ class CodesignResult(Result):
                 f"  after step 1, with its own PSFs  {result.l1_joint:.5f}",
                 f"  the same network with DRT PSFs   {result.l1_before:.5f}",
                 f"  after step 2, with DRT PSFs      {result.l1_drt:.5f}",
+                *self._place_lines(),
                 *self._as_built_lines(),
             ]
             distances = [float(z) / 1e3 for z in result.by_distance]
@@ -291,6 +307,13 @@ class CodesignResult(Result):
         errors = f"{result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs"
         title = f"{result.model} PSFs, mean square error of a pixel behind the best linear filter"
         return [Table(course, [title], [*self._lens_lines(), f"error of this lens: {errors}"])]
+
+    def _place_lines(self) -> Iterator[str]:
+        if self.lens.l1_by_place:
+            yield "at shares of the half diagonal of the sensor, with DRT PSFs:"
+            for place, l1 in self.lens.l1_by_place.items():
+                behind = f"behind a Wiener filter of that place {self.lens.wiener_by_place[place]:.5f}"
+                yield f"  {float(place):4g}   {l1:.5f}, {behind}"
 
     def _as_built_lines(self) -> Iterator[str]:
         if count := len(self.lens.l1_as_built):

@@ -7,10 +7,11 @@ from raytrace.cli.progress import progress
 from raytrace.imaging.pictures import Pictures, files, read
 
 
-def pictures_of(arguments: argparse.Namespace, least: int, leaves: Callable[[], Pictures]) -> tuple[Pictures, str]:
+def pictures_of(
+    arguments: argparse.Namespace, least: int, leaves: Callable[[], Pictures], *, colour: bool = False
+) -> tuple[Pictures, str]:
     """Pictures of at least `least` × `least` pixels and their kind: those of --data, else dead leaves."""
     if not arguments.data:
         return leaves(), "dead leaves"
-    return read(files(arguments.data, arguments.limit), least=least, bar=lambda paths: progress(paths, "picture")), (
-        "pictures"
-    )
+    paths = files(arguments.data, arguments.limit)
+    return read(paths, least=least, bar=lambda paths: progress(paths, "picture"), colour=colour), "pictures"

@@ -45,7 +45,7 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
     """Render and write pictures one after the other; all are read once before the first is rendered."""
     files, targets = arguments.picture, _targets(arguments.picture, arguments.output)
     options = {name: value for name, value in options_of(arguments).items() if name in _names(raytrace.render)}
-    for name in ("picture", "sensor", "progress"):
+    for name in ("picture", "sensor", "progress", "wavelengths", "sensor_distance"):  # the last two are of the lens
         options.pop(name, None)
     lens, options["depth"] = open_lens(arguments), _depth(arguments)
     pictures = [_picture(arguments, lens, file, options["depth"]) for file in files]

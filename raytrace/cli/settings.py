@@ -11,10 +11,17 @@ from raytrace.cli.parameters import Parameter, add_parameter
 from raytrace.cli.types import count, file_name, folder_name, seed_number
 
 
-def option(help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, **spelling) -> dict:
+def option(
+    help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, between: str = " ", **spelling
+) -> dict:
     """A row: help text and the arguments of argparse; name: if it is not that of the field; unit: of the option, in
-    units of the field. Without `type`, whole numbers are positive, other numbers positive and finite."""
-    return {"help": help, "name": name, "unit": unit} | ({"metavar": metavar} if metavar else {}) | spelling
+    units of the field; between: numbers of a field of several. Without `type`, whole numbers are positive, other
+    numbers positive and finite."""
+    return (
+        {"help": help, "name": name, "unit": unit, "between": between}
+        | ({"metavar": metavar} if metavar else {})
+        | spelling
+    )
 
 
 SEED = option("of random numbers", type=seed_number)
@@ -25,7 +32,7 @@ def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: s
     for name in names or rows:
         row, default = dict(rows[name]), defaults[name]
         flags = (f"--{_spelled(name, row)}",)
-        del row["name"], row["unit"]
+        del row["name"], row["unit"], row["between"]
         kind = "Sequence[float]" if isinstance(default, tuple) else type(default).__name__
         add_parameter(group, name, Parameter(kind, default), {"flags": flags, **row}, keep_default=False)
 
@@ -41,7 +48,8 @@ def words(settings, rows: Mapping[str, Mapping]) -> list[str]:
         if value is True:
             found.append(f"--{name}")
             continue
-        found.append(f"--{name} {_text(value) if unit == 1 else f'{value / unit:.12g}'}")
+        between = rows[field.name]["between"]
+        found.append(f"--{name} {_text(value, between) if unit == 1 else f'{value / unit:.12g}'}")
     return found
 
 
@@ -54,9 +62,9 @@ def _spelled(name: str, row: Mapping) -> str:
     return (row["name"] or name).replace("_", "-")
 
 
-def _text(value) -> str:
+def _text(value, between: str) -> str:
     if isinstance(value, tuple | list):
-        return " ".join(entry if isinstance(entry, str) else f"{entry:.12g}" for entry in value)
+        return between.join(entry if isinstance(entry, str) else f"{entry:.12g}" for entry in value)
     return str(value)
 
 

@@ -15,7 +15,11 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer.step()
     camera.variables.project()                              # onto the bounds, if there are any
 
-Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise.
+Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise. A phase element at the
+stop, whose heights are learned with the lens, or an element without a lens:
+
+    camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.PhaseVariables(element), sensor=sensor)
+    camera = rt.Camera(rt.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
 """
 
 import dataclasses
@@ -28,11 +32,11 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
-from raytrace.imaging.field_kernels import order_of
+from raytrace.imaging.field_kernels import check_model, order_of
 from raytrace.imaging.image import add_noise, as_picture, blur
-from raytrace.imaging.render import Rendering, linearised, patch_kernels, render
+from raytrace.imaging.render import Rendering, element_in_stop, linearised, patch_kernels, render
 from raytrace.imaging.sensor import Sensor
-from raytrace.imaging.variables import KEY, OtherLens, Variables, converted, decoded_text, encoded_text
+from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import Grid, grid
@@ -46,6 +50,7 @@ from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
+from raytrace.wave_optics.element import Element
 from raytrace.words import named_value
 
 _RAY_WIDTH = 0.25  # half width in pixels of a ray of pupil_points with "drt", for a derivative
@@ -58,7 +63,10 @@ class Camera(nn.Module):
     With a sensor the images are (B, C, H, W), linear in light, of the C channels of its response, each at its place on
     the sensor; without one they are grey, (B, H, W), at one of the `fields`.
 
-    variables: of the lens; network: (B, C, h, w) -> the same, C = 1 without a sensor; model: a PSF model.
+    variables: of the lens, or of a phase element without a lens, `sensor_distance` mm before the sensor, at wavelengths
+    (W,) µm as for `render`; element: variables of one at the stop of the lens. Elements need a sensor.
+    network: (B, C, h, w) -> the same, C = 1 without a sensor; model: a PSF model, by default "gaussian", with elements
+    "wave".
     sensor: its response, noise, quantisation and mosaic are those of the images; whole pictures: see `render`.
     object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
     on the axis by default; with a sensor they are those of its centre, of 0.7 and of 1 of its half diagonal.
@@ -82,10 +90,13 @@ class Camera(nn.Module):
 
     def __init__(
         self,
-        variables: Variables,
+        variables: Variables | PhaseVariables,
         network: nn.Module,
         *,
-        model: str = "gaussian",
+        element: PhaseVariables | None = None,
+        sensor_distance: float | None = None,
+        wavelengths: Sequence[float] | None = None,
+        model: str | None = None,
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
         pixels: Grid | int | None = None,
@@ -101,18 +112,24 @@ class Camera(nn.Module):
         illumination: bool = False,
     ):
         super().__init__()
-        if not isinstance(variables, Variables):
+        if not isinstance(variables, Variables | PhaseVariables):
             kind = named_value(variables)
-            raise TypeError(f"Camera: `variables` is {kind}; expected the Variables of a lens: Variables(lens, …)")
-        self.variables, self.network, self.model = variables, network, model
-        self.range = object_distances
-        like = variables.lens.wavelengths
-        self.sensor, self.illumination = sensor, illumination
+            expected = "the Variables of a lens: Variables(lens, …), or of an element: PhaseVariables(element)"
+            raise TypeError(f"Camera: `variables` is {kind}; expected {expected}")
+        self.variables, self.element, self.network = variables, element, network
+        self.range, self.sensor, self.illumination = object_distances, sensor, illumination
+        self.sensor_distance, self.wavelengths = sensor_distance, wavelengths
+        self._check_element()
+        self.model = model or ("wave" if self.elements() else "gaussian")
+        with torch.no_grad():
+            lens = self.lens()
+        like = lens.wavelengths
         if fields is not None:
-            self.fields = field_points(fields, like=variables.lens)
+            self.fields = field_points(fields, like=lens)
         else:
             self.fields = like.new_zeros(2, 1) if sensor is None else self._fields_of_sensor()
-        warn_of_filling(variables.lens, self.fields)
+        self._places = None if sensor is None else sensor.landing(lens, self.fields).detach()
+        warn_of_filling(lens, self.fields)
         pitch = like.new_tensor(0.005 if sensor is None else sensor.pitch)
         self.pixels = pixels if isinstance(pixels, Grid) else grid(pitch, pixels or 21)
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
@@ -121,8 +138,35 @@ class Camera(nn.Module):
         self._check()
         self._memo = Memo(object_distances=object_distances)
 
+    def _check_element(self) -> None:
+        """Refuse elements without a sensor, and numbers of the other kind of camera. Raises ValueError, TypeError."""
+        is_alone = isinstance(self.variables, PhaseVariables)
+        if self.element is not None and not isinstance(self.element, PhaseVariables):
+            raise TypeError(f"Camera: `element` is {named_value(self.element)}; expected PhaseVariables(element)")
+        if is_alone and self.element is not None:
+            raise ValueError("an element at the stop of an element: give others=… to its PhaseVariables")
+        if is_alone != (self.sensor_distance is not None):
+            needed = "give sensor_distance=…, mm" if is_alone else "leave sensor_distance out: the lens has it"
+            raise ValueError(f"a camera {'of an element without' if is_alone else 'with'} a lens: {needed}")
+        if self.wavelengths is not None and not is_alone:
+            raise ValueError("wavelengths of a camera with a lens: give lens.at(wavelengths=…)")
+        if self.sensor is None and (is_alone or self.element is not None):
+            raise ValueError("a camera with a phase element: give sensor=rt.Sensor(…), whose pixels its kernels have")
+
+    def lens(self) -> Lens:
+        """The current lens; of an element without one, the stop that it is in."""
+        if isinstance(self.variables, Variables):
+            return self.variables()
+        return element_in_stop(self.variables(), self.sensor, self.sensor_distance, self.wavelengths)
+
+    def elements(self) -> tuple[Element, ...]:
+        """The current phase elements, in contact."""
+        element = self.variables if isinstance(self.variables, PhaseVariables) else self.element
+        return () if element is None else element()
+
     def _check(self) -> None:
         """Refuse what cannot be simulated. Raises ValueError, BadTolerance."""
+        check_model(self.model, self.elements())
         if self.center not in ("chief", "centroid"):
             raise ValueError(f"center {self.center!r}: expected chief or centroid")
         if self.center == "centroid" and self.pupil_points is not None:
@@ -134,14 +178,16 @@ class Camera(nn.Module):
             raise ValueError(f"pixels {shape}: expected a square window of an odd number of pixels of the sensor")
         if self.tolerances is None:
             return
+        if self.elements():
+            raise ValueError("tolerances of a camera with a phase element: expected a lens alone")
         if not MODELS[self.model].traces:
             raise ValueError(f"model {self.model!r} traces no rays of a lens as built; expected gaussian, drt or wave")
         check_tolerances(self.variables.lens, self.tolerances)
         sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        values = self.fields, self.pixels, self.pupil_points
-        self.fields, self.pixels, self.pupil_points = converted(values, fn)
+        values = self.fields, self.pixels, self.pupil_points, self._places
+        self.fields, self.pixels, self.pupil_points, self._places = converted(values, fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
 
@@ -151,7 +197,7 @@ class Camera(nn.Module):
         middle = self.sensor.corners.mean(1)
         points = torch.stack([middle + share * (corner - middle) for share in shares], 1)
         with torch.no_grad():
-            fields = self.sensor.fields(self.variables.lens, points)
+            fields = self.sensor.fields(self.lens(), points)
         return fields[:, ~fields.isnan().any(0)]
 
     @property
@@ -159,12 +205,18 @@ class Camera(nn.Module):
         """Pixels across the PSF window."""
         return self.pixels.rows - (self.pixels.rows + 1) % 2
 
-    def rates(self, *, optics: float, network: float) -> list[dict]:
-        """Groups of parameters for an optimiser of torch, with rates of their own: of the variables and the network."""
-        return [
+    def rates(self, *, optics: float, network: float, element: float | None = None) -> list[dict]:
+        """Groups of parameters for an optimiser of torch, with rates of their own: of the variables and the network.
+
+        element: of the heights of an element at the stop, by default that of the variables.
+        """
+        groups = [
             {"params": [*self.variables.parameters()], "lr": optics},
             {"params": [*self.network.parameters()], "lr": network},
         ]
+        if self.element is not None:
+            groups.append({"params": [*self.element.parameters()], "lr": optics if element is None else element})
+        return groups
 
     # -- states that describe themselves -------------------------------------------------------------------------------
 
@@ -172,6 +224,8 @@ class Camera(nn.Module):
         """Lens, variables, sensor, window, model, network and versions, as plain values for JSON."""
         return {
             **self.variables.identity(),
+            "element": None if self.element is None else self.element.identity(),
+            "sensor_distance": self.sensor_distance,
             "sensor": None if self.sensor is None else plain(dataclasses.asdict(self.sensor)),
             "window": [self.pixels.rows, self.pixels.columns, float(self.pixels.pitch)],
             "model": self.model,
@@ -190,7 +244,7 @@ class Camera(nn.Module):
         stored = state_dict.get(prefix + KEY)
         if stored is not None:
             before, now = decoded_text(stored), self.description()
-            for name in ("sensor", "window"):
+            for name in ("sensor", "window", "sensor_distance"):
                 if not alike(before.get(name), now[name]):
                     raise OtherLens(f"the state is of {_difference(name, before.get(name), now[name])}")
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *lists)
@@ -223,8 +277,8 @@ class Camera(nn.Module):
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
             if self.sensor is not None:
-                lens, places = self.variables(), self.sensor.landing(self.variables(), self.fields)
-                self._order = order_of(lens, self.sensor, self.model, places, distances, self.size, self.tol)
+                about = self.lens(), self.sensor, self.model, self._places, distances, self.size, self.tol
+                self._order = order_of(*about, elements=self.elements())
                 return self._order
             self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
         return self._order
@@ -243,25 +297,39 @@ class Camera(nn.Module):
         (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
         """
         if (points is None) != (self.sensor is None):
-            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "a sensor"
+            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
             raise ValueError(f"the camera has no {missing}")
         if self.sensor is not None:
             if errors is not None:
                 raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
-            return patch_kernels(
-                self.variables(),
-                points.to(self.fields),
-                sensor=self.sensor,
-                size=self.size,
-                order=self.plan() if self._order is None else self._order,
-                model=self.model,
-                object_distances=object_distances.to(self.fields),
-                illumination=self.illumination,
-            )
+            return self._kernels_of_places(points.to(self.fields), object_distances.to(self.fields))
         if self.pupil_points is not None:
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
+
+    def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
+        """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
+
+        points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
+        """
+        points, distances = self._places if points is None else points, object_distances.to(self.fields)
+        pairs = points.to(distances).repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
+        return self._kernels_of_places(*pairs).unflatten(0, (len(distances), -1))
+
+    def _kernels_of_places(self, points: Tensor, distances: Tensor) -> Tensor:
+        """PSFs (B, C, rows, columns) of pairs of points (2, B) and distances (B,) mm."""
+        return patch_kernels(
+            self.lens(),
+            points,
+            sensor=self.sensor,
+            size=self.size,
+            order=self.plan() if self._order is None else self._order,
+            model=self.model,
+            object_distances=distances,
+            illumination=self.illumination,
+            elements=self.elements(),
+        )
 
     def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
         """The current lens with its stored rays, or as built, whose rays are of one call."""
@@ -366,7 +434,11 @@ class Camera(nn.Module):
         scene: (..., C, H, W) linear in light, of as many pixels as the sensor; depth: (H, W) mm; options: those of
         `rt.render`.
         """
-        return render(self.variables(), scene, depth=depth, **{"sensor": self.sensor, "model": self.model, **options})
+        options = {"sensor": self.sensor, "model": self.model, **options}
+        if not isinstance(self.variables, PhaseVariables):
+            return render(self.variables(), scene, depth=depth, elements=self.elements(), **options)
+        alone = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "size": self.size}
+        return render(self.elements(), scene, depth=depth, **{**alone, **options})
 
     def restore(self, image: Tensor) -> Tensor:
         """The network's estimate (B, h, w), or (B, C, h, w) with a sensor, from a noisy image."""

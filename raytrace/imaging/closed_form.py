@@ -10,8 +10,17 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, crop
-from raytrace.imaging.restoration import kernel_error, power_spectrum
+from raytrace.imaging.render import decoded
+from raytrace.imaging.restoration import (
+    cross_spectrum,
+    depth_invariant_wiener,
+    joint_kernel_error,
+    joint_wiener,
+    kernel_error,
+    power_spectrum,
+)
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
@@ -30,26 +39,64 @@ _BETTER = 1e-4  # relative decrease of the error for which a second descent is m
 _RINGS = 12  # of the pupil, for focus
 
 
-def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int = 0) -> Tensor:
+def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int = 0, joint: bool = False) -> Tensor:
     """S (size, size) of patches of pictures, ordered as by `fft2`: its mean is the mean square of a pixel.
 
-    A Hann window suppresses the borders of patches, which would look like texture.
+    A Hann window suppresses the borders of patches, which would look like texture. Of colour pictures (3, size, size),
+    of their light; joint: their cross spectra (3, 3, size, size), see `cross_spectrum`.
     """
-    total = torch.zeros(size, size, dtype=torch.float64)
+    total = 0.0
     count = crops * len(pictures)
     for sample in range(count):
         patch = torch.as_tensor(crop(pictures, sample, epoch=0, size=size, crops=crops, seed=seed)).to(torch.float64)
-        total += power_spectrum(patch[None])
+        patch = decoded(patch.movedim(-1, 0)) if patch.dim() == 3 else patch
+        total = total + (cross_spectrum if joint else power_spectrum)(patch[None])
     return total / count
 
 
 def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
 
-    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens.
+    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. With a sensor the
+    mean over its channels and the camera's field points, each with a filter of its own; with cross spectra (C, C, rows,
+    columns) the filter of each field point is joint, `joint_wiener`.
     """
+    if camera.sensor is not None:
+        kernels, sigma = camera.kernels_over_field(distances), noise_deviation(camera, spectrum)
+        if spectrum.dim() == 4:
+            return joint_kernel_error(kernels, spectrum, sigma).mean()
+        return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
     kernels = [camera.kernels(distances, field) for field in range(camera.fields.shape[1])]
     return kernel_error(torch.cat(kernels), spectrum.to(kernels[0].dtype), camera.noise)
+
+
+def noise_deviation(camera: Camera, spectrum: Tensor) -> float | Tensor:
+    """Standard deviation of the noise of a pixel of mean level, of every channel (C, 1, 1) with a sensor."""
+    if camera.sensor is None:
+        return camera.noise
+    rows, columns = spectrum.shape[-2:]
+    constant = spectrum[..., 0, 0]
+    mean = ((constant.diagonal().real if spectrum.dim() == 4 else constant) / (rows * columns)).sqrt()
+    well, read = camera.sensor.full_well, camera.sensor.read_noise
+    variance = torch.full_like(mean, read**2) if well is None else mean / well + (read / well) ** 2
+    return variance.sqrt()[..., None, None]
+
+
+@torch.no_grad()
+def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], distances: Tensor | None = None) -> Tensor:
+    """Depth-invariant Wiener filters (N, C, rows, columns) of a sensor's channels at places on its diagonal; joint ones
+    (N, C, C, rows, columns) for cross spectra (C, C, rows, columns).
+
+    places: (N,) shares of the way from the middle of the sensor to its corner; distances: (Z,) mm, by default evenly
+    over the camera's range; spectrum: (C, rows, columns) of the scene.
+    """
+    distances = even_distances(camera) if distances is None else distances
+    points = camera.sensor.corners[:, :1] * camera.sensor.corners.new_tensor(places)
+    kernels = camera.kernels_over_field(distances, points)
+    transfer = transfer_functions(kernels, tuple(spectrum.shape[-2:]))
+    if spectrum.dim() == 4:
+        return joint_wiener(transfer, spectrum, noise_deviation(camera, spectrum))
+    return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), noise_deviation(camera, spectrum))
 
 
 def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:
@@ -76,10 +123,12 @@ class Course:
     no_optimum: str
 
 
-def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> Course:
+def optimise_closed_form(
+    camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None, steps: int | None = None
+) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
-    By L-BFGS-B with exact gradients (scipy).
+    By L-BFGS-B with exact gradients (scipy). steps: at most so many iterations, by default until it has settled.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, parts = camera.variables, []
@@ -96,11 +145,17 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
 
     def descend() -> TensorDescent:
         # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-        return minimise_tensors(list(variables.parameters()), loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
+        most = {} if steps is None else {"steps": steps}
+        how = {"unit": _FIRST_STEP, "bounds": bounds, "tolerance": 1e-11, **most}
+        return minimise_tensors(list(variables.parameters()), loss, **how)
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.
-    while variables.held is not None and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]:
+    while (
+        steps is None
+        and variables.held is not None
+        and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]
+    ):
         descent = descend()
     names = tuple(variable.name for variable, at_end in zip(variables.variables, descent.at_end, strict=True) if at_end)
     names += (variables.held.by.name,) if variables.beyond() else ()

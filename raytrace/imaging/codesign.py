@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -24,20 +25,24 @@ from raytrace.imaging.closed_form import (
     Course,
     camera_error,
     even_distances,
+    field_filters,
     focus_columns,
     least_of_closed_form,
     out_of_focus,
     patch_spectrum,
 )
-from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.network import RedNet, RedNetShape, UNet
 from raytrace.imaging.pictures import Pictures, crop, draws
-from raytrace.imaging.restoration import psnr
+from raytrace.imaging.render import decoded
+from raytrace.imaging.restoration import psnr, restore, restore_jointly
+from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
 from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import grid, hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
+from raytrace.optimization.variables import GLASS
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
@@ -52,6 +57,7 @@ _SAMPLE = 10  # last number of the key of a sample's random numbers
 TEST_EPOCH = 2**20  # epoch of the test samples, which training never reaches
 _UNSEEN = 2**62  # number of the first perturbed camera of the test, of seed 0, which training never reaches
 STEPS = ("joint", "refine")
+PLACES = (0.0, 0.7, 1.0)  # of the test, as shares of the half diagonal of a sensor
 LENS = "lens.zmx"  # of a run: the optimised lens
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
@@ -96,6 +102,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,
+        step=settings.step,
     )
 
 
@@ -123,19 +130,47 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | 
     )
 
 
+def sensor_at_start(settings: CodesignSettings) -> Sensor | None:
+    """The sensor of an experiment, of whole pixels; None of a grey camera of field points."""
+    if not settings.sensor:
+        return None
+    pixels = tuple(max(1, round(side / settings.pixel)) for side in settings.sensor)
+    return Sensor(
+        size=tuple(count * settings.pixel for count in pixels),
+        pixels=pixels,
+        response=settings.response,
+        mosaic=settings.mosaic,
+        full_well=settings.full_well,
+        read_noise=settings.noise if settings.full_well is None else settings.read_noise,
+        bits=settings.bits,
+    )
+
+
+def network(settings: CodesignSettings, channels: int) -> torch.nn.Module:
+    """The untrained network of an experiment."""
+    if settings.network == "u-net":
+        return UNet(channels=channels, levels=settings.depth, width=settings.width, seed=settings.seed)
+    if settings.network != "red-net":
+        raise ValueError(f"network {settings.network!r}: expected red-net or u-net")
+    return RedNet(RedNetShape(settings.depth, settings.width), channels=channels, seed=settings.seed)
+
+
 def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     """The camera of an experiment at its start."""
-    like = lens.wavelengths
+    like, sensor = lens.wavelengths, sensor_at_start(settings)
+    if sensor is not None and settings.is_toleranced:
+        raise ValueError("a lens as built in front of a sensor: expected grade, limits and as_built without sensor")
+    fields = torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)])
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
     return Camera(
         variables(lens, settings),
-        RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),
+        network(settings, 1 if sensor is None else len(sensor.channels)).to(memory_format=torch.channels_last),
         model=settings.model,
         object_distances=(settings.near, settings.far),
-        fields=torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)]),
-        pixels=grid(like.new_tensor(settings.pixel), settings.size),
+        fields=fields if sensor is None else None,
+        pixels=grid(like.new_tensor(settings.pixel), settings.size) if sensor is None else settings.size,
         normalise=settings.normalise,
         noise=settings.noise,
         tol=settings.tol,
@@ -144,7 +179,27 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
         pupil_points=pupil_points(settings.sampling, rays.get(settings.model), seed=settings.seed),
         center=settings.center or ("centroid" if settings.is_toleranced else "chief"),
         tolerances=tolerances_at_start(lens, settings),
+        sensor=sensor,
     )
+
+
+def with_catalog_glasses(trained: Camera, settings: CodesignSettings) -> tuple[Camera, CodesignSettings]:
+    """The camera with the nearest glasses of the catalogs, and the settings to train it again for `relearn` epochs.
+
+    Its variables are the others, from their current numbers on; the network goes with it. Raises BadVariables where no
+    glass varies.
+    """
+    lens = trained.variables.snapped()
+    words = [word for word in settings.vary.split() if word.partition(":")[0] not in GLASS]
+    hold = " ".join(word for word in settings.hold.split() if word != "catalog")
+    sensor = float(lens.surfaces[-2].thickness)
+    again = dataclasses.replace(
+        settings, vary=" ".join(words), hold=hold, epochs=settings.relearn, start=repr(sensor), relearn=0
+    )
+    one = camera(lens, again)
+    one.network.load_state_dict(trained.network.state_dict())
+    one.plan()
+    return one, again
 
 
 def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
@@ -161,13 +216,25 @@ class Batch:
     """Samples of one step: picture (B, H, W) float32, distance (B,) mm float64, noise (B, h, w) of deviation 1.
 
     errors: of manufacture, (B, N) or (N,) of one lens, float64; None of the nominal lens.
+    Of a sensor: picture (B, C, H, W), light; points (2, B) mm of the patches; index (B,), seed: of their noise.
     """
 
     picture: Tensor
     distance: Tensor
-    noise: Tensor
+    noise: Tensor | None
     field: list[int]
     errors: Tensor | None = None
+    points: Tensor | None = None
+    index: Tensor | None = None
+    seed: int = 0
+
+    def to(self, device: torch.device) -> Self:
+        """The same on a device; index and seed remain plain numbers."""
+        if self.picture.device == device:
+            return self
+        names = ("picture", "distance", "noise", "errors", "points")
+        moved = {name: getattr(self, name).to(device) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **moved)
 
     def part(self, where: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Picture, distance, noise and errors of some samples."""
@@ -197,11 +264,33 @@ def batch(
         parts.append((patch, distance, random.standard_normal((settings.patch,) * 2, dtype=np.float32)))
     picture, distance, noise = (torch.as_tensor(np.stack(part)) for part in zip(*parts, strict=True))
     errors, count = None, len(pictures) * settings.crops
+    if (sensor := sensor_at_start(settings)) is not None:
+        index = epoch * count + torch.tensor(samples)
+        points = sensor.patch_points(sensor.random_patches(index, settings.patch, settings.seed), settings.patch)
+        where = {"points": points, "index": index, "seed": settings.seed}
+        return Batch(light_of(picture), distance, None, [0] * len(samples), **where)
     if tolerances is not None:
         first, last = min(samples), max(samples)
         drawn = draw_errors(tolerances, last - first + 1, settings.seed, first=epoch * count + first)
         errors = drawn[torch.tensor(samples) - first]
     return Batch(picture, distance, noise, [sample % len(settings.fields) for sample in samples], errors)
+
+
+def spectrum_of(pictures: Pictures, settings: CodesignSettings) -> Tensor:
+    """`patch_spectrum` of the patches of an experiment with their margin; cross spectra for joint filters."""
+    if settings.filters not in ("separate", "joint"):
+        raise ValueError(f"filters {settings.filters!r}: expected separate or joint")
+    size = settings.patch + settings.size - 1
+    joint = settings.filters == "joint"
+    if joint and not settings.sensor:
+        raise ValueError("joint filters are those of the colours of a sensor: give sensor, as 24x16")
+    return patch_spectrum(pictures, size, crops=settings.crops, seed=settings.seed, joint=joint)
+
+
+def light_of(levels: Tensor) -> Tensor:
+    """Light (..., C, H, W) of sRGB levels (..., H, W), or (..., H, W, 3), from 0 to 1."""
+    channels_first = levels.movedim(-1, -3) if levels.shape[-1] == 3 else levels[..., None, :, :]
+    return decoded(channels_first).contiguous()
 
 
 def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
@@ -241,7 +330,12 @@ def absolute_error(camera: Camera, batch: Batch) -> Tensor:
 
 
 def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor]) -> list[Tensor]:
-    """Σ over pixels of measures of restored - picture, each (B,)."""
+    """Σ over pixels of measures of restored - picture, each (B,); of several channels their mean."""
+    batch = batch.to(camera.fields.device)
+    if camera.sensor is not None:
+        where = {"points": batch.points, "index": batch.index, "seed": batch.seed}
+        difference = camera(batch.picture, batch.distance, **where) - camera.target(batch.picture)
+        return [measure(difference).mean(-3).sum((-2, -1)) for measure in measures]
     if len(camera.fields[0]) == 1:
         restored = camera(batch.picture, batch.distance, noise=batch.noise, errors=batch.errors)
         difference = restored - camera.target(batch.picture)
@@ -294,19 +388,37 @@ def held_out_error(
     settings: CodesignSettings,
     *,
     distance: float | None = None,
+    place: float | None = None,
+    filters: Tensor | None = None,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> float:
     """Mean |restored - picture| of all test samples, at random object distances or at one.
 
-    progress: wraps the batches, for a bar.
+    place: all patches at this share of the way from the middle of the sensor to its upper left corner; filters: (C,
+    rows, columns), or joint ones (C, C, rows, columns), instead of the network; progress: wraps the batches, for a bar.
     """
     count, total = len(pictures) * settings.crops, 0.0
     for first in progress(range(0, count, settings.batch)):
         samples = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), TEST_EPOCH)
         if distance is not None:
             samples = dataclasses.replace(samples, distance=torch.full_like(samples.distance, distance))
-        total += float(absolute_error(camera, samples).sum())
+        if place is not None:
+            points = place * camera.sensor.corners[:, :1].expand(2, len(samples.index))
+            samples = dataclasses.replace(samples, points=points)
+        if filters is None:
+            total += float(absolute_error(camera, samples).sum())
+        else:
+            total += float(_filtered_error(camera, samples, filters).sum())
     return total / (count * settings.patch**2)
+
+
+def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
+    """Σ |filtered - picture| of every sample behind linear filters (C, rows, columns), (B,)."""
+    image = camera.image(batch.picture, batch.distance, points=batch.points)
+    recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
+    apply = restore_jointly if filters.dim() == 4 else restore
+    restored = apply(recorded, filters.to(torch.complex64), boundary="taper")
+    return (restored - camera.target(batch.picture)).abs().mean(-3).sum((-2, -1))
 
 
 @torch.no_grad()
@@ -346,6 +458,8 @@ class Outcome:
     mm², violation of the thickness limits, not part of the losses; no_optimum: the reason why the lens is no optimum
     ("" if none is known). l1_as_built, psnr_as_built: of perturbed cameras after step 2, by their number, with DRT
     PSFs; empty without tolerances.
+    Of a sensor: l1_by_place with DRT PSFs after step 2, by the share of the half diagonal at which all test patches
+    are; wiener_by_place: behind the depth-invariant Wiener filter of each place and channel instead of the network.
     """
 
     model: str
@@ -362,6 +476,8 @@ class Outcome:
     no_optimum: str = ""
     l1_as_built: dict[str, float] = dataclasses.field(default_factory=dict)
     psnr_as_built: dict[str, float] = dataclasses.field(default_factory=dict)
+    l1_by_place: dict[str, float] = dataclasses.field(default_factory=dict)
+    wiener_by_place: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def document(self) -> dict:
         return dataclasses.asdict(self)
@@ -377,13 +493,14 @@ def run_model(
     about: dict,
     distances: tuple[float, ...],
     catalogs: Sequence[str | Path] = (),
+    device: str | torch.device = "cpu",
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
     folder: of this run, resumed if started; about: whatever else decides the result (lens file, pictures); progress:
-    wraps the batches of every test; catalogs: of glass, with which the lens was read. At the end the optimised lens is
-    written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
+    wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the training. At the
+    end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
     """
     folder = Path(folder)
 
@@ -394,16 +511,20 @@ def run_model(
     joint = run(STEPS[0])
     if (folder / "outcome.json").exists():
         return
-    trained = camera(lens, settings)
+    trained = camera(lens, settings).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
     if settings.start in ("spectral", GAUSSIAN) and not joint.checkpoint.exists():
-        size = settings.patch + settings.size - 1
-        spectrum = patch_spectrum(train_pictures, size, crops=settings.crops, seed=settings.seed)
-        course = to_closed_form(trained, settings, spectrum)
+        course = to_closed_form(trained, settings, spectrum_of(train_pictures, settings))
         if course.no_optimum:
             warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
     for step, record in optimise(trained, train_pictures, settings, joint):
         yield STEPS[0], step, record
+    if settings.relearn:
+        trained, again = with_catalog_glasses(trained, settings)
+        trained.to(device)
+        done = settings.epochs * steps_per_epoch(train_pictures, settings)
+        for step, record in optimise(trained, train_pictures, again, run("glasses")):
+            yield STEPS[0], done + step, record
     l1_joint = held_out_error(trained, test_pictures, settings, progress=progress)
     freeze_lens(trained, settings)
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
@@ -413,6 +534,21 @@ def run_model(
     if trained.tolerances is not None:
         found = errors_as_built(trained, test_pictures, settings, progress=progress)
         built = [{str(number): error for number, error in enumerate(errors.tolist(), 1)} for errors in found]
+    of_places = {}
+    if trained.sensor is not None:
+        filters = field_filters(trained, spectrum_of(train_pictures, settings), PLACES)
+        of_places = {
+            "l1_by_place": {
+                f"{place:g}": held_out_error(trained, test_pictures, settings, place=place, progress=progress)
+                for place in PLACES
+            },
+            "wiener_by_place": {
+                f"{place:g}": held_out_error(
+                    trained, test_pictures, settings, place=place, filters=filter, progress=progress
+                )
+                for place, filter in zip(PLACES, filters, strict=True)
+            },
+        }
     result = Outcome(
         model=settings.model,
         seed=settings.seed,
@@ -425,6 +561,7 @@ def run_model(
         no_optimum=out_of_focus(trained),
         l1_as_built=built[0],
         psnr_as_built=built[1],
+        **of_places,
         by_distance={
             f"{d:g}": held_out_error(trained, test_pictures, settings, distance=d, progress=progress) for d in distances
         },

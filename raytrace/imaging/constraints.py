@@ -7,7 +7,7 @@ moves to the nearest x′ that is buildable and meets the conditions of `hold`:
 
 in units of the variables, by a sequence of quadratic programs (Nocedal and Wright, Numerical Optimization, 2006, §18).
 Rays of the rim that miss a surface or are totally reflected are brought back: the amount by which they miss is a
-further residual, which has a derivative where images have none.
+further limit, with a derivative, where images have none.
 """
 
 import dataclasses
@@ -17,6 +17,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from raytrace.materials.glass import Glass
+from raytrace.optimization.glass_choice import Pool
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, State
 from raytrace.optimization.optimize import EXACT, NotReached
 from raytrace.optimization.problem import Condition, Problem
@@ -27,11 +29,64 @@ from raytrace.words import calling_level
 
 _STEPS = 30  # quadratic programs at most
 _HALVES = 12  # of a step
+_FAR = 3.0  # times the step of the optimiser: constraints do not move the lens further
+_INSIDE = 1e-3  # of the miss, by which a ray that is brought back is inside
 _MET = 1e-8  # violation that is met, in units of the conditions, as mm
 _PUPIL = ((0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0))  # rays of every field that must arrive
 
 #: x (n,), whether derivatives are requested -> excess (K,) over limits and its derivatives (K, n), or None.
 Limits = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray | None]]
+
+
+class GlassLimits:
+    """Model glasses within the convex hull of catalog glasses, as further limits.
+
+    start: numbers (k,) of the model glass behind each surface; columns: (n,) variables as pairs (surface, number of the
+    glass), None for others.
+    """
+
+    def __init__(self, pool: Pool, start: dict[int, np.ndarray], columns: Sequence[tuple[int, int] | None]):
+        self.pool, self.start, self.columns = pool, start, columns
+
+    def numbers(self, x: np.ndarray) -> dict[int, np.ndarray]:
+        """Numbers (k,) of every glass at variables (n,)."""
+        numbers = {surface: start.copy() for surface, start in self.start.items()}
+        for value, column in zip(x, self.columns, strict=True):
+            if column is not None and column[1] < self.pool.count:
+                numbers[column[0]][column[1]] = value
+        return numbers
+
+    def __call__(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        numbers = self.numbers(x)
+        excess = np.concatenate([self.pool.normal @ one - self.pool.reach for one in numbers.values()])
+        if not derivatives:
+            return excess, None
+        slope = np.zeros((len(numbers), len(self.pool.reach), len(x)))
+        places = {surface: place for place, surface in enumerate(numbers)}
+        for k, column in enumerate(self.columns):
+            if column is not None and column[1] < self.pool.count:
+                slope[places[column[0]], :, k] = self.pool.normal[:, column[1]]
+        return excess, slope.reshape(-1, len(x))
+
+    def nearest(self, x: np.ndarray) -> dict[int, Glass]:
+        """The catalog glass behind each surface whose numbers are nearest, in units of the spread of the catalogs."""
+        width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
+        distance = {
+            surface: (((self.pool.numbers - one) / width) ** 2).sum(1) for surface, one in self.numbers(x).items()
+        }
+        return {surface: self.pool.glasses[int(np.argmin(one))] for surface, one in distance.items()}
+
+
+def joined_limits(limits: Sequence[Limits]) -> Limits | None:
+    """All of several limits; None of none."""
+    if not limits:
+        return None
+
+    def joined(x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        excess, slopes = zip(*(one(x, derivatives) for one in limits), strict=True)
+        return np.concatenate(excess), np.concatenate(slopes) if derivatives else None
+
+    return joined
 
 
 class Constraints:
@@ -56,49 +111,42 @@ class Constraints:
         self.unit, self.lower, self.upper, self.limits = unit, lower, upper, limits
 
     def nearest(self, x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-        """The nearest variables (n,) that meet all conditions; before: those of the last step, whose rays arrive.
+        """The nearest variables (n,) that meet all conditions and lose no ray of the rim.
 
-        Rays that fail are brought back by their misses, or else by a shorter step. Warns NotReached for conditions that
-        are not met.
+        before: those of the last step, which met them: the step is shortened where the nearest ones are far away. Warns
+        NotReached for conditions that are not met.
         """
         wanted = np.clip(x, self.lower, self.upper)
+        x, state = self._met(wanted)
+        is_far = before is not None and self._distance(x, wanted) > _FAR * self._distance(wanted, before)
+        if before is not None and (state.lost or is_far):
+            last = self._state(before, derivatives=False)
+            if _violation(last) <= EXACT and not last.lost:
+                x, state = self._met(self._shortened(before, wanted))
+                if state.lost:
+                    x, state = before, last
+        self._warn(state)
+        return x
+
+    def _met(self, wanted: np.ndarray) -> tuple[np.ndarray, State]:
+        """The end of the quadratic programs from the wanted variables on."""
         x, state = wanted, self._state(wanted, derivatives=False)
         for _ in range(_STEPS):
-            if state.lost and (back := self._brought_back(x, state)) is not None:
-                x, state = back
-                wanted = x
-                continue
-            if state.lost and before is not None:
-                x = wanted = self._shortened(before, x)
-                state, before = self._state(x, derivatives=False), None
-            if _violation(state) <= _MET or state.lost:
+            if _violation(state) <= _MET and not state.lost:
                 break
             try:
-                step = self._linear(x, wanted, state).step(1e-12)
+                step = self._linear(x, wanted).step(1e-12)
             except NoStep:
                 break
             x = np.clip(x + step, self.lower, self.upper)
             state = self._state(x, derivatives=False)
-        self._warn(state)
-        return x
+        return x, state
 
-    def _brought_back(self, x: np.ndarray, state: State) -> tuple[np.ndarray, State] | None:
-        """A step towards the lens whose failed rays arrive, if there is one: fewer fail, or they miss by less."""
-        step = self._linear(x, x, state).step(1e-12)
-        rays = len(self.problem.rows)
-        for _ in range(_HALVES):
-            trial = np.clip(x + step, self.lower, self.upper)
-            after = self._state(trial, derivatives=False)
-            fewer = after.lost - state.lost, after.residuals[rays:].sum() - 0.99 * state.residuals[rays:].sum()
-            if after.is_finite and (fewer[0] < 0 or (fewer[0] == 0 and fewer[1] < 0)):
-                return trial, after
-            step = 0.5 * step
-        return None
+    def _distance(self, x: np.ndarray, y: np.ndarray) -> float:
+        return float(np.linalg.norm((x - y) / self.unit))
 
     def _shortened(self, before: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The largest part of the step from `before` to x, of halves of halves, at which no ray fails."""
-        if self._state(before, derivatives=False).lost:
-            return x
         arrives = 0.0
         for k in range(1, _HALVES):
             trial = arrives + 0.5**k
@@ -115,22 +163,32 @@ class Constraints:
             return state
         return dataclasses.replace(state, limits_slope=np.concatenate([state.limits_slope, slope]))
 
-    def _linear(self, x: np.ndarray, wanted: np.ndarray, state: State) -> Linear:
-        """The quadratic program at x: the distance from the wanted variables, or the misses of rays that fail."""
-        lost, state = state.lost, self._state(x, derivatives=True)
-        rays = len(self.problem.rows)
-        distance = (x - wanted) / self.unit, np.diag(1 / self.unit)
-        residuals, jacobian = (state.residuals[rays:], state.jacobian[rays:]) if lost else distance
+    def _linear(self, x: np.ndarray, wanted: np.ndarray) -> Linear:
+        """The quadratic program at x, in which failed rays miss by less than nothing."""
+        state = self._state(x, derivatives=True)
+        missed, slopes = self._missed(x)
         return Linear(
-            residuals,
-            jacobian,
+            (x - wanted) / self.unit,
+            np.diag(1 / self.unit),
             sides=Sides.none(len(x)),
             held=(state.held, state.held_slope),
-            limits=(state.limits, state.limits_slope),
+            limits=(
+                np.concatenate([state.limits, missed + _INSIDE]),
+                np.concatenate([state.limits_slope, slopes]),
+            ),
             lower=self.lower - x,
             upper=self.upper - x,
             scale=1 / self.unit,
         )
+
+    def _missed(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Amounts (K,) by which failed rays of the rim miss a surface, and their derivatives (K, n)."""
+        rows = np.flatnonzero(self.problem.evaluated(x).lost)
+        if not len(rows):
+            return np.zeros(0), np.zeros((0, len(x)))
+        missed, slopes, _ = self.problem.recovery.excess(x, rows, derivatives=True)
+        known = missed > 0
+        return missed[known], slopes[known]
 
     def _warn(self, state: State) -> None:
         lost = f"{state.lost} rays of the rim fail" if state.lost else ""

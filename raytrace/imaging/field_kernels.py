@@ -6,29 +6,46 @@ arrives is the relative illumination, an image of its own.
 
 Of a rotationally symmetric lens and the Gaussian model, centroids and covariances along one radius are turned to every
 place. Kernels of the other models are computed in one octant and mirrored to the others.
+
+Phase elements at the stop of a lens add their path to its waves (`wave_optics.hybrid`). Of elements alone, in a stop
+without a lens, the kernel of the axis is that of every place: a paraxial camera.
 """
 
 import dataclasses
 import math
+import warnings
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.imaging.sensor import Sensor
-from raytrace.maths.numerics import safe_sqrt, varies
-from raytrace.maths.sampling import gauss_rings, with_rim
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
+from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
-from raytrace.psf_models import MODELS, model_of, psf
+from raytrace.psf_models import MODELS, NotConverged, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import field_of_object
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import scene, trace_scene
+from raytrace.tracing.scene import Memo, scene, trace_scene
+from raytrace.wave_optics import hybrid
+from raytrace.wave_optics.compute import psf as wave_psf
+from raytrace.wave_optics.compute import psf_by_depth
+from raytrace.wave_optics.element import Element, is_radial
+from raytrace.wave_optics.hybrid import is_stop_alone
+from raytrace.wave_optics.plan import Plan
+from raytrace.wave_optics.scene import WaveScene
+from raytrace.words import calling_level
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
-_RINGS = 6.0  # λN that the window of diffraction is larger than the rays need
+#: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
+#: 2/(π² R) of its light farther away than R λN (Born & Wolf, Principles of Optics, §8.5.2).
+_RINGS = 6.0, 40.0
 _LARGEST = 401  # pixels of a window
+_SMALLEST = 21  # pixels of a window of elements
+_TAIL = 1e-2  # of the light that a window 1.5 times as large adds
 _TOGETHER = 48  # fields of a call of `psf`
 _DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
 
@@ -44,7 +61,7 @@ class FieldKernels:
     model, order: of the PSF; size: of the window, an odd number of pixels; object_distances: (D,) mm; weights: (C, W),
     the share of every wavelength of the lens in a channel; lateral_colour: whether the light of other wavelengths lies
     where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
-    traced.
+    traced; elements: in contact at the stop, with the model "wave". Raises ValueError for elements and another model.
     """
 
     lens: Lens
@@ -56,6 +73,10 @@ class FieldKernels:
     weights: Tensor
     lateral_colour: bool = True
     nodes: int = 33
+    elements: tuple[Element, ...] = ()
+
+    def __post_init__(self):
+        check_model(self.model, self.elements)
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor; where no chief ray arrives, a point."""
@@ -98,7 +119,7 @@ class FieldKernels:
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
-        if not is_round_about_axis(self.lens):
+        if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
             return self._in_parts(points)
         compute = self._turned if self.model == "gaussian" else self._in_parts
         octant = torch.stack([points.abs().amin(0), points.abs().amax(0)])
@@ -123,17 +144,42 @@ class FieldKernels:
         """By the PSF model, field by field."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        about = {"fields": fields, "object_distances": self.object_distances, "normalise": "window", "center": "axis"}
-        model, wavelengths = model_of(self.model, order=self.order), self.lens.wavelengths
-        groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
-        kernels = []
-        for some, origin in zip(groups, self._origin(fields).unbind(-1), strict=True):
-            window = make_grid(points.new_tensor(self.sensor.pitch), self.size, origin)
-            kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=some, per_wavelength=True).kernel)
-        kernels = torch.cat(kernels, 2)
+        kernels = self._of_elements(fields) if self.elements else self._of_model(fields)
         kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
         kept = arrives[:, None, None, None, None] & ~kernels.isnan()
         return torch.where(kept, kernels, _point(kernels))
+
+    def _of_model(self, fields: Tensor) -> Tensor:
+        """(D, F, W, h, w) of sum 1, columns towards +x."""
+        about = {"fields": fields, "object_distances": self.object_distances, "normalise": "window", "center": "axis"}
+        model, kernels = model_of(self.model, order=self.order), []
+        for wavelengths, window in self._windows(fields):
+            how = {"grid": window, "wavelengths": wavelengths, "per_wavelength": True}
+            kernels.append(psf(self.lens, model, **about, **how).kernel)
+        return torch.cat(kernels, 2)
+
+    def _of_elements(self, fields: Tensor) -> Tensor:
+        """(D, F, W, h, w) of sum 1, nan without light, columns towards +x: of the lens with elements at its stop."""
+        kernel = self.light(fields)
+        total = kernel.sum((-2, -1), keepdim=True)
+        return torch.where(total > 0, safe_divide(kernel, total), torch.nan)
+
+    def light(self, fields: Tensor) -> Tensor:
+        """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
+        kernels = []
+        for wavelengths, window in self._windows(fields):
+            view = scene(self.lens, fields, self.object_distances, wavelengths)
+            centre = window.centre[..., None].expand(2, *view.shape)
+            window = dataclasses.replace(window, centre=centre)
+            kernels.append(hybrid.kernels(view, self.elements, window, order=self.order).kernel)
+        return torch.cat(kernels, 2)
+
+    def _windows(self, fields: Tensor) -> Iterator[tuple[Tensor, Grid]]:
+        """Wavelengths with a common origin, µm, and their pixels about it, whose centres are (2, D, F)."""
+        wavelengths, pitch = self.lens.wavelengths, fields.new_tensor(self.sensor.pitch)
+        groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
+        for some, centre in zip(groups, self._origin(fields).unbind(-1), strict=True):
+            yield some, make_grid(pitch, self.size, centre)
 
     def _turned(self, points: Tensor) -> Tensor:
         """Gaussians of the moments along a radius, turned to the azimuth of every place."""
@@ -156,18 +202,22 @@ class FieldKernels:
         radius = safe_sqrt((points * points).sum(0))
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        narrowest = torch.minimum(*moments[1:]).min()
-        pixels = wide_gaussian_pixels if bool(narrowest >= self.sensor.pitch**2) else gaussian_pixels
-        parts = []
-        for some in torch.arange(points.shape[1], device=points.device).split(_TOGETHER):
-            shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
-            x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
-            pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
-            covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-            kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
-            kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
-            parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
-        return torch.cat(parts)
+        narrowest = torch.minimum(*moments[1:]).amin((0, 2))  # of each place: kernels do not depend on other places
+        order, parts = torch.argsort((narrowest >= self.sensor.pitch**2).to(torch.int8), stable=True), []
+        narrow = int((narrowest < self.sensor.pitch**2).sum())
+        for group, pixels in ((order[:narrow], gaussian_pixels), (order[narrow:], wide_gaussian_pixels)):
+            for some in group.split(_TOGETHER):
+                if not len(some):
+                    continue
+                shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
+                x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
+                pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
+                covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
+                kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
+                kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
+                parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
+        kernels = torch.cat(parts)
+        return kernels if narrow in (0, len(order)) else kernels[torch.argsort(order)]
 
     def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Centroid from the origin, mm, sagittal and tangential variance, mm², (D, K, W) at radii (K,) along +y."""
@@ -185,6 +235,82 @@ class FieldKernels:
     def _origin(self, fields: Tensor) -> Tensor:
         """(2, D, N, 1 or W)."""
         return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
+
+
+@dataclasses.dataclass(frozen=True)
+class ElementKernels:
+    """Kernels of elements alone, the same at every place of the sensor, where `FieldKernels` has those of a lens.
+
+    lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
+    plan: the sampling, of an earlier call: for loops; memo: of sums that do not depend on the heights.
+    """
+
+    lens: Lens
+    elements: tuple[Element, ...]
+    sensor: Sensor
+    size: int
+    object_distances: Tensor
+    weights: Tensor
+    plan: Plan | None = None
+    memo: Memo | None = None
+
+    @property
+    def scene(self) -> WaveScene:
+        sensor_distance = self.lens.surfaces[-2].thickness
+        window = make_grid(sensor_distance.new_tensor(self.sensor.pitch), self.size)
+        return WaveScene(self.elements, sensor_distance, self.object_distances, self.lens.wavelengths, window)
+
+    def light(self) -> Tensor:
+        """Light (D, W, h, w) in each pixel, columns towards +x; 1 = all through the aperture."""
+        whole = self.scene
+        return (psf_by_depth(whole) if self.plan is None else wave_psf(whole, plan=self.plan, memo=self.memo)).kernel
+
+    def share(self, light: Tensor) -> Tensor:
+        """Share (D, C) of the light of `light` that lies in the window."""
+        return light.sum((-2, -1)) @ self.weights.to(light).T
+
+    def of_light(self, light: Tensor) -> Tensor:
+        """Kernels (D, C, size, size) of sum 1 of `light`."""
+        kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
+        return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+
+    def at(self, points: Tensor) -> Tensor:
+        """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
+        kernels = self.of_light(self.light())
+        return kernels.expand(points.shape[1], *kernels.shape)
+
+    def paired(self, points: Tensor) -> Tensor:
+        """Kernels (N, C, size, size) at places (2, N) mm, each of its own of the object distances (N,)."""
+        distances, which = self.object_distances.unique(return_inverse=True)
+        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
+
+
+def field_kernels(
+    lens: Lens,
+    sensor: Sensor,
+    model: str,
+    order: int,
+    size: int,
+    object_distances: Tensor,
+    weights: Tensor,
+    lateral_colour: bool = True,
+    elements: Sequence[Element] = (),
+) -> FieldKernels | ElementKernels:
+    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone."""
+    elements = tuple(elements)
+    if elements and is_stop_alone(lens):
+        check_model(model, elements)
+        return ElementKernels(lens, elements, sensor, size, object_distances, weights)
+    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements)
+
+
+def check_model(model: str, elements: Sequence[Element]) -> None:
+    """Raise ValueError for elements and a model of rays."""
+    if elements and model != "wave":
+        raise ValueError(
+            f"model {model!r} with phase elements: only waves diffract at their heights; expected model 'wave', or a "
+            "smooth element as a lens of its own: raytrace.wave_optics.hybrid.element_lens(element, …)"
+        )
 
 
 def by_angle(lens: Lens) -> Lens:
@@ -230,23 +356,72 @@ def _point(kernels: Tensor) -> Tensor:
 
 
 def window_size(
-    lens: Lens, sensor: Sensor, model: str, points: Tensor, object_distances: Tensor, *, lateral_colour: bool = True
+    lens: Lens,
+    sensor: Sensor,
+    model: str,
+    points: Tensor,
+    object_distances: Tensor,
+    *,
+    lateral_colour: bool = True,
+    elements: Sequence[Element] = (),
+    tol: float = math.inf,
 ) -> int:
-    """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge."""
+    """An odd number of pixels that holds the light at places (2, N) mm of the sensor. Raises WindowTooLarge.
+
+    tol: share of the light of diffraction that may lie outside. Of elements: a window 1.5 times as large holds at most
+    1 % more; without a lens at most 401 pixels.
+    """
+    if elements and is_stop_alone(lens):
+        return _window_of_elements(lens, sensor, model, points, object_distances, _SMALLEST, elements)
     with torch.no_grad():
         fields = sensor.fields(lens, points)
         fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
         how = {"tails": model != "drt", "lateral_colour": lateral_colour}
         reach = max(_reach(lens, sensor, fields, distance, **how) for distance in object_distances.split(1))
         if MODELS[model].waves:
-            reach = reach + _RINGS * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
+            rings = min(max(2 / (math.pi**2 * tol), _RINGS[0]), _RINGS[1])
+            reach = reach + rings * 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))
     size = 2 * math.ceil(reach / sensor.pitch + 0.5) + 1
     if size > _LARGEST:
         raise WindowTooLarge(
             f"the blur reaches {1e3 * reach:.0f} µm, {size} pixels of {1e3 * sensor.pitch:g} µm across, more than "
             f"{_LARGEST}: focus the lens, as by rt.focus(lens).lens, or take larger pixels"
         )
-    return size
+    if not elements:
+        return size
+    return _window_of_elements(lens, sensor, model, points[:, ::6], object_distances, size, elements)
+
+
+@torch.no_grad()
+def _window_of_elements(
+    lens: Lens, sensor: Sensor, model: str, points: Tensor, distances: Tensor, size: int, elements: Sequence[Element]
+) -> int:
+    """A window of at least `size` pixels, such that one 1.5 times as large holds little more light."""
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(points)
+    kernels = field_kernels(lens, sensor, model, 0, size, distances, weights, elements=elements)
+    fields = sensor.fields(lens, points)
+    fields = fields[:, ~fields.isnan().any(0)]
+    while True:
+        size = kernels.size
+        larger = min(_LARGEST, 2 * math.ceil(0.75 * size) + 1)
+        kernels = dataclasses.replace(kernels, size=larger)
+        if isinstance(kernels, ElementKernels):
+            light = kernels.light()
+        else:
+            parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
+            light = torch.cat([part.light(fields) for part in parts])
+        edge = (larger - size) // 2
+        inner, outer = (part.sum((-2, -1)) for part in (light[..., edge:-edge, edge:-edge], light))
+        if bool((outer - inner <= _TAIL * outer).all()):
+            return size
+        if larger == _LARGEST and isinstance(kernels, ElementKernels):
+            return _LARGEST
+        if larger == _LARGEST:
+            share = 100 * float((inner / outer).min())
+            raise WindowTooLarge(
+                f"the light of the elements spreads over more than {_LARGEST} pixels of {1e3 * sensor.pitch:g} µm: "
+                f"{size} hold {share:.0f} % of that in {_LARGEST}; take larger pixels"
+            )
 
 
 def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tails: bool, lateral_colour: bool) -> float:
@@ -264,13 +439,56 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
 
 
 def order_of(
-    lens: Lens, sensor: Sensor, model: str, points: Tensor, object_distances: Tensor, size: int, tol: float
+    lens: Lens,
+    sensor: Sensor,
+    model: str,
+    points: Tensor,
+    object_distances: Tensor,
+    size: int,
+    tol: float,
+    *,
+    elements: Sequence[Element] = (),
 ) -> int:
-    """The order of the model that meets the tolerance at places (2, N) mm of the sensor."""
+    """The order of the model that meets the tolerance at places (2, N) mm of the sensor.
+
+    Of elements at the stop of a lens: the lowest order from which the next differs by less. Elements alone have none.
+    """
     if not MODELS[model].traces and len(MODELS[model].orders) == 1:
         return MODELS[model].orders[0]
+    if elements and is_stop_alone(lens):
+        return 0
     with torch.no_grad():
+        if elements:
+            return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
         fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
         fields = fields[:, ~fields.isnan().any(0)]
         about = {"center": "chief", "grid": make_grid(points.new_tensor(sensor.pitch), size)}
         return psf(lens, model, fields=fields, object_distances=object_distances, **about, tol=tol).order
+
+
+def _order_of_elements(
+    lens: Lens,
+    sensor: Sensor,
+    model: str,
+    points: Tensor,
+    distances: Tensor,
+    size: int,
+    tol: float,
+    elements: Sequence[Element],
+) -> int:
+    weights, before = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(points), None
+    for order in MODELS[model].orders:
+        kernels = field_kernels(lens, sensor, model, order, size, distances, weights, elements=elements)
+        try:
+            light = kernels.at(points)
+        except hybrid.TooCoarse:
+            if before is None:
+                raise
+            break
+        change = math.inf if before is None else float((light - before).abs().sum((-2, -1)).max())
+        if change <= tol:
+            return order - 1
+        before = light
+    message = f"the kernels of order {order - 1} still change by {change:.1e} of their light, above {tol:.1e}"
+    warnings.warn(message, NotConverged, stacklevel=calling_level())
+    return order - 1

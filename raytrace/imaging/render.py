@@ -25,7 +25,16 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
-from raytrace.imaging.field_kernels import FieldKernels, along, by_angle, order_of, radii, window_size
+from raytrace.imaging.field_kernels import (
+    FieldKernels,
+    along,
+    by_angle,
+    check_model,
+    field_kernels,
+    order_of,
+    radii,
+    window_size,
+)
 from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.varying_blur import bilinear, varying_blur
@@ -36,6 +45,9 @@ from raytrace.psf_models import MODELS, NotConverged
 from raytrace.system.lens import Lens, field_points, is_round_about_axis
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order
+from raytrace.wave_optics.compute import COLOURS, DESIGN
+from raytrace.wave_optics.element import Element, in_contact
+from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
 from raytrace.words import calling_level
 
 _MOST_NODES = 65  # along the longer side
@@ -58,7 +70,8 @@ class ImageFormation:
     a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
-    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model.
+    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model; haze: (D, C), of elements
+    alone, the light beyond the window of the kernels, which is spread evenly over the image, or None.
     """
 
     sensor: Sensor
@@ -70,24 +83,32 @@ class ImageFormation:
     error: float
     order: int
     tol: float
+    haze: Tensor | None = None
 
     def __call__(
         self,
         picture: Tensor,
         depth: Tensor | None = None,
         *,
+        softness: float = 0.0,
         boundary: str = "reflect",
         progress: Callable[[int], object] | None = None,
     ) -> Tensor:
-        """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm, see `render`."""
+        """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm; others: see `render`."""
         picture = checked_picture(picture, self.sensor)
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
         depth = None if depth is None else checked_depth(depth, picture)
-        return self.image_of(picture, depth, boundary=boundary, progress=progress)
+        return self.image_of(picture, depth, softness=softness, boundary=boundary, progress=progress)
 
     def image_of(
-        self, picture: Tensor, depth: Tensor | None, *, boundary: str, progress: Callable[[int], object] | None
+        self,
+        picture: Tensor,
+        depth: Tensor | None,
+        *,
+        softness: float,
+        boundary: str,
+        progress: Callable[[int], object] | None,
     ) -> Tensor:
         """The same of a picture and a depth map that are checked."""
         inverse = None if depth is None else 1 / depth
@@ -97,19 +118,26 @@ class ImageFormation:
                 inverse = resampled(inverse[..., None, :, :], self.ideal, boundary, mode="nearest")[..., 0, :, :]
         how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": progress}
         flux = [enlarged(part, picture) for part in self.flux]
+        window, haze = [1.0] * len(self.planes), 0.0
+        if self.haze is not None:
+            share = self.haze.to(picture)[..., None, None]
+            window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
         if inverse is None:
-            return varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how)
+            return window[0] * varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how) + haze
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
-        masks = depth_masks(inverse, self.planes.to(inverse))
+        planes = self.planes.to(inverse)
+        step = float(planes.diff().min()) if len(planes) > 1 else 0.0
+        masks = depth_masks(inverse, planes, softness=softness * step)
 
         def layers():
             for d, mask in enumerate(masks.unbind(-3)):
                 cover = flux[d] * mask[..., None, :, :]
-                yield tuple(
+                light, coverage = (
                     varying_blur(part, self.kernels[:, :, d], **how) for part in (cover * picture, cover / shade)
                 )
+                yield window[d] * light, coverage
 
-        return occlusion(layers())
+        return occlusion(layers()) + haze
 
 
 def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
@@ -153,7 +181,8 @@ def optics(
     lens: Lens,
     sensor: Sensor,
     *,
-    model: str = "gaussian",
+    elements: Element | Sequence[Element] = (),
+    model: str | None = None,
     object_distances: Tensor | None = None,
     tol: float = 1e-2,
     distortion: bool = True,
@@ -165,11 +194,15 @@ def optics(
 ) -> ImageFormation:
     """Prepare a lens and its sensor for `ImageFormation.__call__`; arguments as for `render`.
 
-    object_distances: (D,) mm of layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of
-    as many as the tolerance needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
+    elements: at the stop; of elements alone the lens is `wave_optics.hybrid.stop_alone`. object_distances: (D,) mm of
+    layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
+    needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
     """
+    elements = in_contact(elements)
+    model = model or ("wave" if elements else "gaussian")
     if model not in MODELS:
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    check_model(model, elements)
     like = lens.surfaces[-2].thickness
     lens = lens if object_distances is None else by_angle(lens)
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
@@ -178,16 +211,21 @@ def optics(
     distances = distances[nearer]
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
     corners = _places(sensor, 5, 5, like)
-    chosen = size or window_size(lens, sensor, model, corners, distances, lateral_colour=lateral_colour)
+    how = {"lateral_colour": lateral_colour, "elements": elements}
+    chosen = size or window_size(lens, sensor, model, corners, distances, **how, tol=tol)
     if order is None:
-        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol)
-    kernels = FieldKernels(lens, sensor, model, order, chosen, distances, weights, lateral_colour)
-    grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
+        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol, elements=elements)
+    kernels, haze = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how), None
+    if isinstance(kernels, FieldKernels):
+        grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
+    else:
+        light = kernels.light()
+        grid, haze, error = kernels.of_light(light)[None, None], 1 - kernels.share(light), 0.0
     along_radii = is_round_about_axis(lens) and (illumination or distortion)
     pixels = _every_pixel(sensor, like) if along_radii else None
     shade = _illumination(lens, sensor, pixels, like) if illumination else None
-    ideal = _ideal(lens, sensor, pixels, like) if distortion else None
-    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol)
+    ideal = _ideal(lens, sensor, pixels, like) if distortion and not is_stop_alone(lens) else None
+    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol, haze)
 
 
 def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
@@ -240,6 +278,8 @@ def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tenso
     bright as its exit pupil is large, whatever the aberrations. v: the fixed point of v + E - A v, A the blur, from E
     on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
     """
+    if illumination is None and kernels.shape[:2] == (1, 1):
+        return kernels.new_ones(*kernels.shape[2:4], 1, 1)
     columns, rows = sensor.pixels
     factor = max(1, 2 * math.ceil(max(rows, columns) / _COARSE / 2) - 1)
     coarse = _pooled(kernels, factor)
@@ -358,14 +398,19 @@ def resampled(picture: Tensor, places: Tensor, boundary: str, mode: str = "bicub
 
 
 def render(
-    lens: Lens,
+    lens: Lens | Element | Sequence[Element],
     picture: Tensor,
     *,
     sensor: Sensor | None = None,
+    elements: Element | Sequence[Element] = (),
+    sensor_distance: float | Tensor | None = None,
+    wavelengths: Sequence[float] | Tensor | None = None,
     depth: Tensor | None = None,
-    model: str = "gaussian",
+    model: str | None = None,
     tol: float = 1e-2,
     planes: int = _PLANES,
+    softness: float = 0.0,
+    size: int | None = None,
     boundary: str = "reflect",
     distortion: bool = True,
     lateral_colour: bool = True,
@@ -374,12 +419,18 @@ def render(
 ) -> "Rendering":
     """The picture that a lens projects onto its sensor, without noise, differentiable in the numbers of the lens.
 
+    lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
+        or of `depth`; wavelengths: (W,) µm of theirs, by default 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
     sensor: its pixels are those of the picture; by default of the size that the largest field of the lens fills to its
         corners, one channel, or "rgb" of three.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
-        equally spaced reciprocal distances, of which near ones cover far ones.
-    model: of the PSF, see `rt.psf`; tol: bound on the estimated error of the kernels, the sum of |h - ĥ|.
+        equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
+        layers, a logistic function of so large a share of the difference of their reciprocal distances.
+    elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
+    model: of the PSF, see `rt.psf`, by default "gaussian"; with elements "wave".
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|; size: pixels across their window, an odd
+        number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call.
@@ -387,17 +438,40 @@ def render(
     """
     light = linearised(picture)
     light = light[None] if light.dim() == 2 else light
+    if not isinstance(lens, Lens):
+        if elements:
+            raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
+        lens, elements = element_in_stop(lens, sensor, sensor_distance, wavelengths), lens
+    elif sensor_distance is not None or wavelengths is not None:
+        raise ValueError("a lens has a sensor distance and wavelengths: give lens.at(sensor_distance=…, wavelengths=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
     light, distances = checked_picture(light, sensor), None
     if depth is not None:
         depth = checked_depth(depth, light)
         distances = 1 / plane_distances(depth.double(), planes)
     ready = optics(
-        lens, sensor, model=model, object_distances=distances, tol=tol, distortion=distortion,
-        lateral_colour=lateral_colour, illumination=illumination,
+        lens, sensor, elements=elements, model=model, object_distances=distances, tol=tol, distortion=distortion,
+        lateral_colour=lateral_colour, illumination=illumination, size=size,
     )  # fmt: skip
-    image = ready.image_of(light, depth, boundary=boundary, progress=progress)
+    image = ready.image_of(light, depth, softness=softness, boundary=boundary, progress=progress)
     return Rendering(image, light, lens, ready)
+
+
+def element_in_stop(
+    elements: Element | Sequence[Element],
+    sensor: Sensor | None,
+    sensor_distance: float | Tensor | None,
+    wavelengths: Sequence[float] | Tensor | None,
+) -> Lens:
+    """The stop of elements without a lens; arguments as for `render`. Raises ValueError for a missing one."""
+    parts = in_contact(elements)
+    if not parts:
+        raise ValueError("no element: expected one or several in contact, of rt.elements or rt.element")
+    if sensor is None or sensor_distance is None:
+        raise ValueError("elements without a lens: give sensor=rt.Sensor(…) and sensor_distance=…, mm")
+    if wavelengths is None:
+        wavelengths = COLOURS if sensor.response is not None else (DESIGN,)
+    return stop_alone(parts, sensor_distance=sensor_distance, wavelengths=wavelengths)
 
 
 def render_patches(
@@ -408,7 +482,8 @@ def render_patches(
     sensor: Sensor,
     size: int,
     order: int,
-    model: str = "gaussian",
+    elements: Element | Sequence[Element] = (),
+    model: str | None = None,
     object_distances: Tensor | None = None,
     lateral_colour: bool = True,
     illumination: bool = False,
@@ -417,9 +492,9 @@ def render_patches(
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
     change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
-    the `ImageFormation` of the initial lens. object_distances: (B,) mm from surface 1 to the object of each patch, or
-    one of all, inf allowed; by default that of the lens. Differentiable in the numbers of the lens and in the
-    distances.
+    the `ImageFormation` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1
+    to the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers
+    of the lens, of the elements and in the distances.
     Raises ValueError for numbers of patches, points and distances that differ.
     """
     patches = as_picture(patches)
@@ -429,8 +504,8 @@ def render_patches(
             "and (2, B) mm"
         )
     kernels = patch_kernels(
-        lens, points, sensor=sensor, size=size, order=order, model=model, object_distances=object_distances,
-        lateral_colour=lateral_colour, illumination=illumination,
+        lens, points, sensor=sensor, size=size, order=order, elements=elements, model=model,
+        object_distances=object_distances, lateral_colour=lateral_colour, illumination=illumination,
     )  # fmt: skip
     return blur(patches, kernels.to(patches))
 
@@ -442,7 +517,8 @@ def patch_kernels(
     sensor: Sensor,
     size: int,
     order: int,
-    model: str = "gaussian",
+    elements: Element | Sequence[Element] = (),
+    model: str | None = None,
     object_distances: Tensor | None = None,
     lateral_colour: bool = True,
     illumination: bool = False,
@@ -454,7 +530,9 @@ def patch_kernels(
     distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
     distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
-    kernels = FieldKernels(lens, sensor, model, order, size, distances, weights, lateral_colour)
+    elements = in_contact(elements)
+    model = model or ("wave" if elements else "gaussian")
+    kernels = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
     kernels = kernels.at(points)[:, 0] if len(distances) == 1 else kernels.paired(points)
     return _illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
 
@@ -510,7 +588,11 @@ def linearised(picture: Tensor | np.ndarray) -> Tensor:
     picture = torch.as_tensor(picture)
     if picture.is_floating_point():
         return picture
-    level = as_picture(picture)
+    return decoded(as_picture(picture))
+
+
+def decoded(level: Tensor) -> Tensor:
+    """Light of sRGB levels from 0 to 1: the inverse of `encoded` (IEC 61966-2-1)."""
     return torch.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
 
 
@@ -538,12 +620,13 @@ class Rendering(Result):
         picture: Tensor,
         depth: Tensor | None = None,
         *,
+        softness: float = 0.0,
         boundary: str = "reflect",
         progress: Callable[[int], object] | None = None,
     ) -> Self:
         """The rendering of another picture of the same size by the same optics; arguments as for `render`."""
         light = checked_picture(linearised(picture), self.optics.sensor)
-        image = self.optics(light, depth, boundary=boundary, progress=progress)
+        image = self.optics(light, depth, softness=softness, boundary=boundary, progress=progress)
         return dataclasses.replace(self, image=image, picture=light)
 
     def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
@@ -575,6 +658,8 @@ class Rendering(Result):
         ]
         if math.isfinite(ready.error):
             lines.append(f"estimated error between the places {ready.error:.1e} of the light")
+        if ready.haze is not None:
+            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.max()):.1f} %")
         if ready.illumination is not None:
             darkest = 100 * float(ready.illumination.min())
             lines.append(f"illumination of the darkest pixel {darkest:.1f} % of that of the axis")

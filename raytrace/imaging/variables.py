@@ -25,17 +25,19 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from raytrace.imaging.constraints import Constraints
+from raytrace.imaging.constraints import Constraints, GlassLimits, joined_limits
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
-from raytrace.maths.numerics import to
+from raytrace.maths.numerics import safe_divide, to
+from raytrace.maths.sampling import gauss_rings
+from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
@@ -52,11 +54,12 @@ from raytrace.optimization.variables import (
     with_modelled,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
 from raytrace.system.surface import Surface, medium_surfaces, sag, sag_at
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
 
 # -- thickness limits --------------------------------------------------------------------------------------------------
@@ -228,6 +231,7 @@ def _floating(values: tuple) -> Tensor:
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
+_BLUR_RAYS, _DIFFERENCE = (4, 8), 1e-4  # rays and differences, in sag, of units of blur
 _NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
@@ -239,7 +243,7 @@ class Variable:
     kind: its quantity, or "sensor" for the last thickness; start: its value in the lens; unit: of the parameter, in
     that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the change that moves the
     surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them. The system aperture, of
-    surface 0, is in tenths of its number at the start.
+    surface 0, is in tenths of its number at the start. `Variables(step="blur")` takes other units.
     """
 
     kind: str
@@ -269,8 +273,11 @@ class Variables(Owned):
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
-        constraint syntax of `optimize` as "total_track<=80", and "buildable", thicknesses within their limits, are met
-        by `project`.
+        constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
+        "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`.
+    catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT.
+    step: unit of the parameters: "sag" as of `Variable`, or "blur": the change that spreads the rays of all fields by
+        1 mm, RMS about their centroids, so that a rate of an optimiser means the same blur for all numbers of any lens.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
         default relative to the size of the lens (`limits_of`). `violation` is the penalty of the lens beyond them.
     `.to(device)`, `.float()` and `.double()` convert the lens with its parameters (`to`).
@@ -288,8 +295,13 @@ class Variables(Owned):
         glass_thickness: tuple[float, float] | None = None,
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
+        catalog: Sequence[str | os.PathLike] = (),
+        step: Literal["sag", "blur"] = "sag",
     ):
         super().__init__()
+        if step not in ("sag", "blur"):
+            raise BadVariables(f"step {step!r}: expected sag or blur")
+        self.catalog = tuple(catalog)
         self.lens = lens = as_lens(lens, "Variables")
         numbers, kinds = _named(lens, vary)
         self._modelled, words = with_modelled(lens, numbers), constraint_words(hold)
@@ -307,19 +319,53 @@ class Variables(Owned):
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
         self._ends, self._numbers, self._all = (lower, upper), numbers, every
         self._held_to = self._conditions()
+        if "catalog" in self.conditions:
+            self._glasses  # noqa: B018 - refuses lenses whose glasses do not vary
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
+        if step == "blur":
+            self._rescale()
         self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
                 f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
             )
 
+    @torch.no_grad()
+    def _rescale(self) -> None:
+        """Units of equal blur: the RMS distance from the centroid by which rays of all fields move, by differences."""
+        like = self.lens.wavelengths
+        pupil, weights = gauss_rings(*_BLUR_RAYS, dtype=like.dtype, device=like.device)
+        fields = field_points(None, like=self.lens)
+
+        def hits() -> tuple[Tensor, Tensor]:
+            rays = image_rays(self(), pupil, fields=fields)
+            return rays.position[:2], rays.valid
+
+        scaled = {}
+        for variable in self.variables:
+            parameter, ends = self.get_parameter(variable.name), []
+            for shift in (_DIFFERENCE, -_DIFFERENCE):
+                parameter.fill_(shift)
+                ends.append(hits())
+            parameter.zero_()
+            (above, arrives), (below, also) = ends
+            weight = weights * (arrives & also)
+            moved = (above - below) / (2 * _DIFFERENCE)
+            total = weight.sum(-1, keepdim=True)
+            about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), total)
+            blur = safe_divide((weight * about.square().sum(0)).sum(), weight.sum()).sqrt()
+            if float(blur) > _NEGLIGIBLE:
+                scaled[variable.name] = dataclasses.replace(variable, unit=variable.unit / float(blur))
+        self.variables = tuple(scaled.get(one.name, one) for one in self.variables)
+        self._all = tuple(scaled.get(one.name, one) for one in self._all)
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
         self.lens, self._modelled = converted((self.lens, self._modelled), fn)
         self.__dict__.pop("_constraints", None)
+        self.__dict__.pop("_glasses", None)
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:
@@ -458,7 +504,7 @@ class Variables(Owned):
 
     def _conditions(self) -> tuple[Condition, ...]:
         """The conditions of `hold` on the lens. Raises BadVariables."""
-        words = [word for word in self.conditions if word != "buildable"]
+        words = [word for word in self.conditions if word not in ("buildable", "catalog")]
         words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
         try:
             return conditions_in_unit(to(self._modelled, dtype=torch.float64, device="cpu"), words, 1.0)
@@ -470,7 +516,11 @@ class Variables(Owned):
         """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
         if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
             return None
-        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        lens, limits = to(self._modelled, dtype=torch.float64, device="cpu"), []
+        if "buildable" in self.conditions:
+            limits.append(self._excess)
+        if "catalog" in self.conditions:
+            limits.append(self._glasses)
         return Constraints(
             lens,
             self._numbers,
@@ -478,8 +528,28 @@ class Variables(Owned):
             unit=np.array([abs(variable.unit) for variable in self._all]),
             lower=self._ends[0],
             upper=self._ends[1],
-            limits=self._excess if "buildable" in self.conditions else None,
+            limits=joined_limits(limits),
         )
+
+    @functools.cached_property
+    def _glasses(self) -> GlassLimits:
+        """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
+        columns = [(one.surface, GLASS[one.kind]) if one.kind in GLASS else None for one in self._all]
+        surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
+        if not surfaces:
+            raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
+        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        pool = pool_of(lens, catalogs_of(lens, self.catalog))
+        start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
+        return GlassLimits(pool, start, columns)
+
+    @torch.no_grad()
+    def snapped(self) -> Lens:
+        """The current lens with the nearest glasses of the catalogs instead of its model glasses. Raises BadVariables.
+
+        Train it again without the numbers of the glasses: its image has changed.
+        """
+        return with_glasses(self(), self._glasses.nearest(self._values()))
 
     def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""

@@ -25,10 +25,10 @@ from raytrace.maths.sampling import grid
 from raytrace.optimization.least_squares import NoOptimum
 from raytrace.plotting.style import FIELD_COLOURS, GREY, array, new_figure, styled, wavelength_colours
 from raytrace.tracing.scene import Memo
-from raytrace.wave_optics.compute import ElementPsf, psf
-from raytrace.wave_optics.element import Element, Rings, height
+from raytrace.wave_optics.compute import ElementPsf, psf, psf_by_depth
+from raytrace.wave_optics.element import Element, height
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.scene import WaveScene, is_round
+from raytrace.wave_optics.scene import WaveScene
 
 FILTERS = ("wiener", "blind")  # of restoration
 WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
@@ -76,16 +76,8 @@ def scene(elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequ
 def kernels(
     elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequence[float] | None = None
 ) -> ElementPsf:
-    """PSFs of elements. Those that are not round are computed depth by depth, for memory, to 0.5 %; rings in contact
-    with other elements are sampled at their own pitch (2,500 cells across 5 mm of 2 µm rings).
-    """
-    whole = scene(elements, config, depths=depths)
-    if is_round(whole):
-        return psf(whole)
-    pitches = [element.profile.pitch for element in elements if isinstance(element.profile, Rings)]
-    samples = math.ceil(float(2 * elements[0].radius / min(pitches))) if pitches else None
-    parts = [psf(dataclasses.replace(whole, depths=z[None]), tol=5e-3, samples=samples) for z in whole.depths.unbind()]
-    return ElementPsf(torch.cat([part.kernel for part in parts]), whole, parts[0].plan)
+    """PSFs of elements, by `psf_by_depth`; depths: mm, other than the camera's own."""
+    return psf_by_depth(scene(elements, config, depths=depths))
 
 
 def transfer(psf: ElementPsf, size: int | tuple[int, int]) -> Tensor:

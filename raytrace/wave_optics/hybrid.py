@@ -1,6 +1,7 @@
 """Phase elements and traced lenses together.
 
     element_lens   a height map as a plano lens whose rays are traced: plane, glass, surface z = h(x, y)
+    stop_alone     a plane stop in front of a sensor, which elements without a lens are in
     hybrid_psf     a lens whose stop carries elements: the traced wavefront plus their path
 
         U(x, y) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi [W_j + Σ_e (n_e(λ) - 1) h_e(x_j, y_j) + n (L_j x + M_j y)]/λ)
@@ -85,6 +86,40 @@ def element_lens(
         wavelengths=wavelengths,
         wavelength_weights=torch.ones_like(wavelengths),
     )
+
+
+def stop_alone(
+    elements: Sequence[Element],
+    *,
+    sensor_distance: Tensor | float,
+    object_distance: Tensor | float = math.inf,
+    wavelengths: Tensor | Sequence[float] = (0.55,),
+) -> Lens:
+    """A plane stop in air, the aperture of elements in contact, without their paths: a lens without power.
+
+    sensor_distance: mm from the stop; object_distance: mm from it, inf allowed; wavelengths: (W,) µm.
+    """
+    radius = elements[0].radius
+    distances = (torch.as_tensor(t).to(radius) for t in (object_distance, sensor_distance, 0.0))
+    before, behind, image = (Surface(t) for t in distances)
+    wavelengths = torch.as_tensor(wavelengths).to(radius)
+    axis = wavelengths.new_zeros(1)
+    return Lens(
+        surfaces=(before, dataclasses.replace(behind, semi_diameter=float(radius.detach())), image),
+        stop=1,
+        aperture=SystemAperture("float_by_stop", radius),
+        fields=Fields("angle", axis, axis, torch.ones_like(axis)),
+        wavelengths=wavelengths,
+        wavelength_weights=torch.ones_like(wavelengths),
+        name=" + ".join(element.kind.words for element in elements),
+    )
+
+
+def is_stop_alone(lens: Lens) -> bool:
+    """Whether a lens is a plane stop in air, as `stop_alone`: elements there are the only power."""
+    stop = lens.surfaces[1]
+    is_flat = stop.is_plane and stop.sag_terms is None and stop.phase is None
+    return len(lens.surfaces) == 3 and is_flat and all(bool((n == 1).all()) for n in media(lens, lens.wavelengths))
 
 
 def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[Surface, Surface]:

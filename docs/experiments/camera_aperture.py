@@ -1,0 +1,285 @@
+"""Which aperture wins at equal light: F/numbers with shot and read noise at a fixed exposure, by five PSF models.
+
+    python docs/experiments/camera_aperture.py --data DIR -o FOLDER --docs docs
+
+Scene and exposure time are fixed: the electrons of a pixel are proportional to the solid angle of its beam, which the
+semi-diameters of the file clip. At every F/number each model moves the sensor to the least mean square error of
+depth-invariant Wiener filters, one for each field. Pictures are blurred by DRT kernels and restored. A second call
+computes what is missing.
+"""
+
+import argparse
+import csv
+import dataclasses
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import t as student
+from torch import Tensor
+
+import raytrace as rt
+from raytrace.files import write_json
+from raytrace.imaging.image import add_noise, blur, count_electrons, transfer_functions
+from raytrace.imaging.pictures import draws, files, read, split
+from raytrace.imaging.render import linearised
+from raytrace.imaging.restoration import depth_invariant_wiener, kernel_error, mean_square_error, power_spectrum
+from raytrace.imaging.training import read_json
+from raytrace.plotting.style import FIELD_COLOURS, GREY, new_figure
+from raytrace.psf_models import model_of
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Aperture
+from raytrace.tracing.focus import paraxial_sensor
+from raytrace.tracing.launch import UnfilledStop
+
+#: F/numbers and fields in degrees of each lens; wavelengths: the primary one.
+LENSES = {
+    "double_gauss": ((2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0), (0.0, 7.0, 10.0)),
+    "cooke_triplet": ((3.5, 4.0, 5.6, 8.0, 11.0, 16.0), (0.0, 8.4, 11.9)),
+}
+RANGES = {"narrow": (28e3, 33e3), "wide": (20e3, 60e3)}  # object distances, mm
+LIGHTS = {"bright": 10_000.0, "dark": 100.0}  # electrons of white on the axis of an ideal F/4
+READ_NOISE = 3.0  # electrons
+PITCH, SIZE, PATCH = 0.006, 41, 128  # mm, pixels of the PSF and of a patch
+DEPTHS, SENSORS, PATCHES, SEEDS = 5, 9, 2, 5
+ORDERS = {"paraxial": 0, "fourier": -1, "gaussian": 4, "drt": 0, "wave": -1}
+FIRST_ORDER = "paraxial", "fourier"
+WAVES_FROM = 2.8  # F/number from which the PSFs of waves are computed off the axis
+
+
+def clipped(name: str) -> Lens:
+    """The lens at its primary wavelength, clipped by the semi-diameters of all surfaces but the stop."""
+    lens = rt.read_lens(name)
+    lens = lens.at(wavelengths=[float(lens.primary)])
+    for number, surface in enumerate(lens.surfaces[1:-1], 1):
+        if number != lens.stop:
+            lens = lens.replace(number, apertures=(Aperture("circular", (0.0, surface.semi_diameter)),))
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
+
+
+def kernels_of(lens: Lens, model: str, fields: tuple[float, ...], distances: Tensor) -> Tensor:
+    """PSFs (F, D, rows, columns) about the chief ray, of sum 1; of first-order models alike for all fields."""
+    fields = (0.0,) if model in FIRST_ORDER else fields
+    one = model_of(model, order=ORDERS[model])
+    found = [
+        rt.psf(lens, one, fields=[field], object_distances=distances, pixel=PITCH, size=SIZE, center="chief",
+               normalise="window").kernel[:, 0] for field in fields
+    ]  # fmt: skip
+    return torch.stack(found)
+
+
+def judging(lens: Lens, fields: tuple[float, ...], distances: Tensor) -> Tensor:
+    """PSFs of waves, of DRT off the axis at F/numbers below `WAVES_FROM`."""
+    if float(rt.first_order(lens).f_number) > 0.99 * WAVES_FROM:
+        return kernels_of(lens, "wave", fields, distances)
+    axis, others = fields[:1], fields[1:]
+    return torch.cat([kernels_of(lens, "wave", axis, distances), kernels_of(lens, "drt", others, distances)])
+
+
+def noise_of(electrons: Tensor, mean: float) -> Tensor:
+    """Standard deviation (F,) of levels, shot noise at the mean level and read noise."""
+    return (electrons * mean + READ_NOISE**2).sqrt() / electrons
+
+
+def error_of(kernels: Tensor, spectrum: Tensor, sigma: Tensor) -> Tensor:
+    """Expected mean square error (F,) behind depth-invariant Wiener filters of kernels (F or 1, D, h, w)."""
+    each = kernels.expand(len(sigma), *kernels.shape[1:])
+    return torch.stack([kernel_error(one, spectrum, s) for one, s in zip(each, sigma, strict=True)])
+
+
+def best_sensors(
+    lens: Lens, model: str, fields: tuple[float, ...], distances: Tensor, spectrum: Tensor, noise: dict[str, Tensor]
+) -> dict[str, float]:
+    """Sensor distance, mm, of least error for every light: of a grid, and the parabola through its neighbours."""
+    ends = paraxial_sensor(lens, distances)
+    low = float(ends.min()) if model in FIRST_ORDER else rms_focus(lens, float(distances.max())) - 0.1
+    grid = np.linspace(low, float(ends.max()), SENSORS)
+    kernels = [kernels_of(lens.at(sensor_distance=s), model, fields, distances) for s in grid]
+    best = {}
+    for light, sigma in noise.items():
+        found = [float(error_of(one, spectrum, sigma).mean()) for one in kernels]
+        least = min(max(int(np.argmin(found)), 1), SENSORS - 2)
+        square, slope, _ = np.polyfit(grid[least - 1 : least + 2], found[least - 1 : least + 2], 2)
+        bottom = -slope / (2 * square) if square > 0 else grid[int(np.argmin(found))]
+        best[light] = float(np.clip(bottom, grid[0], grid[-1]))
+    return best
+
+
+def rms_focus(lens: Lens, distance: float) -> float:
+    return float(rt.focus(lens.at(object_distance=distance)).lens.surfaces[-2].thickness)
+
+
+def patches_of(pictures: list[Tensor], count: int, *key: int) -> Tensor:
+    """Random patches (count, PATCH, PATCH) of light, functions of the key."""
+    random, found = draws(*key), []
+    for _ in range(count):
+        picture = pictures[int(random.integers(len(pictures)))]
+        row, column = (int(random.integers(side - PATCH + 1)) for side in picture.shape)
+        found.append(picture[row : row + PATCH, column : column + PATCH])
+    return torch.stack(found)
+
+
+def restored(kernels: Tensor, spectrum: Tensor, sigma: Tensor, electrons: Tensor, pictures: list[Tensor], seed: int):
+    """Mean square error of restored pictures, mean over fields, depths and patches; the same patches and draws of noise
+    for all F/numbers."""
+    patches, found = patches_of(pictures, PATCHES, seed, 0), []
+    for field, (each, s, n) in enumerate(zip(kernels, sigma, electrons, strict=True)):
+        filter = depth_invariant_wiener(transfer_functions(each, PATCH), spectrum, s)
+        generator = torch.Generator().manual_seed(int(draws(seed, field).integers(2**62)))
+        for kernel in each:
+            image = blur(patches, kernel, boundary="reflect")
+            image = count_electrons(image.clamp_min(0), float(n), generator=generator)
+            image = add_noise(image, READ_NOISE / float(n), generator=generator)
+            estimate = rt.restore(image, filter)
+            found.append(float(mean_square_error(estimate, patches, margin=SIZE // 2).mean()))
+    return float(np.mean(found))
+
+
+@torch.no_grad()
+def rows_of(name: str, f_number: float, depth: str, pictures: tuple[list[Tensor], list[Tensor]]) -> list[dict]:
+    """The rows of a lens, an F/number and a range of depths."""
+    fields = LENSES[name][1]
+    near, far = RANGES[depth]
+    steps = (torch.arange(DEPTHS, dtype=torch.float64) + 0.5) / DEPTHS
+    distances = 1 / (1 / near + (1 / far - 1 / near) * steps)
+    lens = clipped(name).at(f_number=f_number, object_distance=float(distances[DEPTHS // 2]))
+    solid = rt.relative_illumination(lens, fields=list(fields)).projected_solid_angle
+    share = solid / (math.pi / 4 / 4.0**2)
+    electrons = {light: n * share for light, n in LIGHTS.items()}
+    spectrum = power_spectrum(patches_of(pictures[0], 200, 0, 1))
+    mean = float(torch.cat([picture.flatten() for picture in pictures[0]]).mean())
+    noise = {light: noise_of(n, mean) for light, n in electrons.items()}
+    rows, sensors = [], {}
+    for model in ("paraxial", "fourier", "gaussian", "drt"):
+        sensors[model] = best_sensors(lens, model, fields, distances, spectrum, noise)
+        for light, sigma in noise.items():
+            kernels = kernels_of(lens.at(sensor_distance=sensors[model][light]), model, fields, distances)
+            rows.append(row_of(name, f_number, depth, light, model, sensors[model][light], kernels, spectrum, sigma))
+    for light, sigma in noise.items():
+        kernels = judging(lens.at(sensor_distance=sensors["drt"][light]), fields, distances)
+        row = row_of(name, f_number, depth, light, "wave", sensors["drt"][light], kernels, spectrum, sigma)
+        each = [restored(kernels, spectrum, sigma, electrons[light], pictures[1], seed) for seed in range(SEEDS)]
+        rows.append(row | {f"restored_{seed}": error for seed, error in enumerate(each)})
+    return [{**row, "electrons_axis": float(electrons[row["light"]][0])} for row in rows]
+
+
+def row_of(name, f_number, depth, light, model, sensor, kernels, spectrum, sigma) -> dict:
+    errors = error_of(kernels, spectrum, sigma)
+    head = {"lens": name, "f_number": f_number, "depth": depth, "light": light, "model": model, "sensor_mm": sensor}
+    return head | {"error": float(errors.mean())} | {f"error_{k}": float(e) for k, e in enumerate(errors)}
+
+
+def decibel(error: float) -> float:
+    return -10 * math.log10(error)
+
+
+def curves(rows: list[dict], name: str, depth: str, light: str) -> dict[str, dict[float, dict]]:
+    """Rows by model and F/number."""
+    found: dict[str, dict[float, dict]] = {}
+    for row in rows:
+        if (row["lens"], row["depth"], row["light"]) == (name, depth, light):
+            found.setdefault(row["model"], {})[row["f_number"]] = row
+    return found
+
+
+def interval(differences: list[float]) -> tuple[float, float]:
+    """Mean and half width of its 95 % confidence interval by Student's t."""
+    width = student.ppf(0.975, len(differences) - 1) * np.std(differences, ddof=1) / np.sqrt(len(differences))
+    return float(np.mean(differences)), float(width)
+
+
+def winner(curve: dict[float, dict]) -> float:
+    return min(curve, key=lambda n: curve[n]["error"])
+
+
+def seeds_of(row: dict) -> list[float]:
+    return [decibel(row[f"restored_{seed}"]) for seed in range(SEEDS)]
+
+
+def table(rows: list[dict]) -> str:
+    """The table of the page: the F/number that each model selects, and the PSNR that this costs."""
+    models = [*ORDERS]
+    heads = ["lens", "depth", "light", *models, "PSNR of wave's choice", *(f"{m}, loss" for m in models[:-1])]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for name, depth, light in dict.fromkeys((r["lens"], r["depth"], r["light"]) for r in rows):
+        found = curves(rows, name, depth, light)
+        chosen = {model: winner(curve) for model, curve in found.items()}
+        judge = found["wave"]
+        best = seeds_of(judge[chosen["wave"]])
+        words = [name, depth, light, *(f"F/{chosen[m]:g}" for m in models), f"{np.mean(best):.2f}"]
+        for model in models[:-1]:
+            lost = [b - a for a, b in zip(seeds_of(judge[chosen[model]]), best, strict=True)]
+            middle, width = interval(lost)
+            words.append("0" if chosen[model] == chosen["wave"] else f"{middle:.2f} ± {width:.2f}")
+        lines.append("| " + " | ".join(words) + " |")
+    return "\n".join(lines)
+
+
+def figure(rows: list[dict]):
+    """Predicted PSNR over the F/number by model, and that of restored pictures."""
+    scenes = [*dict.fromkeys((r["depth"], r["light"]) for r in rows)]
+    names = [*dict.fromkeys(r["lens"] for r in rows)]
+    drawn = new_figure(3.0 * len(scenes), 2.7 * len(names))
+    panels = drawn.subplots(len(names), len(scenes), squeeze=False)
+    for line, name in zip(panels, names, strict=True):
+        for panel, (depth, light) in zip(line, scenes, strict=True):
+            found = curves(rows, name, depth, light)
+            for number, (model, curve) in enumerate(found.items()):
+                n = sorted(curve)
+                colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
+                values = [decibel(curve[k]["error"]) for k in n]
+                panel.plot(n, values, color=colour, label=model, linewidth=1.8 if model == "wave" else 1.1)
+                best = winner(curve)
+                panel.plot(best, decibel(curve[best]["error"]), "o", ms=5, color=colour)
+            judge = found["wave"]
+            n = sorted(judge)
+            panel.plot(n, [np.mean(seeds_of(judge[k])) for k in n], "x", color=GREY, label="restored pictures")
+            panel.set_xscale("log", base=2)
+            panel.set_xticks(n, [f"{k:g}" for k in n], fontsize=7)
+            panel.minorticks_off()
+            panel.set_title(f"{name}, {depth} depth, {light}", fontsize=8)
+            panel.set(xlabel="F/number", ylabel="PSNR, dB")
+    panels[0][0].legend(fontsize=6)
+    return drawn
+
+
+def save(rows: list[dict], stem: Path) -> None:
+    columns = [*dict.fromkeys(key for row in rows for key in row)]
+    with open(stem.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n", restval="")
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    figure(rows).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", required=True, help="folder of pictures")
+    parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
+    parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
+    chosen = parser.parse_args(words)
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", UnfilledStop)
+    rt.prepare()
+    sets = split(read(files(chosen.data, chosen.limit), least=PATCH))
+    pictures = tuple([linearised(sample).double() for sample in part.samples] for part in sets)
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, (f_numbers, _) in LENSES.items():
+        for depth in RANGES:
+            for f_number in reversed(f_numbers):
+                path = chosen.folder / f"{name}_{depth}_{f_number:g}.json"
+                if not path.exists():
+                    write_json(path, {"rows": rows_of(name, f_number, depth, pictures)})
+                    print(path.name, flush=True)
+                rows += read_json(path)["rows"]
+    print(table(rows))
+    if chosen.docs:
+        save(rows, chosen.docs / "camera_aperture")
+
+
+if __name__ == "__main__":
+    main()
