@@ -331,7 +331,7 @@ def draw_pictures(study: Study):
     load_state(one, read_state(folder / "step2" / "checkpoint.pt"), folder)
     one.use("drt")
     size = 96 + settings.size - 1
-    light = light_of(torch.as_tensor(dead_leaves(1, size=size, seed=3, smallest=2.0, colour=True).samples[0] / 255.0))
+    light = light_of(torch.as_tensor(dead_leaves(1, size=size, seed=3, smallest=4.0, colour=True).samples[0] / 255.0))
     train_pictures, _ = split(study.pictures, seed=0)
     spectrum = patch_spectrum(train_pictures, 96 + settings.size - 1, crops=1)
     filters = field_filters(one, spectrum, (0.0, 1.0), even_distances(one, DISTANCES, spread=settings.spread))
@@ -348,9 +348,9 @@ def draw_pictures(study: Study):
             axis.imshow(encoded(image[0]).movedim(0, -1).numpy(), interpolation="nearest")
             quality = "" if name == "scene" else f", {float(psnr((image - target).square().mean())):.2f} dB"
             axis.set_title(name + quality, fontsize=9)
-        residual = (0.5 + 2 * (network - target)[0]).clamp(0, 1)
+        residual = (0.5 + (network - target)[0]).clamp(0, 1)
         axes[row, 4].imshow(residual.movedim(0, -1).numpy(), interpolation="nearest")
-        axes[row, 4].set_title("residual of the network, × 2", fontsize=9)
+        axes[row, 4].set_title("residual of the network", fontsize=9)
         axes[row, 0].set_ylabel("middle" if place == 0 else "corner")
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
