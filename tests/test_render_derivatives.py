@@ -34,9 +34,9 @@ SIZE = 9  # pixels, of FINE: kernels are larger, and lose light at the borders
 
 
 def base():
-    """The double Gauss at F/2.4 in two colours, 1 mm out of focus; its semi-diameters clip, but that of the stop."""
+    """The double Gauss at F/2 in two colours, 1 mm out of focus; its semi-diameters clip, but that of the stop."""
     lens = rt.read_lens("double_gauss").at(
-        f_number=2.4, wavelengths=[0.53, 0.61], object_distance=2e3, sensor_distance=62.0
+        f_number=2.0, wavelengths=[0.53, 0.61], object_distance=2e3, sensor_distance=62.0
     )
     for number, surface in enumerate(lens.surfaces[1:-1], 1):
         if number != lens.stop:
@@ -67,7 +67,7 @@ def moved(kind, unit):
         before, behind = (lens.surfaces[lens.stop - back].thickness for back in (1, 0))
         return lens.replace(lens.stop - 1, thickness=before + step).replace(lens.stop, thickness=behind - step)
     if kind == "entrance_pupil":
-        return dataclasses.replace(lens, aperture=SystemAperture("entrance_pupil_diameter", 41.5 + step))
+        return dataclasses.replace(lens, aperture=SystemAperture("entrance_pupil_diameter", 36.0 + step))
     if kind == "stop_radius":  # clips 1 mm inside the beam
         return lens.replace(lens.stop, apertures=(Aperture("circular", (0.0, 11.5 + step)),))
     return lens.replace(7, apertures=(Aperture("circular", (0.0, lens.surfaces[7].semi_diameter - 1.0 + step)),))
@@ -125,7 +125,7 @@ def test_apertures_clip():
         lens, surfaces=tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
     )
     whole = rt.relative_illumination(open_lens, fields=fields).projected_solid_angle
-    assert all(0.7 < float(share) < 0.99 for share in light / whole)
+    assert all(0.5 < float(share) < 0.9 for share in light / whole)
 
 
 @pytest.mark.parametrize(
