@@ -45,8 +45,8 @@ def expected_square_error(spectra: Tensor, places: Tensor, *, pixels: float | No
 
     That of the mean likelihood, the mean over images of the log-likelihood: weights w_ab ∝ exp(-E_a ln p_a/p_b) of
     places b, whose mean square distance from a is the error. Of fine steps and much information it is the Cramér-Rao
-    bound; it also counts places that are far but look alike, as in front of and behind the focus. pixels: of the
-    patch, as for `expected_log_likelihood_ratios`.
+    bound. Places that are far but look alike, as in front of and behind the focus, count too, but less than images
+    mistake them where the ratio is several nats. pixels: of the patch, as for `expected_log_likelihood_ratios`.
     """
     weights = torch.softmax(-expected_log_likelihood_ratios(spectra, pixels=pixels), 1)
     return (weights * (places - places[:, None]) ** 2).sum(1)
