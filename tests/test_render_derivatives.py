@@ -28,7 +28,7 @@ KINDS = {
 }
 #: On the axis, at an edge and at a corner, mm.
 POINTS = torch.tensor([[0.0, 0.0, -9.0], [0.0, 12.0, 11.0]], dtype=torch.float64)
-SENSOR = rt.Sensor(size=(18.0, 24.0), pixels=(12, 16), response="rgb")
+SENSOR = rt.Sensor(size=(1.2, 1.6), pixels=(12, 16), response="rgb", offset=(-5.0, 10.0))
 FINE = rt.Sensor(size=(18.0, 24.0), pixels=(900, 1200), response="rgb")
 SIZE = 9  # pixels, of FINE: kernels are larger, and lose light at the borders
 
@@ -93,7 +93,7 @@ def picture(model, order):
     scene, weights = random(3, 16, 12), random(3, 16, 12, seed=1)
 
     def light(lens):
-        ready = optics(lens, SENSOR, model=model, order=order, size=5, nodes=(3, 3), tol=0.1)
+        ready = optics(lens, SENSOR, model=model, order=order, size=SIZE, nodes=(3, 3), tol=1e-9)  # no low rank
         return (weights * ready(scene)).sum()
 
     return light
@@ -125,7 +125,7 @@ def test_apertures_clip():
         lens, surfaces=tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
     )
     whole = rt.relative_illumination(open_lens, fields=fields).projected_solid_angle
-    assert all(0.5 < float(share) < 0.9 for share in light / whole)
+    assert all(0.5 < float(share) < 0.95 for share in light / whole)
 
 
 @pytest.mark.parametrize(
@@ -147,8 +147,9 @@ def test_derivatives_of_patches(model, kind):
     [(model, kind) for model in MODELS for kind in ("curvature", "asphere", "stop_radius", "semi_diameter")],
 )
 def test_derivatives_of_whole_pictures(model, kind):
+    """Where an aperture begins to clip, the derivative of the illumination errs by up to 2e-4 of it."""
     order, eps, rel = MODELS[model]
-    check(picture(model, order), lambda unit: moved(kind, unit), eps=eps, rel=rel)
+    check(picture(model, order), lambda unit: moved(kind, unit), eps=eps, rel=max(rel, 1e-3))
 
 
 @pytest.mark.slow

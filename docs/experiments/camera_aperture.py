@@ -278,12 +278,16 @@ def save(rows: list[dict], stem: Path) -> None:
     figure(rows).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", required=True, help="folder of pictures")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnfilledStop)
