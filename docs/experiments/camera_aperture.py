@@ -11,6 +11,7 @@ computes what is missing.
 import argparse
 import csv
 import dataclasses
+import functools
 import math
 import warnings
 from pathlib import Path
@@ -137,38 +138,61 @@ def restored(kernels: Tensor, spectrum: Tensor, sigma: Tensor, electrons: Tensor
     return float(np.mean(found))
 
 
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A lens at an F/number, its object distances, and the light of every field by kind of light."""
+
+    lens: Lens
+    fields: tuple[float, ...]
+    distances: Tensor
+    electrons: dict[str, Tensor]
+    noise: dict[str, Tensor]
+    spectrum: Tensor
+
+
 @torch.no_grad()
-def rows_of(name: str, f_number: float, depth: str, pictures: tuple[list[Tensor], list[Tensor]]) -> list[dict]:
-    """The rows of a lens, an F/number and a range of depths."""
+def scene_of(name: str, f_number: float, depth: str, pictures: list[Tensor]) -> Scene:
+    """pictures: of the spectrum."""
     fields = LENSES[name][1]
     near, far = RANGES[depth]
     steps = (torch.arange(DEPTHS, dtype=torch.float64) + 0.5) / DEPTHS
     distances = 1 / (1 / near + (1 / far - 1 / near) * steps)
     lens = clipped(name).at(f_number=f_number, object_distance=float(distances[DEPTHS // 2]))
     solid = rt.relative_illumination(lens, fields=list(fields)).projected_solid_angle
-    share = solid / (math.pi / 4 / 4.0**2)
-    electrons = {light: n * share for light, n in LIGHTS.items()}
-    spectrum = power_spectrum(patches_of(pictures[0], 200, 0, 1))
-    mean = float(torch.cat([picture.flatten() for picture in pictures[0]]).mean())
+    electrons = {light: n * solid / (math.pi / 4 / 4.0**2) for light, n in LIGHTS.items()}
+    mean = float(torch.cat([picture.flatten() for picture in pictures]).mean())
     noise = {light: noise_of(n, mean) for light, n in electrons.items()}
+    return Scene(lens, fields, distances, electrons, noise, power_spectrum(patches_of(pictures, 200, 0, 1)))
+
+
+@torch.no_grad()
+def predicted(scene: Scene, head: dict) -> list[dict]:
+    """The error that every model expects, at the sensor distance of its own minimum, of waves at that of DRT."""
     rows, sensors = [], {}
-    for model in ("paraxial", "fourier", "gaussian", "drt"):
-        sensors[model] = best_sensors(lens, model, fields, distances, spectrum, noise)
-        for light, sigma in noise.items():
-            kernels = kernels_of(lens.at(sensor_distance=sensors[model][light]), model, fields, distances)
-            rows.append(row_of(name, f_number, depth, light, model, sensors[model][light], kernels, spectrum, sigma))
-    for light, sigma in noise.items():
-        kernels = judging(lens.at(sensor_distance=sensors["drt"][light]), fields, distances)
-        row = row_of(name, f_number, depth, light, "wave", sensors["drt"][light], kernels, spectrum, sigma)
-        each = [restored(kernels, spectrum, sigma, electrons[light], pictures[1], seed) for seed in range(SEEDS)]
-        rows.append(row | {f"restored_{seed}": error for seed, error in enumerate(each)})
-    return [{**row, "electrons_axis": float(electrons[row["light"]][0])} for row in rows]
+    for model in ORDERS:
+        if model != "wave":
+            sensors = best_sensors(scene.lens, model, scene.fields, scene.distances, scene.spectrum, scene.noise)
+        for light, sigma in scene.noise.items():
+            lens = scene.lens.at(sensor_distance=sensors[light])
+            compute = judging if model == "wave" else functools.partial(kernels_of, model=model)
+            errors = error_of(compute(lens, fields=scene.fields, distances=scene.distances), scene.spectrum, sigma)
+            row = {**head, "light": light, "model": model, "sensor_mm": sensors[light], "error": float(errors.mean())}
+            row |= {f"error_{k}": float(e) for k, e in enumerate(errors)}
+            rows.append(row | {"electrons_axis": float(scene.electrons[light][0])})
+    return rows
 
 
-def row_of(name, f_number, depth, light, model, sensor, kernels, spectrum, sigma) -> dict:
-    errors = error_of(kernels, spectrum, sigma)
-    head = {"lens": name, "f_number": f_number, "depth": depth, "light": light, "model": model, "sensor_mm": sensor}
-    return head | {"error": float(errors.mean())} | {f"error_{k}": float(e) for k, e in enumerate(errors)}
+@torch.no_grad()
+def tested(scene: Scene, rows: list[dict], pictures: list[Tensor]) -> dict[str, dict[str, float]]:
+    """Mean square error of restored pictures by kind of light and seed."""
+    found = {}
+    for row in rows:
+        if row["model"] == "wave":
+            light = row["light"]
+            kernels = judging(scene.lens.at(sensor_distance=row["sensor_mm"]), scene.fields, scene.distances)
+            about = scene.spectrum, scene.noise[light], scene.electrons[light], pictures
+            found[light] = {f"restored_{seed}": restored(kernels, *about, seed) for seed in range(SEEDS)}
+    return found
 
 
 def decibel(error: float) -> float:
@@ -254,12 +278,16 @@ def save(rows: list[dict], stem: Path) -> None:
     figure(rows).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
 
 
-def main(words: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", required=True, help="folder of pictures")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnfilledStop)
@@ -271,11 +299,18 @@ def main(words: list[str] | None = None) -> None:
     for name, (f_numbers, _) in LENSES.items():
         for depth in RANGES:
             for f_number in reversed(f_numbers):
-                path = chosen.folder / f"{name}_{depth}_{f_number:g}.json"
-                if not path.exists():
-                    write_json(path, {"rows": rows_of(name, f_number, depth, pictures)})
-                    print(path.name, flush=True)
-                rows += read_json(path)["rows"]
+                head = {"lens": name, "f_number": f_number, "depth": depth}
+                paths = [chosen.folder / f"{name}_{depth}_{f_number:g}{part}.json" for part in ("", "_restored")]
+                if not all(path.exists() for path in paths):
+                    scene = scene_of(name, f_number, depth, pictures[0])
+                if not paths[0].exists():
+                    write_json(paths[0], {"rows": predicted(scene, head)})
+                of_case = read_json(paths[0])["rows"]
+                if not paths[1].exists():
+                    write_json(paths[1], tested(scene, of_case, pictures[1]))
+                    print(paths[0].name, flush=True)
+                errors = read_json(paths[1])
+                rows += [{**row, **errors[row["light"]]} if row["model"] == "wave" else row for row in of_case]
     print(table(rows))
     if chosen.docs:
         save(rows, chosen.docs / "camera_aperture")
