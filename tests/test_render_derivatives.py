@@ -5,6 +5,7 @@ import warnings
 
 import pytest
 import torch
+from test_render import random
 
 import raytrace as rt
 from raytrace.imaging.render import optics, patch_kernels, render_patches
@@ -71,10 +72,6 @@ def moved(kind, unit):
     if kind == "stop_radius":  # clips 1 mm inside the beam
         return lens.replace(lens.stop, apertures=(Aperture("circular", (0.0, 11.5 + step)),))
     return lens.replace(7, apertures=(Aperture("circular", (0.0, lens.surfaces[7].semi_diameter - 1.0 + step)),))
-
-
-def random(*shape, seed=0):
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def patches(model, order):

@@ -366,14 +366,18 @@ def table(rows: list[dict]) -> str:
     return text.getvalue()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", choices=[*ARMS, "pictures"])
     parser.add_argument("--data", required=True, help="folder of colour photographs")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--docs", type=Path, help="folder for the table and the figure")
     parser.add_argument("--seconds", type=float, default=60.0, help="processor time of a training")
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     prepare()
