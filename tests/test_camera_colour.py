@@ -442,3 +442,14 @@ def test_blur_of_patches_is_that_of_their_kernels(triplet):
     picture, distances, points, _ = samples(2)
     wanted = blur(picture, one.kernels(distances, points=points))
     torch.testing.assert_close(one.image(picture, distances, points=points), wanted)
+
+
+def test_a_camera_in_single_precision_has_the_same_kernels(triplet):
+    _, distances, points, _ = samples(3)
+    double = made(triplet).kernels(distances, points=points).detach()
+    single = made(triplet).float()
+    kernels = single.kernels(distances.float(), points=points.float())
+    assert kernels.dtype == torch.float32
+    assert float((kernels - double).abs().sum((-2, -1)).max()) < 1e-3
+    kernels.square().sum().backward()
+    assert all(bool(torch.isfinite(p.grad)) for p in single.variables.parameters())

@@ -299,3 +299,17 @@ def test_a_step_means_the_same_blur_for_every_variable(name):
     assert max(ratio) > 3 * min(ratio)
     with pytest.raises(BadVariables, match="step 'mm': expected sag or blur"):
         Variables(lens, "sensor", step="mm")
+
+
+def test_a_frozen_lens_is_not_moved_and_a_frozen_number_neither(lens):
+    prepare()
+    variables = Variables(lens, "thickness:2,4 sensor", hold="thickness:2-4<=18.1 buildable")
+    variables.requires_grad_(False)
+    start = variables.numbers()
+    variables.project()
+    assert variables.numbers() == start
+    variables.requires_grad_(True)
+    variables.thickness_4.requires_grad_(False)
+    variables.project()
+    assert variables.numbers()["thickness_4"] == start["thickness_4"]
+    assert sum(float(surface.thickness.detach()) for surface in variables().surfaces[2:5]) <= 18.1 + 1e-7

@@ -2,12 +2,14 @@
 
     python docs/experiments/camera_codesign.py models --data DIR -o FOLDER --docs docs
     python docs/experiments/camera_codesign.py apart --data DIR -o FOLDER --docs docs
+    python docs/experiments/camera_codesign.py pictures --data DIR -o FOLDER --docs docs
 
 `models`: step 1 of the first work with Gaussian and with DRT PSFs, of three lenses, all curvatures and air spaces.
 `apart`: a lens for its spot size and one for the closed form, each with a network trained behind it, against training
 of both together. Every training has `--seconds` of processor time, lens and network together: its number of steps
 follows from the measured time of a step. Step 2 freezes the lens and trains the network further with DRT PSFs; the test
-takes held-out photographs at the middle, at 0.7 and at the corner of the sensor. A second call resumes.
+takes held-out photographs at the middle, at 0.7 and at the corner of the sensor. A second call resumes. `pictures`
+draws the scene, the record of the sensor and its restorations, by the camera that `apart` trained together first.
 """
 
 import argparse
@@ -28,7 +30,13 @@ from torch import Tensor
 import raytrace as rt
 from raytrace.files import write_json, write_text
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.closed_form import camera_error, even_distances, field_filters, optimise_closed_form
+from raytrace.imaging.closed_form import (
+    camera_error,
+    even_distances,
+    field_filters,
+    optimise_closed_form,
+    patch_spectrum,
+)
 from raytrace.imaging.codesign import (
     TEST_EPOCH,
     Batches,
@@ -36,14 +44,16 @@ from raytrace.imaging.codesign import (
     batch,
     camera,
     lens_at_start,
+    light_of,
     optimise,
     spectrum_of,
     steps_per_epoch,
 )
 from raytrace.imaging.image import blur
-from raytrace.imaging.pictures import Pictures, digest, draws, files, read, split
+from raytrace.imaging.pictures import Pictures, dead_leaves, digest, draws, files, read, split
+from raytrace.imaging.render import encoded
 from raytrace.imaging.restoration import psnr, restore
-from raytrace.imaging.training import Run, read_json, train
+from raytrace.imaging.training import Run, load_state, read_json, read_state, train
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure
 from raytrace.settings import CodesignSettings
 from raytrace.shards import Share
@@ -68,6 +78,8 @@ PLACES = (0.0, 0.7, 1.0)  # shares of the half diagonal
 BANK = 48  # places and distances whose DRT PSFs train the network of a frozen lens
 REFINED = 80  # steps of step 2
 SEEDS = range(5)
+SHOWN = 9e3  # mm, object distance of the pictures
+TESTED = 7  # distances of the test, even in their reciprocal
 DISTANCES = 5  # of the closed form, which has half of the time
 ARMS = {
     "models": ("gaussian", "drt"),
@@ -94,7 +106,7 @@ class Study:
         return [*LENSES] if self.kind == "models" else ["cooke_triplet"]
 
     def settings(self, lens: str, arm: str, seed: int) -> CodesignSettings:
-        model = arm if self.kind == "models" else "gaussian"
+        model = arm if self.kind == "models" else "gaussian"  # also of pictures
         return dataclasses.replace(BASE, **LENSES[lens], model=model, seed=seed)
 
 
@@ -120,7 +132,12 @@ def for_spots(lens: Lens, settings: CodesignSettings) -> tuple[Lens, float]:
     """The lens of least spots at the focus distance, with the same variables and limits; processor time in s."""
     start, initial = time.process_time(), lens_at_start(lens, settings)
     length = float(rt.first_order(initial).effective_focal_length)
-    kinds = {"hold": f"efl={length!r}", "bounds": "thickness:1..15 sensor:60..90", "cycles": 40, "seconds": 20}
+    kinds = {
+        "hold": f"efl={length!r}",
+        "bounds": "thickness:1..15 thickness_6:4..15 sensor:60..90",
+        "cycles": 40,
+        "seconds": 20,
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         optimised = rt.optimize(initial, merit="spot", vary=settings.vary, **kinds).lens
@@ -210,22 +227,27 @@ def refined(one: Camera, pictures: Pictures, settings: CodesignSettings, folder:
 
 @torch.no_grad()
 def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, settings: CodesignSettings) -> dict:
-    """PSNR, dB, of held-out photographs at each place, behind the network and behind the Wiener filter of the place."""
+    """PSNR, dB, at each place, behind the network and behind the Wiener filter of the place.
+
+    Every held-out photograph is recorded at every one of TESTED distances: no lens is lucky to be in focus.
+    """
     spectrum = spectrum_of(train_pictures, settings)
-    distances = even_distances(one, DISTANCES, spread=settings.spread)
-    filters = field_filters(one, spectrum, PLACES, distances)
+    filters = field_filters(one, spectrum, PLACES, even_distances(one, DISTANCES, spread=settings.spread))
     samples, row = batch(test_pictures, settings, [*range(len(test_pictures))], TEST_EPOCH), {}
+    distances, count = even_distances(one, TESTED, spread=settings.spread), len(test_pictures)
     target = one.target(samples.picture)
     for place, filter in zip(PLACES, filters, strict=True):
-        points = place * one.sensor.corners[:, :1].expand(2, len(test_pictures))
-        kernels = kernels_of(one, points, samples.distance)
-        recorded = one.recorded(blur(samples.picture, kernels), points, samples.index, settings.seed)
-        behind = {
-            "network": one.restore(recorded),
-            "wiener": restore(recorded, filter.to(torch.complex64), boundary="taper"),
-        }
-        for name, image in {**behind, "recorded": recorded}.items():
-            row[f"{name}_{place:g}"] = float(psnr((image - target).square().mean()))
+        points = place * one.sensor.corners[:, :1]
+        kernels, errors = kernels_of(one, points.expand(2, TESTED), distances), {}
+        for number, kernel in enumerate(kernels):
+            image = blur(samples.picture, kernel)
+            recorded = one.recorded(image, points.expand(2, count), samples.index + number * count, settings.seed)
+            found = {"network": one.restore(recorded), "recorded": recorded}
+            found["wiener"] = restore(recorded, filter.to(torch.complex64), boundary="taper")
+            for name, estimate in found.items():
+                errors.setdefault(name, []).append((estimate - target).square().mean())
+        for name, squares in errors.items():
+            row[f"{name}_{place:g}"] = float(psnr(torch.stack(squares).mean()))
     for name in ("network", "wiener", "recorded"):
         row[name] = float(np.mean([row[f"{name}_{place:g}"] for place in PLACES]))
     return row
@@ -300,6 +322,41 @@ def draw(study: Study, rows: list[dict], reference: str):
     return figure
 
 
+@torch.no_grad()
+def draw_pictures(study: Study):
+    """Scene, record, restorations and the residual of the network, at the middle and at the corner of the sensor."""
+    folder = study.folder.parent / "apart" / "cooke_triplet" / "together" / "0"
+    settings = study.settings("cooke_triplet", "together", 0)
+    one = camera(rt.read_lens("cooke_triplet"), settings)
+    load_state(one, read_state(folder / "step2" / "checkpoint.pt"), folder)
+    one.use("drt")
+    size = 96 + settings.size - 1
+    light = light_of(torch.as_tensor(dead_leaves(1, size=size, seed=3, smallest=4.0, colour=True).samples[0] / 255.0))
+    train_pictures, _ = split(study.pictures, seed=0)
+    spectrum = patch_spectrum(train_pictures, 96 + settings.size - 1, crops=1)
+    filters = field_filters(one, spectrum, (0.0, 1.0), even_distances(one, DISTANCES, spread=settings.spread))
+    scene, distance = light[None].float(), torch.tensor([SHOWN], dtype=torch.float64)
+    figure = new_figure(10.2, 4.6)
+    axes = figure.subplots(2, 5)
+    for row, (place, filter) in enumerate(zip((0.0, 1.0), filters, strict=True)):
+        points = place * one.sensor.corners[:, :1]
+        recorded = one.recorded(one.image(scene, distance, points=points), points, [row], 0)
+        target, network = one.target(scene), one.restore(recorded)
+        wiener = restore(recorded, filter.to(torch.complex64), boundary="taper")
+        shown = {"scene": target, "sensor": recorded, "network": network, "Wiener filter": wiener}
+        for axis, (name, image) in zip(axes[row], shown.items(), strict=False):
+            axis.imshow(encoded(image[0]).movedim(0, -1).numpy(), interpolation="nearest")
+            quality = "" if name == "scene" else f", {float(psnr((image - target).square().mean())):.2f} dB"
+            axis.set_title(name + quality, fontsize=9)
+        residual = (0.5 + (network - target)[0]).clamp(0, 1)
+        axes[row, 4].imshow(residual.movedim(0, -1).numpy(), interpolation="nearest")
+        axes[row, 4].set_title("residual of the network", fontsize=9)
+        axes[row, 0].set_ylabel("middle" if place == 0 else "corner")
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    return figure
+
+
 def table(rows: list[dict]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, [*rows[0]], lineterminator="\n")
@@ -311,7 +368,7 @@ def table(rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=[*ARMS])
+    parser.add_argument("study", choices=[*ARMS, "pictures"])
     parser.add_argument("--data", required=True, help="folder of colour photographs")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--docs", type=Path, help="folder for the table and the figure")
@@ -323,6 +380,9 @@ def main() -> None:
     warnings.filterwarnings("ignore", category=UserWarning)
     pictures = read(files(arguments.data), least=BASE.patch + BASE.size - 1, colour=True)
     study = Study(arguments.study, arguments.output / arguments.study, arguments.seconds, pictures)
+    if arguments.study == "pictures":
+        draw_pictures(study).savefig(arguments.docs / "camera_pictures.png")
+        return
     study.folder.mkdir(parents=True, exist_ok=True)
     about = {"pictures": digest(pictures.samples), "seconds": arguments.seconds}
     Run(study.folder / "about", about)

@@ -110,13 +110,17 @@ class Constraints:
         self.conditions, self.names = tuple(conditions), tuple(map(name_of, variables))
         self.unit, self.lower, self.upper, self.limits = unit, lower, upper, limits
 
-    def nearest(self, x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    def nearest(
+        self, x: np.ndarray, before: np.ndarray | None = None, *, fixed: np.ndarray | None = None
+    ) -> np.ndarray:
         """The nearest variables (n,) that meet all conditions and lose no ray of the rim.
 
-        before: those of the last step, which met them: the step is shortened where the nearest ones are far away. Warns
-        NotReached for conditions that are not met.
+        fixed: (n,) bool, variables that do not move; before: those of the last step, which met the conditions: the
+        step is shortened where the nearest ones are far away. Warns NotReached for conditions that are not met.
         """
-        wanted = np.clip(x, self.lower, self.upper)
+        frozen = np.zeros(len(x), dtype=bool) if fixed is None else fixed
+        self._ends = np.where(frozen, x, self.lower), np.where(frozen, x, self.upper)
+        wanted = np.clip(x, *self._ends)
         x, state = self._met(wanted)
         is_far = before is not None and self._distance(x, wanted) > _FAR * self._distance(wanted, before)
         if before is not None and (state.lost or is_far):
@@ -138,7 +142,7 @@ class Constraints:
                 step = self._linear(x, wanted).step(1e-12)
             except NoStep:
                 break
-            x = np.clip(x + step, self.lower, self.upper)
+            x = np.clip(x + step, *self._ends)
             state = self._state(x, derivatives=False)
         return x, state
 
@@ -176,8 +180,8 @@ class Constraints:
                 np.concatenate([state.limits, missed + _INSIDE]),
                 np.concatenate([state.limits_slope, slopes]),
             ),
-            lower=self.lower - x,
-            upper=self.upper - x,
+            lower=self._ends[0] - x,
+            upper=self._ends[1] - x,
             scale=1 / self.unit,
         )
 

@@ -479,8 +479,12 @@ class Variables(Owned):
     def project(self) -> None:
         """Move variables to the nearest ones within their bounds that meet the conditions of `hold`, after a step.
 
-        Rays of the rim of every field that fail are brought back. Warns NotReached for what is not met.
+        Rays of the rim of every field that fail are brought back; variables that need no gradient do not move. Warns
+        NotReached for what is not met.
         """
+        frozen = [not self.get_parameter(variable.name).requires_grad for variable in self.variables]
+        if all(frozen):
+            return
         for variable in self.variables:
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
@@ -488,7 +492,10 @@ class Variables(Owned):
         if self._constraints is None:
             return
         x = self._values()
-        nearest = self._constraints.nearest(x, self._before)
+        fixed = {variable.name for variable, is_frozen in zip(self.variables, frozen, strict=True) if is_frozen}
+        nearest = self._constraints.nearest(
+            x, self._before, fixed=np.array([variable.name in fixed for variable in self._all])
+        )
         for variable, before, after in zip(self._all, x, nearest, strict=True):
             if variable in self.variables and after != before:
                 self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
