@@ -131,7 +131,7 @@ ROWS = {
         "electrons of white: adds shot noise, and --read-noise instead of --noise", "E", type=positive_finite
     ),
     "read_noise": option("standard deviation in electrons, with --full-well", "E", type=not_negative),
-    "bits": option("of the quantisation (default: none)", type=count),
+    "bits": option("of the quantisation (default: none)", "N", type=count),
     "depth": option("layers, an even number, or poolings of the U-Net, instead of the preset's"),
     "width": option("maps of a layer, instead of the preset's"),
     "epochs": option("of each step"),
