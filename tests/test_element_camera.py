@@ -95,7 +95,7 @@ def test_a_model_of_rays_is_refused_with_elements(model):
 
 @pytest.mark.slow
 def test_the_window_and_the_order_hold_the_light_of_the_element():
-    lens, element = slow_gauss(), smooth_power(1e-3)
+    lens, element = slow_gauss(), smooth_power(3e-3)
     chosen = optics(lens, SENSOR, elements=element, nodes=(1, 1), **BARE)
     plain = optics(lens, SENSOR, model="wave", nodes=(1, 1), **BARE)
     assert chosen.kernels.shape[-1] > plain.kernels.shape[-1]
