@@ -533,3 +533,17 @@ def test_wide_gaussians_are_those_of_the_quadrature(deviation):
         centroid = torch.tensor([0.3, -0.2], dtype=torch.float64)
         close = wide_gaussian_pixels(pixels, centroid, covariance)
         assert float((close - gaussian_pixels(pixels, centroid, covariance)).abs().sum()) < 1e-4 / deviation**5
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_progress_counts_up_to_the_total(triplet, depth):
+    """Of one picture, and of layers, each of which is blurred with its coverage."""
+    picture, counted = random(3, ROWS, COLUMNS), []
+    distances = torch.where(torch.arange(COLUMNS) < COLUMNS // 2, 2e3, 9e3).expand(ROWS, COLUMNS) if depth else None
+    planes = None if distances is None else (1 / distances.unique()).sort().values
+    system = ready(triplet, object_distances=None if planes is None else 1 / planes)
+    system(picture, distances, progress=lambda done, total: counted.append((done, total)))
+    so_far = np.cumsum([done for done, _ in counted])
+    assert so_far[-1] == counted[-1][1]  # of layers also low rank, whose numbers differ
+    assert all(done <= total for done, (_, total) in zip(so_far, counted, strict=True))
+    assert depth or {total for _, total in counted} == {3 * 4}

@@ -7,13 +7,14 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 import raytrace
-from raytrace.cli.progress import progress
+from raytrace.cli.progress import Bar, Lines, progress
 from raytrace.cli.run import CommandError, open_lens, options_of, say
 from raytrace.cli.types import OutputFolder
 from raytrace.imaging.render import checked_depth, default_sensor, linearised
@@ -52,13 +53,12 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
     texts, records, rendering = [], [], None
     for number, file in enumerate(progress(files, "picture", what="render") if len(files) > 1 else files):
         load, sensor = pictures[number]
-        with _named(arguments.lens), progress(None, "convolution", what=f"render {file}") as bar:
+        with _named(arguments.lens), progress(1, "convolution", what=f"render {file}") as bar:
+            advance = partial(_advance, bar)
             if rendering is None or rendering.optics.sensor != sensor:
-                rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=bar.update)
+                rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=advance)
             else:
-                rendering = rendering.another(
-                    load(), options["depth"], boundary=options["boundary"], progress=bar.update
-                )
+                rendering = rendering.another(load(), options["depth"], boundary=options["boundary"], progress=advance)
             recorded = rendering.captured(number, arguments.seed)
         if targets[number] is not None:
             targets[number].parent.mkdir(parents=True, exist_ok=True)
@@ -73,6 +73,12 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
         texts.append(str(recorded))
     arguments.plot = arguments.output = None
     return RenderedPictures(tuple(texts), tuple(records))
+
+
+def _advance(bar: Bar | Lines, done: int, total: int) -> None:
+    """Move the progress of a picture, whose number of convolutions is known when its kernels are."""
+    bar.total = total
+    bar.update(done)
 
 
 def _names(function: Callable) -> set[str]:

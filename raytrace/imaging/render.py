@@ -92,7 +92,7 @@ class ImageFormation:
         *,
         softness: float = 0.0,
         boundary: str = "reflect",
-        progress: Callable[[int], object] | None = None,
+        progress: Callable[[int, int], object] | None = None,
     ) -> Tensor:
         """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm; others: see `render`."""
         picture = checked_picture(picture, self.sensor)
@@ -108,7 +108,7 @@ class ImageFormation:
         *,
         softness: float,
         boundary: str,
-        progress: Callable[[int], object] | None,
+        progress: Callable[[int, int], object] | None,
     ) -> Tensor:
         """The same of a picture and a depth map that are checked."""
         inverse = None if depth is None else 1 / depth
@@ -116,7 +116,9 @@ class ImageFormation:
             picture = resampled(picture, self.ideal, boundary)
             if inverse is not None:  # the mean of two depths is that of no object
                 inverse = resampled(inverse[..., None, :, :], self.ideal, boundary, mode="nearest")[..., 0, :, :]
-        how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": progress}
+        blurs = 1 if inverse is None else 2 * len(self.planes)
+        each = None if progress is None else _of_several(progress, blurs)
+        how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": each}
         flux = [enlarged(part, picture) for part in self.flux]
         window, haze = [1.0] * len(self.planes), 0.0
         if self.haze is not None:
@@ -138,6 +140,20 @@ class ImageFormation:
                 yield window[d] * light, coverage
 
         return occlusion(layers()) + haze
+
+
+def _of_several(progress: Callable[[int, int], object], blurs: int) -> Callable[[int, int], None]:
+    """The progress of several blurs in turn: those to come are expected to take as many convolutions as the current."""
+    finished, left, current = 0, blurs, 0
+
+    def advance(done: int, total: int) -> None:
+        nonlocal finished, left, current
+        current += done
+        progress(done, finished + left * total)
+        if current == total:
+            finished, left, current = finished + total, left - 1, 0
+
+    return advance
 
 
 def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
@@ -415,7 +431,7 @@ def render(
     distortion: bool = True,
     lateral_colour: bool = True,
     illumination: bool = True,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> "Rendering":
     """The picture that a lens projects onto its sensor, without noise, differentiable in the numbers of the lens.
 
@@ -433,7 +449,7 @@ def render(
         number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
-    progress: called with the number of convolutions done since the last call.
+    progress: called with the number of convolutions done since the last call, and their total.
     Raises ValueError for a picture, depth map or sensor that do not fit, WindowTooLarge for a blur of over 401 pixels.
     """
     light = linearised(picture)
@@ -622,7 +638,7 @@ class Rendering(Result):
         *,
         softness: float = 0.0,
         boundary: str = "reflect",
-        progress: Callable[[int], object] | None = None,
+        progress: Callable[[int, int], object] | None = None,
     ) -> Self:
         """The rendering of another picture of the same size by the same optics; arguments as for `render`."""
         light = checked_picture(linearised(picture), self.optics.sensor)

@@ -31,7 +31,7 @@ def varying_blur(
     *,
     boundary: str = "reflect",
     tol: float = 0.0,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Tensor:
     """Images (..., C, H, W) of pictures (..., C, H, W); kernels: (m, n, C, h, w) of odd h and w, at nodes of a grid.
 
@@ -39,7 +39,7 @@ def varying_blur(
     single row or column of nodes is the same everywhere. boundary: one of `image.EXTENSIONS`, how the picture continues
     beyond its edge. tol: allowed error of low rank, Σ |h - ĥ| / Σ |h| of every kernel; 0: patches alone. Low rank is
     used where no derivative may be requested and where it needs fewer operations. progress: called with the number of
-    convolutions done.
+    convolutions done since the last call, and their total.
     Raises ValueError for other shapes.
     """
     picture = as_picture(picture)
@@ -102,7 +102,7 @@ def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress,
                 beyond = left, shape[1] - left - columns, top, shape[0] - top - rows
                 total = total + torch.nn.functional.pad(part, beyond)
             if progress is not None:
-                progress(1)
+                progress(1, len(weights[0]) * len(weights[1]))
     return _inner(total, h, w)
 
 
@@ -166,6 +166,6 @@ def _by_rank(large: Tensor, modes: Tensor, shares: Tensor, weights: list[Tensor]
             spectrum = torch.fft.rfft2(large[..., c, :, :] * weight, s=fast)
             total = total + spectrum * torch.fft.rfft2(mode.to(large.dtype), s=fast)
             if progress is not None:
-                progress(1)
+                progress(1, len(modes) * large.shape[-3])
         channels.append(_inner(torch.fft.irfft2(total, s=fast)[..., : shape[0], : shape[1]], h, w))
     return torch.stack(channels, -3)
