@@ -24,7 +24,7 @@ from raytrace.imaging.codesign import (
     camera,
     closed_form,
     lens_at_start,
-    network,
+    network_at_start,
     outcome,
     run_model,
     sensor_at_start,
@@ -173,9 +173,9 @@ def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int =
 
     Processors without instructions for bfloat16 emulate it, ten times slower.
     """
-    channels = 1 if not settings.sensor else 3
-    trained = network(settings, channels).to(memory_format=torch.channels_last)
-    picture = torch.rand(count, channels, size, size)
+    trained = network_at_start(settings).to(memory_format=torch.channels_last)
+    sensor = sensor_at_start(settings)
+    picture = torch.rand(count, 1 if sensor is None else len(sensor.channels), size, size)
     seconds = {}
     for name, enabled in (("float32", False), ("bfloat16", True)):
         for _ in range(2):  # the first call prepares

@@ -483,7 +483,7 @@ class Camera(nn.Module):
         points: (2, B) mm of their centres; index, seed: of the noise, see `Sensor.capture`.
         """
         size = image.new_tensor([image.shape[-1], image.shape[-2]], dtype=torch.float64)
-        first = self.sensor.pixel_of(points.detach()).T - 0.5 * (size - 1)
+        first = self.sensor.pixel_of(points.detach().to(size)).T - 0.5 * (size - 1)
         origin = (first + 1e-6).floor().long()
         return self.sensor.demosaic(self.sensor.capture(image, index, seed, origin), origin)
 

@@ -62,7 +62,8 @@ def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     columns) the filter of each field point is joint, `joint_wiener`.
     """
     if camera.sensor is not None:
-        kernels, sigma = camera.kernels_over_field(distances), noise_deviation(camera, spectrum)
+        kernels, spectrum = camera.kernels_over_field(distances), spectrum.to(camera.fields.device)
+        sigma = noise_deviation(camera, spectrum)
         if spectrum.dim() == 4:
             return joint_kernel_error(kernels, spectrum, sigma).mean()
         return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
@@ -92,6 +93,7 @@ def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], dis
     """
     distances = even_distances(camera) if distances is None else distances
     points = camera.sensor.corners[:, :1] * camera.sensor.corners.new_tensor(places)
+    spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, points)
     transfer = transfer_functions(kernels, tuple(spectrum.shape[-2:]))
     if spectrum.dim() == 4:

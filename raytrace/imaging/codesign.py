@@ -8,6 +8,7 @@ a seed.
 """
 
 import dataclasses
+import functools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +32,7 @@ from raytrace.imaging.closed_form import (
     out_of_focus,
     patch_spectrum,
 )
-from raytrace.imaging.network import RedNet, RedNetShape, UNet
+from raytrace.imaging.network import RedNetShape, UNetShape, network
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.render import decoded
 from raytrace.imaging.restoration import psnr, restore, restore_jointly
@@ -130,6 +131,7 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | 
     )
 
 
+@functools.lru_cache(maxsize=8)  # every batch asks for it, and its response may be a file
 def sensor_at_start(settings: CodesignSettings) -> Sensor | None:
     """The sensor of an experiment, of whole pixels; None of a grey camera of field points."""
     if not settings.sensor:
@@ -146,13 +148,14 @@ def sensor_at_start(settings: CodesignSettings) -> Sensor | None:
     )
 
 
-def network(settings: CodesignSettings, channels: int) -> torch.nn.Module:
-    """The untrained network of an experiment."""
-    if settings.network == "u-net":
-        return UNet(channels=channels, levels=settings.depth, width=settings.width, seed=settings.seed)
-    if settings.network != "red-net":
-        raise ValueError(f"network {settings.network!r}: expected red-net or u-net")
-    return RedNet(RedNetShape(settings.depth, settings.width), channels=channels, seed=settings.seed)
+def network_at_start(settings: CodesignSettings) -> torch.nn.Module:
+    """The untrained network of an experiment, of as many channels as its sensor has. Raises ValueError."""
+    shapes = {"red-net": RedNetShape, "u-net": UNetShape}
+    if settings.network not in shapes:
+        raise ValueError(f"network {settings.network!r}: expected {' or '.join(shapes)}")
+    sensor = sensor_at_start(settings)
+    shape = shapes[settings.network](settings.depth, settings.width)
+    return network(shape, channels=1 if sensor is None else len(sensor.channels), seed=settings.seed)
 
 
 def camera(lens: Lens, settings: CodesignSettings) -> Camera:
@@ -166,7 +169,7 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
     return Camera(
         variables(lens, settings),
-        network(settings, 1 if sensor is None else len(sensor.channels)).to(memory_format=torch.channels_last),
+        network_at_start(settings).to(memory_format=torch.channels_last),
         model=settings.model,
         object_distances=(settings.near, settings.far),
         fields=fields if sensor is None else None,
@@ -414,6 +417,7 @@ def held_out_error(
 
 def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
     """Σ |filtered - picture| of every sample behind linear filters (C, rows, columns), (B,)."""
+    batch = batch.to(camera.fields.device)
     image = camera.image(batch.picture, batch.distance, points=batch.points)
     recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
     apply = restore_jointly if filters.dim() == 4 else restore

@@ -22,7 +22,7 @@ from raytrace.optimization.glass_choice import Pool
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, State
 from raytrace.optimization.optimize import EXACT, NotReached
 from raytrace.optimization.problem import Condition, Problem
-from raytrace.optimization.variables import Model, name_of
+from raytrace.optimization.variables import Model
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.words import calling_level
@@ -107,8 +107,9 @@ class Constraints:
         limits: Limits | None = None,
     ):
         self.problem = Problem(Model(lens, tuple(variables)), [*_rays(lens)], conditions)
-        self.conditions, self.names = tuple(conditions), tuple(map(name_of, variables))
-        self.unit, self.lower, self.upper, self.limits = unit, lower, upper, limits
+        self.conditions, self.limits = tuple(conditions), limits
+        self.unit, self.lower, self.upper = unit, lower, upper
+        self._ends = lower, upper  # of the variables that move
 
     def nearest(
         self, x: np.ndarray, before: np.ndarray | None = None, *, fixed: np.ndarray | None = None
@@ -170,7 +171,7 @@ class Constraints:
     def _linear(self, x: np.ndarray, wanted: np.ndarray) -> Linear:
         """The quadratic program at x, in which failed rays miss by less than nothing."""
         state = self._state(x, derivatives=True)
-        missed, slopes = self._missed(x)
+        missed, slopes = self._missed(x) if state.lost else (np.zeros(0), np.zeros((0, len(x))))
         return Linear(
             (x - wanted) / self.unit,
             np.diag(1 / self.unit),
@@ -188,8 +189,6 @@ class Constraints:
     def _missed(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Amounts (K,) by which failed rays of the rim miss a surface, and their derivatives (K, n)."""
         rows = np.flatnonzero(self.problem.evaluated(x).lost)
-        if not len(rows):
-            return np.zeros(0), np.zeros((0, len(x)))
         missed, slopes, _ = self.problem.recovery.excess(x, rows, derivatives=True)
         known = missed > 0
         return missed[known], slopes[known]

@@ -1,4 +1,4 @@
-"""Depth from defocus: how well one image tells the distance of its object, and the most likely distance.
+"""Depth from defocus: how well one image determines the distance of its object, and the most likely distance.
 
 A patch of a scene of power spectrum S, blurred by the kernel of distance z, with white noise of variance σ², is a
 Gaussian random field of the spectrum

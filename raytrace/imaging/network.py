@@ -33,11 +33,11 @@ class UNetShape:
 PRESETS = {"paper": RedNetShape(30, 64), "cpu": RedNetShape(10, 32), "unet": UNetShape()}
 
 
-def network(preset: str, *, channels: int = 1, seed: int = 0) -> nn.Module:
-    """The network of a name in `PRESETS`, untrained. Raises ValueError for other names."""
-    if preset not in PRESETS:
+def network(preset: str | RedNetShape | UNetShape, *, channels: int = 1, seed: int = 0) -> nn.Module:
+    """The network of a name in `PRESETS`, or of a shape, untrained. Raises ValueError for other names."""
+    if isinstance(preset, str) and preset not in PRESETS:
         raise ValueError(f"network {preset!r}: expected {', '.join(PRESETS)}")
-    shape = PRESETS[preset]
+    shape = PRESETS[preset] if isinstance(preset, str) else preset
     if isinstance(shape, UNetShape):
         return UNet(channels=channels, width=shape.width, levels=shape.levels, seed=seed)
     return RedNet(shape, channels=channels, seed=seed)

@@ -480,7 +480,7 @@ class Variables(Owned):
         """Move variables to the nearest ones within their bounds that meet the conditions of `hold`, after a step.
 
         Rays of the rim of every field that fail are brought back; variables that need no gradient do not move. Warns
-        NotReached for what is not met.
+        NotReached for conditions that are not met.
         """
         frozen = [not self.get_parameter(variable.name).requires_grad for variable in self.variables]
         if all(frozen):
