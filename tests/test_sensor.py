@@ -462,3 +462,9 @@ def test_a_wrong_table_is_named_with_its_line(tmp_path, text, message):
     (tmp_path / "table.csv").write_text(text, "utf-8")
     with pytest.raises(ValueError, match=message):
         sensor(response=tmp_path / "table.csv")
+
+
+def test_points_on_the_diagonal_begin_at_the_middle_of_a_shifted_sensor():
+    sensor = rt.Sensor((24, 16), (240, 160), offset=(1.0, -2.0))
+    points = sensor.on_diagonal([0.0, 0.5, 1.0])
+    assert points.T.tolist() == [[1.0, -2.0], [7.0, -6.0], [13.0, -10.0]]

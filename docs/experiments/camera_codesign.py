@@ -237,7 +237,7 @@ def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, setti
     distances, count = even_distances(one, TESTED, spread=settings.spread), len(test_pictures)
     target = one.target(samples.picture)
     for place, filter in zip(PLACES, filters, strict=True):
-        points = place * one.sensor.corners[:, :1]
+        points = one.sensor.on_diagonal([place])
         kernels, errors = kernels_of(one, points.expand(2, TESTED), distances), {}
         for number, kernel in enumerate(kernels):
             image = blur(samples.picture, kernel)
@@ -339,7 +339,7 @@ def draw_pictures(study: Study):
     figure = new_figure(10.2, 4.6)
     axes = figure.subplots(2, 5)
     for row, (place, filter) in enumerate(zip((0.0, 1.0), filters, strict=True)):
-        points = place * one.sensor.corners[:, :1]
+        points = one.sensor.on_diagonal([place])
         recorded = one.recorded(one.image(scene, distance, points=points), points, [row], 0)
         target, network = one.target(scene), one.restore(recorded)
         wiener = restore(recorded, filter.to(torch.complex64), boundary="taper")

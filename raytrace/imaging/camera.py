@@ -193,11 +193,8 @@ class Camera(nn.Module):
 
     def _fields_of_sensor(self, shares: Sequence[float] = (0.0, 0.7, 1.0)) -> Tensor:
         """Field points (2, F) of shares of the way from the middle of the sensor to its corner, where there are any."""
-        corner = self.sensor.corners[:, 0]
-        middle = self.sensor.corners.mean(1)
-        points = torch.stack([middle + share * (corner - middle) for share in shares], 1)
         with torch.no_grad():
-            fields = self.sensor.fields(self.lens(), points)
+            fields = self.sensor.fields(self.lens(), self.sensor.on_diagonal(shares))
         return fields[:, ~fields.isnan().any(0)]
 
     @property

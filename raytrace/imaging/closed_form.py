@@ -92,9 +92,8 @@ def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], dis
     over the camera's range; spectrum: (C, rows, columns) of the scene.
     """
     distances = even_distances(camera) if distances is None else distances
-    points = camera.sensor.corners[:, :1] * camera.sensor.corners.new_tensor(places)
     spectrum = spectrum.to(camera.fields.device)
-    kernels = camera.kernels_over_field(distances, points)
+    kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
     transfer = transfer_functions(kernels, tuple(spectrum.shape[-2:]))
     if spectrum.dim() == 4:
         return joint_wiener(transfer, spectrum, noise_deviation(camera, spectrum))

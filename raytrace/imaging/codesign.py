@@ -406,7 +406,7 @@ def held_out_error(
         if distance is not None:
             samples = dataclasses.replace(samples, distance=torch.full_like(samples.distance, distance))
         if place is not None:
-            points = place * camera.sensor.corners[:, :1].expand(2, len(samples.index))
+            points = camera.sensor.on_diagonal([place]).expand(2, len(samples.index))
             samples = dataclasses.replace(samples, points=points)
         if filters is None:
             total += float(absolute_error(camera, samples).sum())

@@ -126,6 +126,11 @@ class Sensor:
         left, right, top, bottom = -0.5, columns - 0.5, -0.5, rows - 0.5
         return self.points(_numbers([left, right, left, right]), _numbers([top, top, bottom, bottom]))
 
+    def on_diagonal(self, shares: Tensor | Sequence[float]) -> Tensor:
+        """Points (2, N) mm at shares (N,) of the way from the middle of the sensor to its upper left corner."""
+        middle = self.corners.mean(1, keepdim=True)
+        return middle + (self.corners[:, :1] - middle) * _numbers(shares)
+
     def points(self, columns: Tensor | float, rows: Tensor | float) -> Tensor:
         """Points (2, ...) mm on the sensor of pixel coordinates, which broadcast; whole numbers are pixel centres."""
         column, row = torch.broadcast_tensors(_numbers(columns), _numbers(rows))
