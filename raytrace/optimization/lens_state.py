@@ -877,17 +877,12 @@ class Bundle:
     def _hits_by_torch(self, state: LensState) -> Hits:
         def end(lens: Lens) -> Rays:
             wavelength = lens.wavelengths[:, None]
-            indices = unbent(lens, media(lens, wavelength)[: self.last + 1])
+            indices = media(lens, wavelength)[: self.last + 1]
             rays = self._start_by_torch(lens)
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength)
 
         parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=self._aims_bent)
         return self._as_hits(state, parts, valid)
-
-
-def unbent(lens: Lens, indices: list) -> list:
-    """Indices behind the first surfaces of a lens, the object's first; behind the image as before it."""
-    return [*indices[:-1], indices[-2]] if len(indices) == len(lens.surfaces) else indices
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:

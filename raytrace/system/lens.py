@@ -630,8 +630,9 @@ def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
 def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     """Refractive index behind every surface, object first; positive also behind a mirror.
 
-    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
-    break keeps the medium. A medium that does not change is the same tensor, so that a trace refracts nothing there.
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror, a coordinate break
+    and the image keep the medium. A medium that does not change is the same tensor, so that a trace refracts nothing
+    there: rays on the sensor have the direction and the index of the last gap.
     """
     dtype, numbers = lens.surfaces[-2].thickness.dtype, medium_surfaces(lens.surfaces)
     in_air = lens.environment is None and all(surface.environment is None for surface in lens.surfaces)
