@@ -21,7 +21,7 @@ from raytrace.materials.environment import (
     objection,
     unknown_change,
 )
-from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
+from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
 from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
@@ -650,6 +650,16 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
         indices = [index_behind(lens, number, wavelength) for number in distinct.values()]
     by_medium = {key: n.to(dtype) for key, n in zip(distinct, indices, strict=True)}
     return [by_medium[key] for key in keys]
+
+
+def glass_on_image(lens: Lens) -> str:
+    """The name of a glass on the image surface, "" where it is air or the medium in front of it.
+
+    No light enters it: rays, spots, wavefronts and PSFs are those in the last gap.
+    """
+    surface, before = lens.surfaces[-1], lens.surfaces[medium_surfaces(lens.surfaces)[-1]]
+    unused = not surface.is_mirror and not is_air(surface.glass) and not multiple.same(surface.glass, before.glass)
+    return label(surface.glass) if unused else ""
 
 
 def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:
