@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from problems import number
@@ -327,6 +328,57 @@ def test_a_fringe_of_power_is_half_a_wave_of_sag_at_the_semi_diameter(nominal):
     assert float(sag_at(plane.surfaces[1], h, 0 * h)) == pytest.approx(0.6328e-3, rel=1e-12)
 
 
+#: Errors of a face, and the angles θx and θy that it is tilted by: a sphere about (sin θy cos θx, -sin θx, …)/c.
+TILTS = {
+    "surface_tilt_x": ("surface_tilt_x", 0.4, (0.4, 0.0)),
+    "surface_tilt_y": ("surface_tilt_y", -0.3, (0.0, -0.3)),
+    "surface_runout_x": ("surface_runout_x", 0.05, (0.0, -math.degrees(math.atan(0.05 / 16)))),
+    "surface_runout_y": ("surface_runout_y", 0.05, (math.degrees(math.atan(0.05 / 16)), 0.0)),
+    "element_tilt_x": ("element_tilt_x", 0.4, (0.4, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", TILTS)
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_a_tilted_sphere_is_the_sphere_about_a_moved_centre(name, k, nominal):
+    kind, value, tilts = TILTS[name]
+    found = rt.perturbed(nominal, [T(kind, (k, k) if kind.startswith("element") else (k,), -1, 1)], [value])
+    tilt_x, tilt_y = map(math.radians, tilts)
+    axis = np.array([math.sin(tilt_y), -math.sin(tilt_x) * math.cos(tilt_y), math.cos(tilt_x) * math.cos(tilt_y)])
+    start = launch(
+        nominal, torch.tensor([[0.0, 0.3], [0.5, -0.8]]).double(), fields=torch.tensor([[0.0], [5.0]]).double()
+    )
+    position, direction = (part.flatten(1).numpy() for part in (start.position, start.direction))
+    vertex, before = np.zeros(3), 1.0
+    for j, (curvature, thickness, *_) in enumerate(SURFACES, 1):
+        centre = vertex + (axis if j == k else np.array([0, 0, 1])) / curvature
+        offset = position - centre[:, None]
+        along, power = (offset * direction).sum(0), (offset**2).sum(0) - 1 / curvature**2
+        root = np.sign(curvature) * np.sqrt(along**2 - power)
+        position = position + (-along - root) * direction
+        normal = (centre[:, None] - position) * curvature
+        after = float(index(nominal.surfaces[j].glass, nominal.wavelengths))
+        cosine = (direction * normal).sum(0)
+        kept = np.sqrt(1 - (before / after) ** 2 * (1 - cosine**2))
+        direction = before / after * direction + (kept - before / after * cosine) * normal
+        vertex, before = vertex + np.array([0, 0, thickness]), after
+    position = position + (vertex[2] - position[2]) / direction[2] * direction
+    end = trace_lens(found, start, nominal.wavelengths[:, None]).position.flatten(1)
+    close(end[:2], torch.from_numpy(position[:2]), 1e-12)
+
+
+def test_the_change_by_a_wedge_is_that_of_a_decentred_sphere():
+    lens = rt.read_lens("double_gauss")
+    radius = float(lens.surfaces[1].radius)
+    rows = [T("surface_tilt_x", (1,), -0.1, 0.1), T("element_tilt_x", (1, 1), -0.1, 0.1)]
+    step = radius * math.sin(math.radians(0.1))
+    rows.append(T("element_decenter_y", (1, 1), -step, step))
+    tilt, element, decentre = rt.tolerance(lens, rt.Tolerances(tuple(rows), (rt.Compensator(11),)), trials=0).maximum
+    assert float(tilt) == pytest.approx(float(element), rel=1e-12)
+    assert float(tilt) == pytest.approx(float(decentre), rel=3e-4)  # a sphere, shifted along z by R (1 - cos θ)
+    assert float(tilt) == pytest.approx(0.6031, abs=1e-4)  # a plane added to the sag had 6.627
+
+
 @pytest.mark.parametrize("angle", [0.0, 30.0])
 def test_irregularity_is_half_spherical_half_astigmatism(angle, nominal):
     rows = [T("irregularity", (2,), -9, 9), T("irregularity_angle", (2,), -90, 90)]
@@ -362,10 +414,10 @@ SAGS = {
 @pytest.mark.parametrize("name", SAGS)
 def test_sag_terms_stay_under_an_error(name, nominal):
     lens = nominal.replace(2, sag_terms=SAGS[name])
-    rows = [T("irregularity", (2,), -9, 9), T("surface_tilt_x", (2,), -1, 1)]
+    rows = [T("irregularity", (2,), -9, 9), T("zernike", (2,), -1, 1, term=3)]
     found = rt.perturbed(lens, rows, [3.0, 0.1])
     x, y = torch.tensor([[0.0, 3.0, -5.0], [1.0, -2.0, 4.0]], dtype=torch.float64)
-    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + y * math.tan(math.radians(0.1))
+    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + 0.1 * 2 * y / 8
     close(sag_at(found.surfaces[2], x, y), sag_at(lens.surfaces[2], x, y) + added, 1e-15)
 
 

@@ -4,9 +4,11 @@ A row is a number that differs from its nominal value within limits: a radius, a
 value, the error, is in the row's own unit. Rows hold plain numbers, so that two sets compare by their parts.
 
     tilt, decentre   old = d + Rx Ry Rz new: decentre first, then tilts about x, y and z, as a coordinate break
+    runout           the tilt with tan θ = e/(2h): the plane across the vertex rises by e from rim to rim
     power            z(h) of the conic grows by N λ/2 at the semi-diameter h: N fringes in double pass
     irregularity     Δz = N λ/4 (ρ⁴ + v²),  ρ = r/h,  v = (y cos θ - x sin θ)/h
-    surface tilt     Δz = y tan θ_x - x tan θ_y, a plane term on the sag; runout: Δz = e x/(2h), e y/(2h)
+
+A surface or an element is tilted rigidly about its vertex: a tilted sphere is the sphere about a centre that has moved.
 
 KINDS has a row for each kind: a new kind is a new row.
 """
@@ -24,7 +26,6 @@ from raytrace.maths.bivariate import zernike_to_powers
 from raytrace.maths.zernike import noll, norm
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, with_number
-from raytrace.system.poses import cos_sin
 from raytrace.system.sag_terms import IrregularSag, as_polynomial
 from raytrace.system.surface import Surface
 
@@ -156,7 +157,8 @@ class Kind:
     """A kind of error: its definition, and one of `change`, `sag` and `motion`.
 
     operand: OpticStudio's; unit; words: its definition. change: makes the surface with an error; sag: the powers that
-    it adds to the sag; motion: the field of a `Pose` by which the surface, or all surfaces of an element, are moved.
+    it adds to the sag; motion: the field of a `Pose` by which the surface, or all surfaces of an element, are moved;
+    step: error (...), `Gauge` -> the number (...) of that field, by default the error.
     length: power of length in the unit, by which limits of a file in inches are converted.
     needs_semi_diameter: whether the error is measured at the semi-diameter. elements: whether it has two surfaces.
     parameter: its parameter of an Irregular surface, which other surfaces may pick up.
@@ -168,6 +170,7 @@ class Kind:
     change: Change | None = None
     sag: AddedSag | None = None
     motion: str = ""
+    step: Callable[[Tensor, Gauge], Tensor] = lambda error, gauge: error
     length: int = 0
     needs_semi_diameter: bool = False
     elements: bool = False
@@ -217,25 +220,9 @@ def _parameter(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) ->
     return with_number(surface, gauge.path, number_at(surface, gauge.path) + error)
 
 
-def _tangent(degrees: Tensor) -> Tensor:
-    cosine, sine = cos_sin(degrees)
-    return sine / cosine
-
-
-def _tilt_x(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [0 * error, gauge.radius * _tangent(error)]
-
-
-def _tilt_y(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [-gauge.radius * _tangent(error), 0 * error]
-
-
-def _runout_x(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [error / 2, 0 * error]
-
-
-def _runout_y(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [0 * error, error / 2]
+def _tilt_of_runout(error: Tensor, gauge: Gauge) -> Tensor:
+    """θ in degrees, tan θ = e/(2h)."""
+    return torch.rad2deg(torch.atan(error / (2 * gauge.radius)))
 
 
 def _irregularity(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
@@ -251,8 +238,8 @@ def _zernike(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
 
 
 _DECENTRE = "decentre of the surface along {}, in its own axes"
-_TILT = "tilt of the surface about {}: a plane term on the sag"
-_RUNOUT = "difference of the sag between the rims at {0} = h and {0} = -h: a plane term"
+_TILT = "tilt of the surface about {} through its vertex"
+_RUNOUT = "total indicator runout along {} over the diameter 2h: a tilt of the surface by arctan(e/2h)"
 _ELEMENT = "of all surfaces from the first to the last"
 
 #: Every kind of error by its name.
@@ -273,13 +260,14 @@ KINDS = {
     "parameter": Kind("TPAR TUDX TUDY TUTX TUTY TUTZ", "", "a number of `parameter_paths`", _parameter),
     "surface_decenter_x": Kind("TSDX", "mm", _DECENTRE.format("x"), motion="x", length=1, parameter=1),
     "surface_decenter_y": Kind("TSDY", "mm", _DECENTRE.format("y"), motion="y", length=1, parameter=2),
-    "surface_tilt_x": Kind("TSTX", "degrees", _TILT.format("x"), sag=_tilt_x, parameter=3),
-    "surface_tilt_y": Kind("TSTY", "degrees", _TILT.format("y"), sag=_tilt_y, parameter=4),
+    "surface_tilt_x": Kind("TSTX", "degrees", _TILT.format("x"), motion="tilt_x", parameter=3),
+    "surface_tilt_y": Kind("TSTY", "degrees", _TILT.format("y"), motion="tilt_y", parameter=4),
     "surface_runout_x": Kind(
         "TIRX",
         "mm",
         _RUNOUT.format("x"),
-        sag=_runout_x,
+        motion="tilt_y",
+        step=lambda error, gauge: -_tilt_of_runout(error, gauge),
         length=1,
         needs_semi_diameter=True,
         parameter=4,
@@ -288,7 +276,8 @@ KINDS = {
         "TIRY",
         "mm",
         _RUNOUT.format("y"),
-        sag=_runout_y,
+        motion="tilt_x",
+        step=_tilt_of_runout,
         length=1,
         needs_semi_diameter=True,
         parameter=3,

@@ -6,11 +6,11 @@ thicknesses and other numbers, with the pickups and position solves that follow 
     before′ = M_group ∘ M_element ∘ before ∘ M_surface            M: decentre, then tilts about x, y and z
     after′  = M_surface⁻¹ ∘ after ∘ E_element ∘ E_group           E = T⁻¹ M⁻¹ T,  T: the way through the element
 
-An element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what follows
-keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that surfaces
-keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses before and
-behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such thickness:
-the axes from which rays start follow the vertex of surface 1.
+A surface, an element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what
+follows keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that
+surfaces keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses
+before and behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such
+thickness: the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses
@@ -83,7 +83,11 @@ class Perturbation:
             _change(lens, surfaces, row, value, gauges)
         _follow(start, surfaces)
         numbers = list(surfaces)
-        spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
+        spread = [
+            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0])))
+            for row, value in pairs
+            for k, f in _carriers(lens, row)
+        ]
         _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
         moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
         for k, surface in enumerate(surfaces):  # a shift along z is one of thicknesses
