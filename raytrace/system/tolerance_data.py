@@ -23,7 +23,7 @@ from torch import Tensor
 
 from raytrace.materials.glass import with_index_errors
 from raytrace.maths.bivariate import zernike_to_powers
-from raytrace.maths.zernike import noll, norm
+from raytrace.maths.zernike import fringe, noll, norm
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, with_number
 from raytrace.system.sag_terms import IrregularSag, as_polynomial
@@ -35,7 +35,11 @@ DISTRIBUTIONS = {
     "uniform": "all values between the limits alike",
     "parabolic": "density rising with the square of the distance from the middle of the limits",
     "end_points": "one limit or the other, each in half of the cases",
+    "table": "linear between the points of `density`",
 }
+
+#: The last number of the terms of a kind: Noll's, and the fringe terms.
+MOST_TERM = {"zernike": 231, "fringe": 37}
 
 #: The test wavelength of fringes unless a file has another, in µm: a helium-neon laser.
 TEST_WAVELENGTH = 0.6328
@@ -54,9 +58,10 @@ class Tolerance:
     adjust: of a thickness, the surface whose thickness changes by the opposite, so that all that follows stays; None.
     pivot: of the tilt of an element, how far behind the vertex of its first surface its axis lies, mm.
     parameter: of "parameter", a name of `parameter_paths`, as "a4", "tilt_x".
-    term: of "zernike", Noll's number of the term.
-    group: rows of one group are drawn together: the root of the sum of the squares of the errors is `maximum` times
-        the root of the number of the rows.
+    term: of "zernike", Noll's number of the term; of "fringe", that of the fringe terms.
+    group: rows of one group, as the components of a radial decentre, are drawn together: in a direction that is random
+        in all n of them alike, by √n times what the distribution of a row gives. At its limits all are at once.
+    density: of the distribution "table": fractions of the way from `minimum` to `maximum`, rising, and the density.
     configuration, operand: of "operand", the configuration (from 1) and its place in `lens.operands` (from 0).
     source: file and line, or the grade that the limits come from.
     """
@@ -73,6 +78,7 @@ class Tolerance:
     parameter: str = ""
     term: int = 0
     group: str = ""
+    density: tuple[tuple[float, float], ...] = ()
     configuration: int = 0
     operand: int | None = None
     source: str = ""
@@ -93,7 +99,7 @@ class Tolerance:
     @property
     def name(self) -> str:
         """The quantity in words: the kind, with the parameter or the term."""
-        number = str(self.term) if self.kind == "zernike" else self.parameter
+        number = str(self.term) if self.term else self.parameter
         return f"{self.kind} {number}".rstrip()
 
     def __str__(self) -> str:
@@ -234,7 +240,16 @@ def _irregularity(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tenso
 
 def _zernike(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
     order = noll(row.term)
-    return [float(entry) * norm(*order) * error for entry in zernike_to_powers((order,))[0][:, 0]]
+    return _term(order, norm(*order) * error)
+
+
+def _fringe_term(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
+    return _term(fringe(row.term), error * (0.5 * gauge.wavelength))
+
+
+def _term(order: tuple[int, int], height: Tensor) -> list[Tensor]:
+    """The powers of a term of a height (...) at the rim."""
+    return [float(entry) * height for entry in zernike_to_powers((order,))[0][:, 0]]
 
 
 _DECENTRE = "decentre of the surface along {}, in its own axes"
@@ -297,6 +312,13 @@ KINDS = {
         "RMS of one of Noll's terms of the sag over the semi-diameter",
         sag=_zernike,
         length=1,
+        needs_semi_diameter=True,
+    ),
+    "fringe": Kind(
+        "TEXI",
+        "fringes",
+        "one of the fringe terms of the sag, λ/2 a fringe at the semi-diameter",
+        sag=_fringe_term,
         needs_semi_diameter=True,
     ),
     "element_decenter_x": Kind("TEDX", "mm", f"decentre along x {_ELEMENT}", motion="x", length=1, elements=True),

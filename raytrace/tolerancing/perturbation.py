@@ -29,7 +29,7 @@ from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, 
 from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
 from raytrace.system.sag_terms import with_powers
 from raytrace.system.surface import Surface, with_z_in_thicknesses
-from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
+from raytrace.system.tolerance_data import KINDS, MOST_TERM, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
@@ -443,8 +443,8 @@ def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Sol
             message = f"the surface has no {row.parameter!r}; it has {known}"
     elif surface.is_break and row.kind != "thickness":
         message = 'the surface is a coordinate break; expected "parameter" with its tilt_x, x, …, or an optical surface'
-    elif row.kind == "zernike" and not 2 <= row.term <= 231:
-        message = f"term {row.term}; expected one of Noll's from 2 to 231"
+    elif row.kind in MOST_TERM and not 2 <= row.term <= MOST_TERM[row.kind]:
+        message = f"term {row.term}; expected a number from 2 to {MOST_TERM[row.kind]}"
     quantity = {"radius": "curvature", "power": "curvature", "index": "glass", "abbe": "glass"}.get(row.kind, row.kind)
     quantity = row.parameter if row.kind == "parameter" else quantity
     if (k, quantity) in solves and not message:

@@ -29,7 +29,7 @@ from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus
 from raytrace.tolerancing.perturbation import Perturbation, path_of
-from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.sampling import density_moments, draw_errors
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
@@ -234,9 +234,15 @@ def _check(lens: Lens, one: Compensator) -> None:
 
 
 def moments(row: Tolerance) -> tuple[float, float]:
-    """Mean and variance of the error of a row. Rows of a group have errors on a sphere, alike in all directions."""
-    if row.group:
-        return 0.0, row.maximum**2
+    """Mean and variance of the error of a row; those of a group have no direction."""
+    mean, variance = _moments(row)
+    return (0.0, mean**2 + variance) if row.group else (mean, variance)
+
+
+def _moments(row: Tolerance) -> tuple[float, float]:
+    if row.distribution == "table":
+        mean, variance, width = *density_moments(row.density), row.maximum - row.minimum
+        return row.minimum + width * mean, width**2 * variance
     middle, half = 0.5 * (row.minimum + row.maximum), 0.5 * (row.maximum - row.minimum)
     if row.distribution == "normal":
         s = row.sigmas

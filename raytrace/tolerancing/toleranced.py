@@ -27,7 +27,7 @@ from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.study import Study, sampling_of, second_order_draws, with_changes
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
 
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -103,8 +103,18 @@ class Toleranced(Result):
 
     @property
     def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change to the worse first."""
-        return torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
+        """Places (G,) of the tolerances, the largest change to the worse first; of a group that of its first row."""
+        order = torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
+        leaders = self.tolerances.leaders
+        return order[leaders[order] == order]
+
+    @property
+    def labels(self) -> list[str]:
+        """Kind and place of every row in words; of the first row of a group those of all its rows."""
+        labels = self.tolerances.labels
+        for first, *_, last in (places for places in groups_of(self.tolerances) if len(places) > 1):
+            labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
+        return labels
 
     def percentile(self, percent: float) -> Tensor:
         """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
@@ -205,7 +215,7 @@ class Toleranced(Result):
         }
 
     def words(self) -> dict[str, Sequence[str]]:
-        return {"tolerance": self.tolerances.labels, "unit": [row.unit for row in self.tolerances]}
+        return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
 
     def summary(self) -> dict[str, float]:
         """Figures of the lens as built, in the unit of the criterion."""
@@ -273,7 +283,7 @@ class Toleranced(Result):
             )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about)]
+        found = [Table(self.columns(), about, self.tolerances.notes)]
         if len(self.trials):
             bound = "within" if self.sign > 0 else "above"
             found.append(
@@ -282,7 +292,8 @@ class Toleranced(Result):
         return found
 
     def document(self) -> dict:
-        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        return about | ({"unread": list(self.tolerances.unread)} if self.tolerances.unread else {})
 
     @styled
     def draw(self):
@@ -308,7 +319,7 @@ class Toleranced(Result):
         side = "right" if self.sign > 0 else "left"
         left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)
-        labels = [self.tolerances.labels[k] for k in order.tolist()]
+        labels = [self.labels[k] for k in order.tolist()]
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
@@ -404,20 +415,17 @@ def tolerance(
         if goal is not None and yield_ is not None:
             tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
             study = Study(lens, tolerances, chosen, sampling)
-        limits_alone = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
-        changes = (chosen.sign * study.harm(limits_alone)).chunk(2)
-        seconds = [
-            _second_order_change(chosen, model, limits.to(study.half))
-            for limits in (tolerances.minimum, tolerances.maximum)
-        ]
+        alone = [tolerances.alone(limits).to(study.half) for limits in (tolerances.minimum, tolerances.maximum)]
+        changes = (chosen.sign * study.harm(torch.cat(alone))).chunk(2)
+        seconds = [_second_order_change(chosen, model, errors) for errors in alone]
         predicted, expected, mean_square = second_order_draws(tolerances, chosen, *model, seed)
         values, moved = monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
     rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
         minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
-        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=expected,
-        expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
+        slope=_slope(chosen, model, tolerances.alone(study.half)), estimated=nominal + chosen.sign * rss,
+        expected=expected, expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
         unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
         given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
         angle=chosen.angle,
@@ -425,16 +433,18 @@ def tolerance(
 
 
 def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
-    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
+    """f(q₀ + g·e + ½ e·H e) - f(q₀) (L,) of errors (L, N)."""
     q0, g, H = model
-    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
+    found = (q0 + errors @ g + 0.5 * ((errors @ H) * errors).sum(-1)).clamp_min(0)
     return criterion.value(found) - criterion.value(found.new_tensor(q0))
 
 
-def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
-    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
+def _slope(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
+    """Changes (L,) of the criterion along errors (L, N) to first order; where its square is 0 of the nominal lens, by
+    their sizes."""
+    q0, g, H = model
     if q0 <= 1e-12 * criterion.scale:
-        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
+        return torch.sqrt((0.5 * ((errors @ H) * errors).sum(-1)).clamp_min(0))
     with torch.enable_grad():
         q = g.new_tensor(q0).requires_grad_()
-        return g * torch.autograd.grad(criterion.value(q), q)[0]
+        return (errors @ g) * torch.autograd.grad(criterion.value(q), q)[0]
