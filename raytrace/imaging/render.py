@@ -618,7 +618,7 @@ def encoded(light: Tensor) -> Tensor:
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Rendering(Result):
     """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
 

@@ -355,6 +355,12 @@ class Lens:
     def __getattr__(self, name: str):
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
 
+    def __repr__(self) -> str:
+        several = "" if self.count is None else f"{self.count} lenses of "
+        kinds = {"surface": self.surfaces, "field": self.fields.y, "wavelength": self.wavelengths}
+        counts = ", ".join(f"{len(part)} {kind}{'' if len(part) == 1 else 's'}" for kind, part in kinds.items())
+        return f"<Lens: {self.name}{self.name and '; '}{several}{counts}>"
+
     def __str__(self) -> str:
         from raytrace.tracing.lens_report import text
 

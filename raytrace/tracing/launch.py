@@ -527,7 +527,13 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
-    """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
+    """Warn UnfilledStop by the words of `unfilled`, if there are any."""
+    if words := unfilled(lens, fields, ray_aiming=ray_aiming):
+        warnings.warn(words, UnfilledStop, stacklevel=calling_level())
+
+
+def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> str:
+    """Words for the field of (2, F) that misses the stop most, if it does by more than TOLERANCE; else empty.
 
     Of more than MOST_FIELDS fields so many are measured, and the largest one. Fields without rays at the stop are left
     to LostRays. Nothing is traced if rays are aimed, if object space is telecentric, and where a derivative by numbers
@@ -535,7 +541,7 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
     """
     lens = with_ray_aiming(lens, ray_aiming)
     if any(map(varies, pytree.tree_leaves((lens, fields)))) or lens.fields.telecentric or aiming_of(lens) != "off":
-        return
+        return ""
     if fields.shape[1] > MOST_FIELDS:
         spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
         fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
@@ -546,16 +552,14 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         radius = beams.radius.expand(len(worst), 1, 1, 1)[at, 0, 0, 0]
         beams, worst = Filling(beams.chief[at], beams.marginal[at], beams.lost[at], radius), worst[at]
     if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
-        return
+        return ""
     at = int(worst.argmax())
     named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
     many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
-    warnings.warn(
+    return (
         f"field {named}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
         f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
-        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
-        UnfilledStop,
-        stacklevel=calling_level(),
+        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')"
     )
 
 
