@@ -7,7 +7,7 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
     origins = sensor.random_patches(index, size=128)        # index (B,): global numbers of the samples
     distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
-    where = {"points": sensor.patch_points(origins, 128), "origins": origins, "index": index}
+    where = {"points": sensor.patch_points(origins, 128), "index": index}
     restored = camera(pictures, distances, **where)         # (B, 3, H, W): blurred, recorded, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()

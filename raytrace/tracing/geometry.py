@@ -205,7 +205,7 @@ def frames(lens: Lens) -> list[Frame]:
     distance = lens.surfaces[0].thickness
     axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
     here = Frame(torch.zeros_like(axes[0]), axes)
-    found = [Frame(-distance * axes[2], axes)]
+    found = [_posed(Frame(-distance * axes[2], axes), lens.surfaces[0].before)]
     for surface in lens.surfaces[1:]:
         here = _posed(here, surface.before)
         found.append(here)
