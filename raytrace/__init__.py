@@ -51,6 +51,7 @@ PUBLIC = {
     "glass": "materials.properties",
     "refractive_index": "materials.glass",
     # rays
+    "RaytraceWarning": "words",
     "BaseRay": "tracing.base_ray",
     "FirstOrder": "tracing.paraxial",
     "Rays": "system.rays",

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -31,7 +31,7 @@ class OverBudget(ValueError):
     """More memory is needed than available; the message has the cause and a remedy."""
 
 
-class TakesLong(UserWarning):
+class TakesLong(RaytraceWarning):
     """A computation is predicted to take more than half a minute; the message has its time and a remedy."""
 
 

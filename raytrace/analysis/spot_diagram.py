@@ -22,7 +22,6 @@ from raytrace.system.lens import (
     field_label,
     field_points,
     field_title,
-    name_of_field,
     one_lens,
     with_wavelengths,
 )
@@ -120,8 +119,12 @@ class Spots(Result):
         several = len(waves) > 1
         together = [""] * several
         whole, each = _figures(self.whole), _figures(self.each)
-        fields, lost = map(name_of_field, self.fields.unbind(1)), (self.launched - each.pop("rays")).tolist()
-        columns = {"field_y": [text for field in fields for text in (*[field] * len(waves), *together)]}
+        lost = (self.launched - each.pop("rays")).tolist()
+        columns = {
+            name: [text for place in row.tolist() for text in (*[f"{place:g}"] * len(waves), *together)]
+            for name, row in zip(("field_x", "field_y"), self.fields, strict=True)
+            if name == "field_y" or bool(row.any())
+        }
         columns["wavelength"] = [*waves, *["all"] * several] * self.fields.shape[1]
         for name, values in each.items():
             columns[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten()

@@ -17,7 +17,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.sampling import Grid, centres, gauss_rings
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 
 class TooManyPoints(ValueError):
@@ -28,7 +28,7 @@ class EmptyPupil(ValueError):
     """No light passes the pupil: a point spread function normalised by its light is undefined."""
 
 
-class Aliased(UserWarning):
+class Aliased(RaytraceWarning):
     """The wavefront changes by more than half a wave between neighbouring samples."""
 
 

@@ -33,7 +33,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 
@@ -182,7 +182,7 @@ _ROWS = (
 MODELS = {row.name: row for row in _ROWS}
 
 
-class NotConverged(UserWarning):
+class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
 

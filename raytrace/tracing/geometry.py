@@ -26,7 +26,7 @@ from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import lens_steps
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Points of the pupil whose rays are highest on a surface.
 _ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
@@ -35,7 +35,7 @@ _HEIGHTS = 65  # at which two surfaces are compared
 _LEAST = 1e-6  # mm: an overlap that counts
 
 
-class Unbuildable(UserWarning):
+class Unbuildable(RaytraceWarning):
     """A lens that cannot be made as its numbers say."""
 
 

@@ -14,7 +14,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import Crossing, lens_steps
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Status of a ray, and its wording at a surface.
 FATES = {
@@ -31,7 +31,7 @@ LOST = ("miss", "tir", "vignetted")
 _RINGS = 8  # of the rays that try a field
 
 
-class LostRays(UserWarning):
+class LostRays(RaytraceWarning):
     """Rays do not reach the sensor; the message says which, where they end and what helps."""
 
 
