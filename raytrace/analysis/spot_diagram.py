@@ -341,8 +341,8 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
-    weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
+    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`. The
+    dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
     `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
     from where radii count, the centroid by default. rings: of dots.
     """
@@ -357,7 +357,12 @@ def field_spots(
         hits, valid = rays.position[:2], rays.valid
         whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten(), about=about)
         drawn = points.shape[1]
-        return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        seen = spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        if pupil is None and not bool(valid.all()):
+            lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+            fields, inside = field_points(fields, like=lens), points[:, weights[:drawn] > 0]
+            seen, whole = _of_clear_pupils(lens, fields, inside, SAMPLINGS["gauss"][2], about, seen, whole)
+        return whole, seen
 
 
 def even_hexapolar(rings: int, **like) -> Tensor:
