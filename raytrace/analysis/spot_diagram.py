@@ -341,9 +341,9 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`. The
-    dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
-    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
+    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`.
+    The dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are
+    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
     from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
