@@ -343,8 +343,8 @@ def field_spots(
 
     The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`.
     The dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are
-    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
-    from where radii count, the centroid by default. rings: of dots.
+    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about:
+    (2, F) mm, from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
