@@ -34,7 +34,7 @@ from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import launch
 from raytrace.tracing.spot import image_rays
-from raytrace.tracing.trace import lens_task
+from raytrace.tracing.trace import lens_task, without_apertures
 
 #: Angle of the astigmatism of an irregularity, degrees, and its change: the squares and the product of cos 2θ and
 #: sin 2θ have the means of a uniform distribution.
@@ -98,7 +98,7 @@ class AsBuiltTerm:
         self.limits = _focus_limits(lens, self.tolerances)
         self.radii = semi_diameters(lens)
         self.errors = design(self.tolerances).to(lens.wavelengths)
-        self.sampling = sampling_of(lens, settings.fields, settings.rings, settings.arms)
+        self.sampling = sampling_of(without_apertures(lens), settings.fields, settings.rings, settings.arms)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         self.weights = (shares[:, None] * self.sampling.weights).flatten()
         if not bool(torch.isfinite(self.expected(lens))):

@@ -16,6 +16,7 @@ angles of a rule of equal steps err by the step squared, and their derivatives b
 Gaussian nodes between kinks.
 """
 
+import dataclasses
 import math
 
 import torch
@@ -25,8 +26,10 @@ from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.apertures import clearances_of, stands_inside
 from raytrace.system.lens import Lens, field_points
+from raytrace.system.rays import Rays
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
+from raytrace.tracing.trace import without_apertures
 
 _SCAN = 32  # steps along an arm in which edges are looked for
 _SECTIONS, _ZOOMS = 8, 2  # an edge is enclosed in 8⁻² of a step: slopes are good to 5e-4
@@ -105,13 +108,32 @@ def clear_pupil(
     return points[:, None, None].expand(2, *shape), weights.expand(shape)
 
 
+def clear_rays(scene: Scene, rings: int) -> tuple[Rays, Tensor]:
+    """Rays (3, D, F, W, P) on the sensor that fill the clear pupils, and their weights (D, F, W, P).
+
+    `rings` nodes on each of about 4·rings arms; the ends of the arms, on the edge, have no weight. See `Arms.rule`.
+    """
+    arms = arms_of(scene, 4 * rings)
+    (points, weights), (ends, exist) = arms.rule(rings), arms.ends()
+    bare = dataclasses.replace(scene, lens=without_apertures(scene.lens))
+    rays = trace_scene(bare, torch.cat([points, ends], -1))
+    valid = rays.valid & torch.cat([weights > 0, exist], -1)
+    return dataclasses.replace(rays, valid=valid), torch.cat([weights, torch.zeros_like(ends[0])], -1)
+
+
 @torch.no_grad()
 def is_clipped(scene: Scene, points: Tensor) -> bool:
     """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails."""
+    return not scene.everywhere(~clipped(scene, points).any())
+
+
+@torch.no_grad()
+def clipped(scene: Scene, points: Tensor) -> Tensor:
+    """Whether rays of each object distance (D,), or lens of a batch, fail; arguments as for `is_clipped`."""
     if any(surface.apertures for surface in scene.lens.surfaces):
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
-    return not scene.everywhere(trace_scene(scene, points).valid.all())
+    return ~trace_scene(scene, points).valid.flatten(1).all(-1)
 
 
 def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:

@@ -545,6 +545,8 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
     if fields.shape[1] > MOST_FIELDS:
         spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
         fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
+    if lens.count == 0:
+        return
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most

@@ -181,11 +181,14 @@ def arrivals(
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
     each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
     for field in progress(fields.unbind(1)):
-        rays = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
-        reached = rays.valid
-        for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
-            reached = reached & ~crossing.missed & ~crossing.totally_reflected
-            on_sensor = crossing.rays, status, reached
+        launched = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
+        rays = trace_lens(lens, launched, lens.wavelengths[:, None])
+        on_sensor = rays, torch.zeros_like(rays.valid, dtype=torch.int64), rays.valid
+        if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails
+            reached = launched.valid
+            for crossing, status in ray_status(lens, launched, lens.wavelengths[:, None]):
+                reached = reached & ~crossing.missed & ~crossing.totally_reflected
+                on_sensor = crossing.rays, status, reached
         each.append(on_sensor)
     joined = Rays(
         torch.cat([rays.position for rays, *_ in each], -3),
