@@ -251,7 +251,7 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
 # -- results
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class CodesignResult(Result):
     """The outcome of a run, or the optimum of the closed form. curves: losses by their name, for the figure."""
 

@@ -54,7 +54,7 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
     """
     if not increment > 0:
         raise ValueError(f"increment {increment:g}: expected a change of the criterion above 0")
-    limits = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
+    limits = torch.cat([tolerances.alone(tolerances.minimum), tolerances.alone(tolerances.maximum)])
     found = change(limits)
     reaches = (found > increment) | ~found.isfinite()  # where no light arrives the limit is too wide
     few = limits[reaches]
@@ -65,7 +65,7 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
         good = found <= increment
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
     factors = torch.ones_like(reaches, dtype=few.dtype).masked_scatter(reaches, low)
-    return scaled(tolerances, *factors.chunk(2))
+    return scaled(tolerances, *(part[tolerances.leaders] for part in factors.chunk(2)))
 
 
 def limited_to_yield(

@@ -28,7 +28,7 @@ from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
 
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -76,7 +76,7 @@ class Toleranced(Result):
     lost: Tensor
     lost_minimum: Tensor
     lost_maximum: Tensor
-    loss: float = 0.01
+    loss: float = 0.05
     holds: str = ""
     configurations: int = 1
     seed: int = 0
@@ -117,9 +117,19 @@ class Toleranced(Result):
 
     @property
     def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change to the worse first."""
+        """Places (G,) of the tolerances, the largest change to the worse first; of a group that of its first row."""
         changes = torch.maximum(self.sign * self.minimum, self.sign * self.maximum)
-        return torch.argsort(changes.nan_to_num(torch.inf), descending=True)  # nan: the lens fails
+        order = torch.argsort(changes.nan_to_num(torch.inf), descending=True)  # nan: the lens fails
+        leaders = self.tolerances.leaders
+        return order[leaders[order] == order]
+
+    @property
+    def labels(self) -> list[str]:
+        """Kind and place of every row in words; of the first row of a group those of all its rows."""
+        labels = self.tolerances.labels
+        for first, *_, last in (places for places in groups_of(self.tolerances) if len(places) > 1):
+            labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
+        return labels
 
     def percentile(self, percent: float) -> Tensor:
         """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
@@ -224,7 +234,7 @@ class Toleranced(Result):
         )
 
     def words(self) -> dict[str, Sequence[str]]:
-        return {"tolerance": self.tolerances.labels, "unit": [row.unit for row in self.tolerances]}
+        return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
 
     def summary(self) -> dict[str, float]:
         """Figures of the lens as built, in the unit of the criterion."""
@@ -308,7 +318,7 @@ class Toleranced(Result):
             )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about)]
+        found = [Table(self.columns(), about, self.tolerances.notes)]
         if len(self.trials):
             bound = "within" if self.sign > 0 else "above"
             found.append(
@@ -317,7 +327,8 @@ class Toleranced(Result):
         return found
 
     def document(self) -> dict:
-        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        return about | ({"unread": list(self.tolerances.unread)} if self.tolerances.unread else {})
 
     @styled
     def draw(self):
@@ -344,7 +355,7 @@ class Toleranced(Result):
         side = "right" if self.sign > 0 else "left"
         left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)
-        labels = [self.tolerances.labels[k] for k in order.tolist()]
+        labels = [self.labels[k] for k in order.tolist()]
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
@@ -374,7 +385,7 @@ def tolerance(
     fields: Tensor | Sequence | None = None,
     rings: int | None = None,
     arms: int | None = None,
-    loss: float = 0.01,
+    loss: float = 0.05,
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
@@ -410,7 +421,7 @@ def tolerance(
         that of its own fields.
     rings: of the pupil, Gaussian quadrature; by default the fewest that give the spots of `spot`.
     arms: of the pupil, 4·rings by default.
-    loss: share of the light of the nominal lens that a lens may lose, 0.01 by default; one that loses more has failed.
+    loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has failed.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
@@ -430,7 +441,7 @@ def tolerance(
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= loss <= 1:
-        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.01")
+        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.05")
     options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
     views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
     chosen, study, given = views[0].criterion, Study(views, tolerances, loss), tolerances
@@ -451,7 +462,8 @@ def tolerance(
                 chosen.quantity_of(goal), yield_, seed + 1,
             )  # fmt: skip
             study = Study(views, tolerances, loss)
-        alone = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)]).to(study.half)
+        ends = tolerances.minimum, tolerances.maximum
+        alone = torch.cat([tolerances.alone(limits) for limits in ends]).to(study.half)
         changes, light = study.harm(alone)
         start, slope = second(torch.zeros_like(alone[:1]))
         seconds = chosen.value(second(alone)[0].clamp_min(0)) - chosen.value(start.clamp_min(0))
@@ -466,9 +478,9 @@ def tolerance(
     return Toleranced(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal, minimum=low,
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
-        slope=_slope(chosen, start[0], slope[0], second.H) * study.half, estimated=nominal + chosen.sign * rss,
-        expected=expected, expected_square=mean_square, predicted=predicted, trials=values, changes=moved,
-        lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss, holds=holds,
+        slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
+        estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
+        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss, holds=holds,
         configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
@@ -496,10 +508,11 @@ def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -
     )
 
 
-def _slope(criterion: Criterion, q0: Tensor, g: Tensor, H: Tensor) -> Tensor:
-    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
+def _slope(criterion: Criterion, q0: Tensor, g: Tensor, H: Tensor, errors: Tensor) -> Tensor:
+    """Changes (L,) of the criterion along errors (L, N) to first order; where its square is 0 of the nominal lens, by
+    their sizes."""
     if float(q0) <= 1e-12 * criterion.scale:
-        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
+        return torch.sqrt((0.5 * ((errors @ H) * errors).sum(-1)).clamp_min(0))
     with torch.enable_grad():
         q = q0.detach().clone().requires_grad_()
-        return g * torch.autograd.grad(criterion.value(q), q)[0]
+        return (errors @ g) * torch.autograd.grad(criterion.value(q), q)[0]

@@ -62,7 +62,7 @@ def defects(lens: Lens) -> tuple[Defect, ...]:
                 f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
             )
             found.append(Defect(k, "reach", height - edge, words))
-    for k, end, side in _gaps(lens):
+    for k, end, side in gaps(lens):
         found += _of_gap(lens, k, end, side, heights)
     return tuple(found)
 
@@ -126,21 +126,21 @@ def _edge_radius(surface: Surface) -> float:
     return min(float(end) if end < far else math.inf for end in ends)
 
 
-def _gaps(lens: Lens) -> list[tuple[int, int, float]]:
+def gaps(lens: Lens) -> list[tuple[int, int, float]]:
     """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
     indices = media(lens, lens.primary)
-    gaps, before, side = [], None, 1.0
+    pairs, before, side = [], None, 1.0
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
         if surface.is_break or surface.before is not None:
             before = None
         if surface.is_mirror or surface.phase is not None or not torch.equal(indices[k], indices[k - 1]):
             if before is not None:
-                gaps.append((before, k, side))
+                pairs.append((before, k, side))
             before = k
         side = -side if surface.is_mirror else side
         if surface.after is not None:
             before = None
-    return gaps
+    return pairs
 
 
 def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> list[Defect]:
@@ -205,7 +205,7 @@ def frames(lens: Lens) -> list[Frame]:
     distance = lens.surfaces[0].thickness
     axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
     here = Frame(torch.zeros_like(axes[0]), axes)
-    found = [Frame(-distance * axes[2], axes)]
+    found = [_posed(Frame(-distance * axes[2], axes), lens.surfaces[0].before)]
     for surface in lens.surfaces[1:]:
         here = _posed(here, surface.before)
         found.append(here)

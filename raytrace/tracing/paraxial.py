@@ -11,13 +11,39 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
-from raytrace.maths.result import flat
+from raytrace.maths.result import Column, Result, Table, flat
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, shared
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
+#: Lines of a report: text, entry of FirstOrder, unit; further ones are printed of first-order data alone.
+LINES = (
+    ("effective focal length", "effective_focal_length", "mm"),
+    ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
+    ("front focal distance", "front_focal_distance", "mm, from surface 1"),
+    ("F/#", "f_number", "focal length / entrance pupil diameter"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
+    ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
+    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
+    ("exit pupil position", "exit_pupil_position", "mm, from the image"),
+    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
+    ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
+    ("magnification", "magnification", ""),
+    ("angular magnification", "angular_magnification", "u'/u of the chief ray"),
+    ("optical invariant", "optical_invariant", "mm, of the largest field"),
+    ("object NA", "object_na", ""),
+    ("image NA", "image_na", ""),
+    ("Petzval radius", "petzval_radius", "mm"),
+)
+FURTHER_LINES = (
+    ("power", "power", "1/mm"),
+    ("height at the stop", "stop_height", "mm, of the marginal ray"),
+    ("front principal plane", "front_principal_plane", "mm, from surface 1"),
+    ("rear principal plane", "rear_principal_plane", "mm, from the last surface before the image"),
+)
+
 
 @value
-class FirstOrder:
+class FirstOrder(Result):
     """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
 
     power: -ω′/y₁ in 1/mm.
@@ -59,11 +85,24 @@ class FirstOrder:
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
 
-    def to_frame(self):
-        """The data for pandas, a row for each wavelength; lengths in mm."""
-        import pandas
+    def columns(self) -> dict[str, Tensor]:
+        """A row for each wavelength and lens."""
+        return {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
 
-        return pandas.DataFrame(flat({entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}))
+    def column(self, name: str) -> Column:
+        unit = next(unit for _, entry, unit in (*LINES, *FURTHER_LINES) if entry == name)
+        return Column(name, next((length for length in ("1/mm", "mm") if unit.startswith(length)), ""))
+
+    def tables(self) -> list[Table]:
+        """A line for each quantity: its number, of several lenses or wavelengths the least and the largest."""
+        figures = flat(self.columns())
+        lines, count = (*LINES, *FURTHER_LINES), len(figures["power"])
+        ends = {"": min} if count == 1 else {"least": min, "largest": max}
+        printed: dict = {Column("quantity", form="<", heading=" "): [words for words, *_ in lines]}
+        for name, end in ends.items():
+            printed[Column(name, form=".9g")] = [end(figures[entry]) for _, entry, _ in lines]
+        printed[Column("unit", form="<", heading=" ")] = [unit for *_, unit in lines]
+        return [Table(printed, [f"first-order data of {count} lenses or wavelengths"] if count > 1 else ())]
 
 
 def brackets(powers: Sequence, gaps: Sequence) -> tuple:
