@@ -147,6 +147,8 @@ def script() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without µ shows ?
+    if sys.stdout is None:  # Python drops what is printed there
+        sys.exit(_fail("output: standard output is closed; send it to a file, or to /dev/null", 1))
     keep_freed_memory()
     sys.exit(main())
 
