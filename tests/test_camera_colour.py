@@ -169,6 +169,21 @@ def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     assert slopes.tolist() == pytest.approx(differences, rel=1e-3, abs=2e-4 * float(slopes.abs().max()))
 
 
+def test_vignetting_factors_move_with_the_field_of_the_middle():
+    """Tilting a surface of a Tessar at 2 m moves the field at the middle of the sensor from the listed one, 0."""
+    one = made(rt.read_lens("tessar").at(object_distance=2000.0), "tilt_x:3", object_distances=(1.9e3, 2.1e3), tol=1e-3)
+    where = {"points": torch.zeros(2, 1, dtype=torch.float64)}
+    pattern = torch.cos(torch.arange(363.0, dtype=torch.float64)).reshape(3, 11, 11)
+    tilt = one.variables.get_parameter("tilt_x_3")
+    (slope,) = torch.autograd.grad((one.kernels(pattern.new_tensor([2e3]), **where) * pattern).sum(), tilt)
+    ends = []
+    with torch.no_grad():
+        for change in (1e-4, -1e-4):
+            tilt.fill_(change)
+            ends.append((one.kernels(pattern.new_tensor([2e3]), **where) * pattern).sum())
+    assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-4)
+
+
 def test_what_does_not_fit_is_refused(triplet):
     picture, distances, points, _ = samples(2)
     one = made(triplet)

@@ -43,8 +43,7 @@ def focused(lens):
 
 def check_changes(lens, rows, judge, accuracy):
     """The changes at both limits of every row are those of single lenses, judged one by one."""
-    arms = rt.gauss_rings(4)[0].shape[1] // 4
-    found = rt.tolerance(lens, rows, trials=0, arms=arms)
+    found = rt.tolerance(lens, rows, trials=0, rings=4)
     nominal = judge(lens)
     assert float(found.nominal) == pytest.approx(nominal, abs=accuracy)
     for n in range(len(rows)):
@@ -242,9 +241,7 @@ def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
     lens = rt.read_lens("cooke_triplet")  # auto: off, whose elements are tilted then
     rows = rt.tolerances(lens, grade="precision", compensators=[])
     assert rt.perturbed(lens, rows, [0.0] * len(rows)).ray_aiming == "off"
-    nominal = rt.tolerance(
-        lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, arms=rt.gauss_rings(4)[0].shape[1] // 4
-    ).nominal
+    nominal = rt.tolerance(lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, rings=4).nominal
     assert float(nominal) == pytest.approx(rms(lens.at(fields=[0, 8.4, -8.4])), abs=1e-9)
 
 

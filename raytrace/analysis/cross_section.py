@@ -306,8 +306,9 @@ def _start(lens: Lens, rays, z_start: float) -> np.ndarray:
     distance = float(lens.surfaces[0].thickness)
     position, direction = rays.position, rays.direction
     if math.isfinite(distance) and -distance >= z_start:
-        shift = position.new_tensor([0.0, 0.0, -distance]).reshape(3, 1, 1, 1)
-        points = intersect(lens.surfaces[0], position - shift, direction)[0] + shift
+        frame = frames(lens)[0]
+        along = torch.tensordot(frame.axes.T, direction, dims=1)
+        points = frame.outside(intersect(lens.surfaces[0], frame.inside(position), along)[0])
     else:
         points = position + direction * ((z_start - position[2]) / direction[2])
     return array(points)[:, :, 0, :]

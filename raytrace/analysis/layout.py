@@ -407,7 +407,7 @@ def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[flo
 
 
 def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
-    heights = [abs(path.y[0]) for field in paths for path in field]
+    heights = [abs(float(place.height(path.z[0], path.y[0]))) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
         y = np.linspace(-half, half, 81)

@@ -21,7 +21,7 @@ from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
-from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
+from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.words import calling_level
 
 _RINGS = 14, 56
@@ -181,7 +181,7 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
         opd=opd,
         valid=valid,
         coefficients=of(zernike_coefficients(front, terms, numbering)) / wave[:, None],
-        rms=of(rms(front)) / wave,
+        rms=of(rms(clear_wavefront(view, *_RINGS))) / wave,
         peak_to_valley=of(peak_to_valley(dense)) / wave,
         strehl=of(_strehl(view)),
         numbering=numbering,

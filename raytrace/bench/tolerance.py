@@ -25,7 +25,7 @@ from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import Criterion, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.study import Study
+from raytrace.tolerancing.study import Study, View
 from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.paraxial import first_order
@@ -102,24 +102,26 @@ def tolerances() -> Tolerances:
 
 def sampling(lens: Lens, points: Tensor, weights: Tensor) -> Sampling:
     fields = torch.stack([lens.fields.x, lens.fields.y])
-    return Sampling(fields, torch.full_like(fields[0], 1 / fields.shape[1]), points, weights)
+    return Sampling(fields, torch.full_like(fields[0], 1 / fields.shape[1]), points, weights, _RINGS)
 
 
-def _parabola(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor, Tensor]:
-    """The mean over fields and wavelengths of the mean square spot radius (L,) as the sensor moves, mm."""
+def _parabola(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean over fields and wavelengths of the mean square spot radius (L,) as the sensor moves, mm; and the light."""
     rays = image_rays(lens, given.points, fields=given.fields)
-    return tuple(part.mean((-1, -2)) for part in spot_parabola(rays, given.weights))
+    parts = *spot_parabola(rays, given.weights), rays.valid.to(rays.position).mean(-1)
+    return tuple(part.mean((-1, -2)) for part in parts)
 
 
-def _square(lens: Lens, given: Sampling) -> Tensor:
-    return _parabola(lens, given)[0]
+def _square(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor]:
+    q0, *_, light = _parabola(lens, given)
+    return q0, light
 
 
 CRITERION = Criterion("RMS spot radius of each wavelength", "mm", _square, _parabola)
 
 
 def study(lens: Lens, rule: tuple[Tensor, Tensor]) -> Study:
-    return Study(lens, tolerances(), CRITERION, sampling(lens, *rule))
+    return Study([View(lens, CRITERION, sampling(lens, *rule))], tolerances(), loss=0.01)
 
 
 @torch.no_grad()

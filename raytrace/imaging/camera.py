@@ -7,7 +7,7 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
     origins = sensor.random_patches(index, size=128)        # index (B,): global numbers of the samples
     distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
-    where = {"points": sensor.patch_points(origins, 128), "origins": origins, "index": index}
+    where = {"points": sensor.patch_points(origins, 128), "index": index}
     restored = camera(pictures, distances, **where)         # (B, 3, H, W): blurred, recorded, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()
@@ -342,18 +342,17 @@ class Camera(nn.Module):
         errors: Tensor | None = None,
     ):
         # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
-        # traced one by the distortion.
-        fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
+        # traced one by the distortion and by tilts.
+        traces = MODELS[self.model].traces
         lens, memo = self._lens(errors)
-        distances, is_nominal = distances.to(self.fields.dtype), errors is None and self.center == "chief"
         return psf(
             lens,
             Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
             tol=tol,
-            fields=fields,
-            object_distances=distances,
-            grid=self._window(lens, fields, distances, memo) if is_nominal else self.pixels,
-            center="axis" if is_nominal else self.center,
+            fields=fields if traces else torch.zeros_like(fields),
+            object_distances=distances.to(self.fields.dtype),
+            grid=self.pixels,
+            center=self.center if traces or self.center == "centroid" else "axis",
             normalise=self.normalise,
             execution=Execution(memo=memo),
         )
@@ -362,10 +361,9 @@ class Camera(nn.Module):
         """PSFs (B, rows, columns) of the rays through the pupil points alone."""
         (lens, memo), distances = self._lens(errors), distances.to(fields.dtype)
         light = scene(lens, fields, distances, lens.wavelengths, memo)
-        window = self._window(lens, fields, distances, memo)
-        if window.centre.dim() > 1:  # chief rays (2, D, F), for every wavelength
-            centre = window.centre[..., None].expand(*window.centre.shape, len(lens.wavelengths))
-            window = dataclasses.replace(window, centre=centre)
+        chief = chief_landing(dataclasses.replace(light, wavelengths=lens.primary[None]))
+        centre = self.pixels.centre[:, None, None, None] + chief.expand(2, *light.shape)
+        window = dataclasses.replace(self.pixels, centre=centre)
         points = self.pupil_points.to(fields)
         weights = torch.full_like(points[0], 1 / len(points[0]))
         if self.model == "drt":
@@ -383,13 +381,6 @@ class Camera(nn.Module):
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
-
-    def _window(self, lens: Lens, fields: Tensor, distances: Tensor, memo: Memo | None) -> Grid:
-        """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""
-        if bool((fields == 0).all()) and memo is not None:
-            return self.pixels
-        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], memo))[..., 0]
-        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(
         self,

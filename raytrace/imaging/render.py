@@ -1,6 +1,6 @@
 """Pictures that a lens projects onto a sensor: blur over the whole field, distortion, illumination, colour, depth.
 
-    sensor = rt.Sensor(size=(24, 16), pixels=(1200, 800), response="rgb")
+    sensor = rt.Sensor(size=(24, 16), pixels=(240, 160), response="rgb")
     image = rt.render(lens, picture, sensor=sensor).image
 
 A picture is the image of an ideal lens of the same focal length. The real lens moves every point of it to the landing

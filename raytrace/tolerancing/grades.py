@@ -218,7 +218,7 @@ def _parsed(text: str) -> list[_Limit]:
         if not match:
             raise BadTolerance(f"{piece!r}: expected a kind and its limit, as radius=0.1% or power:2-4=-1..3")
         word, places, low, high, percent = match.groups()
-        if word not in WORDS and (word not in KINDS or word in ("operand", "parameter", "zernike")):
+        if word not in WORDS and (word not in KINDS or word in ("operand", "parameter", "zernike", "fringe")):
             meant = did_you_mean(word, [*WORDS, *KINDS])
             raise BadTolerance(f"{piece!r}: no tolerance {word!r}{meant}; expected one of {', '.join(WORDS)}")
         if percent and word not in ("radius", "abbe"):

@@ -172,7 +172,6 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     aim = _aim(lens, wavelength)
     launched = _start_direction(aim, distance)
     indices = media(lens, wavelength)
-    indices = [*indices[:-1], indices[-2]]  # the direction before the image surface, whatever medium is behind
     axes, image = _axes(launched), len(lens.surfaces) - 1
     real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
 

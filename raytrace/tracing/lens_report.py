@@ -12,7 +12,7 @@ from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached, summary, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, is_round_about_axis, media
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
@@ -292,6 +292,8 @@ def _remarks(lens: Lens, k: int) -> str:
     if surface.conic is not None:
         parts.append(f"conic {float(surface.conic):g}")
     parts += remarks(surface)
+    if k == len(lens.surfaces) - 1 and (unused := glass_on_image(lens)):
+        parts.append(f"light does not enter {unused}")
     if surface.environment is not None:
         parts.append(f"in {in_words(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
