@@ -65,7 +65,7 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     rays = math.prod((pupil_points, *counts.values()))
     factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     what = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
-    afford(RAY_BYTES * rays, what, helps="ask for fewer fields, wavelengths or pupil points")
+    afford(RAY_BYTES * rays, what, helps="ask for fewer `fields`, `wavelengths` or points of the pupil")
 
 
 def forewarn(seconds: float, what: str, *, helps: str) -> None:

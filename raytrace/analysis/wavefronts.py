@@ -1,6 +1,7 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import dataclasses
+import math
 import warnings
 from typing import Literal
 
@@ -147,6 +148,7 @@ def wavefront(
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
         helps="ask for a smaller `size`, or fewer fields or wavelengths",
     )
+    zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
     parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
     over = 0 if lens.count is None else 1
