@@ -480,8 +480,8 @@ def tolerance(
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
         slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
         estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
-        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss, holds=holds,
-        configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
+        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss,
+        holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
