@@ -32,7 +32,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Surface, is_freeform, is_posed
-from raytrace.words import named
+from raytrace.words import RaytraceWarning, named
 
 #: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
 MAX_BYTES = 16 * 2**20
@@ -81,7 +81,7 @@ class UnsupportedSurface(LensFileError):
     """A surface of a type that is not modelled; it is never dropped and never read as another type."""
 
 
-class LensFileWarning(UserWarning):
+class LensFileWarning(RaytraceWarning):
     """A lens file was read, but something in it was left out or assumed."""
 
 

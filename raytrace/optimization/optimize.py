@@ -71,7 +71,7 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 # -- conditions: what is required, and what is reached -----------------------------------------------------------------
 
@@ -84,7 +84,7 @@ _TRIES = 4
 _NAMED = 4  # variables in one sentence
 
 
-class NotReached(UserWarning):
+class NotReached(RaytraceWarning):
     """A condition or a boundary that the optimised lens does not meet."""
 
 

@@ -58,7 +58,7 @@ from raytrace.system.surface import Surface, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of
-from raytrace.words import calling_level, did_you_mean
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -97,7 +97,7 @@ _PICKUP = re.compile(rf"([-+]?)(?:({_NUMBER})\*)?([a-z]\w*):(\d+)(?:([-+])({_NUM
 _SOLVE = re.compile(r"([a-z]\w*)\(([^()]*)\)")
 
 
-class VariedGlass(UserWarning):
+class VariedGlass(RaytraceWarning):
     """A glass of a catalog is replaced by a model glass, whose numbers can vary."""
 
 

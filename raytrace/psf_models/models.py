@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import OverBudget, within
+from raytrace.budget import OverBudget, afford, within
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.maths.sampling import grid as make_grid
@@ -33,9 +33,10 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
+_PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
 
 
 @value
@@ -182,7 +183,7 @@ _ROWS = (
 MODELS = {row.name: row for row in _ROWS}
 
 
-class NotConverged(UserWarning):
+class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
 
@@ -300,6 +301,13 @@ def psf(
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+    D, F, W = len(distances), fields.shape[1], len(wavelengths) if per_wavelength else 1
+    rows, columns = base.shape
+    afford(
+        _PIXEL_BYTES * D * F * W * rows * columns,
+        f"{D * F * W:,} PSFs of {rows:,} × {columns:,} pixels",
+        helps="ask for a smaller `size`, or fewer `fields` at once",
+    )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
     drive = _driver(lens, name, parameters, tol or 0.01, execution)

@@ -462,8 +462,7 @@ def tolerance(
                 chosen.quantity_of(goal), yield_, seed + 1,
             )  # fmt: skip
             study = Study(views, tolerances, loss)
-        ends = tolerances.minimum, tolerances.maximum
-        alone = torch.cat([tolerances.alone(limits) for limits in ends]).to(study.half)
+        alone = torch.cat([tolerances.alone(each) for each in (tolerances.minimum, tolerances.maximum)]).to(study.half)
         changes, light = study.harm(alone)
         start, slope = second(torch.zeros_like(alone[:1]))
         seconds = chosen.value(second(alone)[0].clamp_min(0)) - chosen.value(start.clamp_min(0))

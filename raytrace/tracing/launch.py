@@ -57,10 +57,10 @@ from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
-from raytrace.words import calling_level, named_value
+from raytrace.words import RaytraceWarning, calling_level, named_value
 
 
-class MarginalRayLost(UserWarning):
+class MarginalRayLost(RaytraceWarning):
     """The real marginal ray does not reach the stop, so that it cannot define its radius."""
 
 
@@ -498,7 +498,7 @@ TOLERANCE = 0.02
 MOST_FIELDS = 64  # measured per call: a map of the field has thousands
 
 
-class UnfilledStop(UserWarning):
+class UnfilledStop(RaytraceWarning):
     """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
 
     of_result = True  # about a result: not printed with an error that ends the command
