@@ -49,6 +49,7 @@ PUBLIC = {
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
+    "internal_transmittance": "materials.glass",
     "refractive_index": "materials.glass",
     # rays
     "RaytraceWarning": "words",

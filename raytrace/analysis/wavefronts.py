@@ -18,7 +18,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
-from raytrace.psf_models.wave import strehl
+from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients

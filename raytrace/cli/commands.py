@@ -668,7 +668,8 @@ pictures, which share the kernels if they have one size.""",
     _command(
         "glass",
         "look up a glass",
-        "Print index, nd, Vd, formula, range and catalog of a glass; similar names are suggested for an unknown one. "
+        "Print index, nd, Vd, formula, range, expansion, density, price, internal transmittance and catalog of a "
+        "glass; similar names are suggested for an unknown one. "
         "With a temperature or a pressure also its indices there, relative to air at that temperature and pressure, "
         "and their change with temperature.",
         """

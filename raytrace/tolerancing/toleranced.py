@@ -76,7 +76,7 @@ class Toleranced(Result):
     lost: Tensor
     lost_minimum: Tensor
     lost_maximum: Tensor
-    loss: float = 0.01
+    loss: float = 0.05
     holds: str = ""
     configurations: int = 1
     seed: int = 0
@@ -385,7 +385,7 @@ def tolerance(
     fields: Tensor | Sequence | None = None,
     rings: int | None = None,
     arms: int | None = None,
-    loss: float = 0.01,
+    loss: float = 0.05,
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
@@ -421,7 +421,7 @@ def tolerance(
         that of its own fields.
     rings: of the pupil, Gaussian quadrature; by default the fewest that give the spots of `spot`.
     arms: of the pupil, 4·rings by default.
-    loss: share of the light of the nominal lens that a lens may lose, 0.01 by default; one that loses more has failed.
+    loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has failed.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
@@ -441,7 +441,7 @@ def tolerance(
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= loss <= 1:
-        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.01")
+        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.05")
     options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
     views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
     chosen, study, given = views[0].criterion, Study(views, tolerances, loss), tolerances
