@@ -13,13 +13,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from problems import MICROMETRE, PICOMETRE
+from problems import MICROMETRE, PICOMETRE, own_fields
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, media
 from raytrace.tracing.scene import beam_share
 from raytrace.tracing.spot import chief_reference, image_rays
+from raytrace.tracing.trace import is_bent, without_apertures
 from raytrace.tracing.wavefront import wavefront_of
 from raytrace.viewer.compute import spots_of
 
@@ -82,7 +83,8 @@ ZOO = {
     "mirrors off the axis": lambda: rt.read_lens(EXAMPLES / "off_axis_telescope.zmx"),
     "folded": lambda: rt.read_lens(EXAMPLES / "folded_relay.zmx"),
     "aspheres": lambda: rt.read_lens("phone"),
-    "clipped": lambda: rt.read_lens("double_gauss_28deg"),
+    "vignetting factors": lambda: rt.read_lens("double_gauss_28deg").at(wavelengths=[0.546]),
+    "clipped": lambda: _triplet(**SINGLE).replace(6, apertures=(rt.Aperture("circular", (0.0, 11.0)),)),
     "one configuration of two": lambda: dataclasses.replace(
         _zoom().configuration(2), operands=(), current_configuration=1
     ),
@@ -107,14 +109,9 @@ def lens(request) -> Lens:
     return member(request.param)
 
 
-def fields_of(lens: Lens) -> torch.Tensor:
-    """(2, F) the lens's own."""
-    return torch.stack([lens.fields.x, lens.fields.y])
-
-
 def relative_fields(lens: Lens) -> list[list[float]]:
     """Hx, Hy of the lens's fields, as operands take them."""
-    fields = fields_of(lens)
+    fields = own_fields(lens)
     largest = torch.hypot(*fields).max()
     return (fields / torch.where(largest > 0, largest, 1.0)).T.tolist()
 
@@ -149,10 +146,10 @@ def test_spot_radii(lens):
     """The radius about the centroid by `spot`, along the field, and in the viewer."""
     spots = rt.spot(lens)
     radii, rel = spots.whole.rms_radius, rule_of(lens)
-    curve = rt.rms_over_field(lens, spot=True, fields=fields_of(lens))
+    curve = rt.rms_over_field(lens, spot=True, fields=own_fields(lens))
     assert close(curve.polychromatic, radii, rel=rel, abs=PICOMETRE)
     assert close(curve.rms, spots.each.rms_radius, rel=rel, abs=PICOMETRE)
-    assert close(spots_of(lens, fields_of(lens))["rms"], radii / MICROMETRE, rel=1e-6, abs=1e-6)
+    assert close(spots_of(lens, own_fields(lens))["rms"], radii / MICROMETRE, rel=1e-6, abs=1e-6)
 
 
 @quiet
@@ -195,7 +192,7 @@ def test_energy_of_kernels(lens):
     lens = lens.at(wavelengths=lens.primary[None])
     spots = rt.spot(lens, rings=48)
     share = torch.where(spots.arrivals.rays.valid, spots.arrivals.weight, 0.0).sum(-1)[:, 0]
-    share = share * beam_share(scene_of(lens, fields_of(lens)))[0, :, 0]
+    share = share * beam_share(scene_of(lens, own_fields(lens)))[0, :, 0]
     window = dict(pixel=2.5 * float(spots.whole.geometric_radius.max()) / 21 + 1e-3, size=21)
     assert close(rt.psf(lens, rt.DRT(order=5), **window).energy[0], share, abs=2e-2)
 
@@ -211,7 +208,7 @@ def test_wavefront_rms(lens):
     light = map_.valid / map_.valid.sum((-2, -1), keepdim=True)
     mean = (light * map_.opd).sum((-2, -1), keepdim=True)
     assert close((light * (map_.opd - mean) ** 2).sum((-2, -1)).sqrt(), map_.rms, rel=5e-3, abs=1e-6)
-    curve = rt.rms_over_field(lens, reference="own", fields=fields_of(lens))
+    curve = rt.rms_over_field(lens, reference="own", fields=own_fields(lens))
     assert close(curve.rms, map_.rms, rel=rule_of(lens), abs=1e-7)
 
 
@@ -224,14 +221,14 @@ def test_wavefront_along_the_axes_of_the_pupil(lens):
         ("tangential", 1, torch.stack([0 * line, line])),
         ("sagittal", 0, torch.stack([line, 0 * line])),
     ):
-        front = wavefront_of(scene_of(lens, fields_of(lens)), points)
+        front = wavefront_of(scene_of(lens, own_fields(lens)), points)
         valid = getattr(fan, f"{section}_valid")
         assert valid.any() or section == "tangential"  # the vane covers it
         assert torch.equal(valid, front.valid[0])
         waves = front.opd[0] / (1e-3 * lens.wavelengths[:, None])
         assert close(waves[valid], getattr(fan, section)[valid], rel=1e-9, abs=1e-7)
         places = image_rays(lens, points).position[axis]
-        chief = chief_reference(lens, fields_of(lens))[axis]
+        chief = chief_reference(lens, own_fields(lens))[axis]
         assert close((places - chief[..., None])[valid], getattr(rays, section)[valid], rel=1e-9, abs=PICOMETRE)
 
 
@@ -243,3 +240,99 @@ def test_strehl_ratio(lens):
     assert bool((ratio <= 1 + 1e-9).all())
     rows = [operand(lens, "STRH", (0, 1), (f + 1,)) for f in range(len(ratio))]
     assert close(rows, ratio, rel=1e-6)
+
+
+# -- transfer functions and energy ------------------------------------------------------------------------------------
+
+#: Lenses whose diffraction kernels are small enough for a window of a few hundred pixels.
+SHARP = "immersed ellipsoid", "obscured asphere", "mirrors off the axis", "vane", "sensor in glass"
+
+
+@quiet
+def test_geometric_transfer(lens):
+    """The geometric MTF is the transform of the DRT kernel, 1 at frequency 0."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    pitch = float(rt.spot(lens).whole.geometric_radius.max()) / 40 + 1e-4
+    kernel = rt.psf(lens, rt.DRT(order=5), pixel=pitch, size=99, center="chief").kernel[0]
+    frequencies = torch.tensor([0.0, 0.02, 0.06], dtype=torch.float64) / pitch
+    at = pitch * (torch.arange(99) - 49)
+    wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
+    curve = rt.mtf(lens, frequencies, geometric=True)
+    for direction, axis in (("tangential", -1), ("sagittal", -2)):
+        spread = kernel.sum(axis)
+        expected = (spread.to(wave) @ wave.T).abs() / spread.sum(-1, keepdim=True)
+        assert close(getattr(curve, direction), expected, abs=1e-2), direction
+
+
+@quiet
+@pytest.mark.parametrize("name", SHARP)
+def test_diffraction_transfer_and_energy(name):
+    """MTF and encircled energy of diffraction are those of the wave kernel, on the axis at the primary wavelength."""
+    lens = member(name).at(fields=[0], wavelengths=member(name).primary[None])
+    cutoff = _cutoff(lens)
+    pitch, size = 0.25 / cutoff, 301
+    psf = rt.psf(lens, "wave", pixel=pitch, size=size, tol=1e-3)
+    kernel, at = psf.kernel[0, 0], pitch * (torch.arange(size, dtype=torch.float64) - size // 2)
+    frequencies = torch.tensor([0.1, 0.3, 0.6], dtype=torch.float64) * cutoff
+    wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
+    light = float(rt.psf(lens, rt.DRT(order=5), pixel=1.0, size=21).energy)
+    expected = (wave @ kernel.sum(1).to(wave)).abs() / light
+    curve = rt.mtf(lens, [0.0, *frequencies.tolist(), 1.001 * cutoff], geometric=False)
+    assert close(curve.tangential[0, 1:-1], expected, abs=2e-2)
+    assert close(curve.tangential[0, [0, -1]], [1.0, 0.0], abs=1e-6)
+    radius = 20 * pitch
+    inside = torch.hypot(at[:, None], at) <= radius
+    energy = rt.encircled_energy(lens, [radius], geometric=False).share[0]
+    assert close(energy, kernel[inside].sum() / light, abs=1e-2)
+
+
+def _cutoff(lens: Lens) -> float:
+    """Cycles/mm beyond which nothing of the axial field is resolved: the width of the pupil in directions over λ."""
+    line = torch.linspace(-1, 1, 201, dtype=torch.float64)
+    rays = image_rays(without_apertures(lens), torch.stack([0 * line, line]), wavelengths=lens.primary[None])
+    slopes = rays.direction[1].flatten()
+    index = float(media(lens, lens.primary)[-2])
+    return float(slopes.max() - slopes.min()) * index / (1e-3 * float(lens.primary))
+
+
+# -- chief rays, focus and first-order data ---------------------------------------------------------------------------
+
+
+@quiet
+def test_chief_rays(lens):
+    """Distortion and lateral colour are differences of the chief rays that `rays` lands on the sensor."""
+    if is_bent(lens):
+        pytest.skip("distortion is about a straight axis")
+    fields = own_fields(lens)
+    landed = image_rays(lens, fields.new_zeros(2, 1), fields=fields).position[:2, ..., 0]
+    heights = rt.distortion(lens, fields=fields).height
+    assert close(heights.abs(), torch.hypot(*landed), rel=1e-9, abs=PICOMETRE)
+    shift = rt.lateral_colour(lens, fields=fields).shift
+    primary = landed[..., lens.primary_wavelength - 1, None]
+    assert close(shift.abs(), torch.hypot(*(landed - primary)), rel=1e-6, abs=PICOMETRE)
+
+
+@quiet
+def test_focus(lens):
+    """The spot has its least RMS radius at the sensor distance that `focus` reports."""
+    lens = lens.at(fields=own_fields(lens).T[:1], wavelengths=lens.primary[None])
+    best = float(rt.focus(lens).lens.surfaces[-2].thickness)
+    near, middle, far = (float(rt.spot(lens.at(sensor_distance=best + s)).whole.rms_radius) for s in (-0.01, 0, 0.01))
+    assert middle <= min(near, far) + PICOMETRE
+
+
+@quiet
+def test_first_order_data(lens):
+    """Focal length, F-number and magnification: first-order data, operands, and the report of the lens."""
+    if is_bent(lens):
+        pytest.skip("operands of first order are those of a straight axis")
+    data, report = rt.first_order(lens), rt.info(lens).document()
+    for name, row, integers in (
+        ("effective_focal_length", "EFFL", (0, lens.primary_wavelength)),
+        ("f_number", "ISFN", ()),
+        ("magnification", "PMAG", (0, lens.primary_wavelength)),
+        ("image_na", "ISNA", ()),
+    ):
+        value = float(getattr(data, name))
+        assert report[name] == pytest.approx(value, rel=1e-12), name
+        assert operand(lens, row, integers) == pytest.approx(value, rel=1e-9, abs=1e-12), name

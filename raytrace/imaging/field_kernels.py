@@ -38,7 +38,7 @@ from raytrace.wave_optics.element import Element, is_radial
 from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
 #: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
@@ -55,7 +55,7 @@ class WindowTooLarge(ValueError):
     """A blur of more pixels than a window has."""
 
 
-class DarkPlaces(UserWarning):
+class DarkPlaces(RaytraceWarning):
     """Places of the sensor without light, whose kernels are 0."""
 
 

@@ -445,7 +445,7 @@ class _Run:
 
         keys = [f"start {i}" for i in numbers]
         ends = self._results([(key, lambda i=i: start(i)) for key, i in zip(keys, numbers, strict=True)])
-        self.started = numbers[-1] + 1
+        self.started = numbers.stop
         best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
         self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
         springs = self.minima.each[:_SPRINGS]
