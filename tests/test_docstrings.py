@@ -115,7 +115,7 @@ def given() -> dict:
     return {
         "rt": raytrace,
         "torch": torch,
-        "lens": raytrace.read_lens("singlet"),
+        "lens": raytrace.read_lens("cooke_triplet"),
         "element": raytrace.elements("ideal", aperture=1.0)[0],
         "network": raytrace.UNet(channels=3),
         "picture": torch.rand(3, 160, 240),

@@ -324,6 +324,7 @@ def shipped_difference(glass: Glass) -> float:
     return _difference(glass, shipped) if shipped else 0.0
 
 
+@lru_cache(maxsize=1024)
 def _shipped_glass(name: str, catalog: str) -> Glass:
     return shipped_catalog(catalog).glasses[_shipped_names(catalog)[name.upper()]]
 
