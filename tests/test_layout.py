@@ -1,7 +1,9 @@
 """Frames of surfaces in space, and layouts of folded systems."""
 
+import dataclasses
 import math
 
+import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -94,6 +96,34 @@ def test_views_and_colours_by_wavelength(tmp_path):
     assert len(rays) == 6
     assert len({line.get_color() for line in rays}) == 2
     assert "0.45 µm" in "".join(text.get_text() for text in figure.legends[0].get_texts())
+
+
+def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
+    lens = rt.read_lens("cooke_triplet")
+    for aperture in (
+        rt.Aperture("circular", (0.0, 1e6), False, (0.0, 1.0)),
+        rt.Aperture("circular", (12.0, 1e6), True),
+    ):
+        first = dataclasses.replace(lens.surfaces[1], apertures=(aperture,))
+        wide = dataclasses.replace(lens, surfaces=(lens.surfaces[0], first, *lens.surfaces[2:]))
+        figure = rt.layout(wide).plot()
+        assert all(np.abs(line.get_ydata()).max() < 50 for line in figure.axes[0].lines)
+        space, plain = (rt.layout(one, view="3d").plot().axes[0] for one in (wide, lens))
+        assert space.get_zlim() == pytest.approx(plain.get_zlim(), abs=5)
+
+
+def test_obscurations_are_seen_in_space():
+    lens = rt.read_lens("cooke_triplet")
+    vane = rt.Aperture("rectangular", (2.0, 6.0), True)
+    surface = dataclasses.replace(lens.surfaces[1], apertures=(vane,))
+    lens = dataclasses.replace(lens, surfaces=(lens.surfaces[0], surface, *lens.surfaces[2:]))
+    grey = matplotlib.colors.to_rgba("#8c8c8c", 0.9)
+    drawn = rt.layout(lens, view="3d").plot().axes[0].collections
+    (blocked,) = [one for one in drawn if len(one.get_facecolor()) and tuple(one.get_facecolor()[0]) == grey]
+    corners = np.concatenate([*blocked._faces]) if hasattr(blocked, "_faces") else blocked._vec[:3].T
+    size = float(lens.surfaces[1].semi_diameter) / 40  # of a tile
+    assert np.abs(corners[:, 1]).max() == pytest.approx(2.0, abs=size)  # x of the lens
+    assert np.abs(corners[:, 2]).max() == pytest.approx(6.0, abs=size)
 
 
 def test_a_decentred_aperture_shows_that_part_of_a_mirror():

@@ -107,10 +107,11 @@ def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] =
 
 
 def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
-    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone."""
+    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone, where
+    it is smaller than the surface."""
     for aperture in surface.apertures:
         rim = reach(aperture)[1]
-        if not aperture.obscures and math.isfinite(rim) and any(aperture.centre):
+        if not aperture.obscures and rim < radius and any(aperture.centre):
             return *aperture.centre, rim
     return 0.0, 0.0, radius
 

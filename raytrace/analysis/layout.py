@@ -360,7 +360,8 @@ def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii
                 bars = [(-rim - outward, -rim), (rim, rim + outward)]
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
-                height = centre + np.linspace(low, high, 41)
+                most = radii[k] + outward
+                height = np.linspace(*np.clip((centre + low, centre + high), -most, most), 41)
                 edge = 0.9999 * edge_radius(surface)
                 depth = cross_section.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)

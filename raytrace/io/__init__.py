@@ -56,12 +56,13 @@ from raytrace.io.table import write as table_write
 from raytrace.io.zemax import archive as zemax_archive
 from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
+from raytrace.io.zemax.tolerances import read_lines
 from raytrace.materials.agf import write_agf
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, glass_on_image
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.surface import is_posed
 from raytrace.words import calling_level, did_you_mean, named_value
@@ -196,8 +197,11 @@ def read_lens_with_report(
         raise LensFileError(message, Place(file))
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
     data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
+    unused, image = glass_on_image(lens), len(lens.surfaces) - 1
+    note = f"surface {image}: light does not enter {unused}, the glass of the image; results are those in front of it"
     report = dataclasses.replace(
         report,
+        notes=(*report.notes, *([note] if unused else [])),
         surfaces=len(lens.surfaces),
         stop_surface=lens.stop,
         primary_wavelength=lens.primary_wavelength,
@@ -209,8 +213,17 @@ def read_lens_with_report(
         kept=tuple(map(str, data.kept)),
         operands=operand_uses(data.merit, evaluated),
         tolerances=len(data.tolerances),
+        unread_tolerances=_unread_tolerances(lens),
     )
     return lens, report
+
+
+def _unread_tolerances(lens: Lens) -> tuple[str, ...]:
+    """The lines of tolerances that are not read, with the reason, or the first that the lens does not have."""
+    try:
+        return read_lines(lens, lens.optimization_data.tolerances).unread if lens.optimization_data else ()
+    except LensFileError as error:
+        return (str(error),)
 
 
 def shipped_lens(name: str | os.PathLike) -> Path | None:

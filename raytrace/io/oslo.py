@@ -429,7 +429,7 @@ def _solved(
     which suffices for a height of 0.
     """
     surfaces, n = list(surfaces), []
-    for k in medium_surfaces(surfaces[:-1]):
+    for k in medium_surfaces(surfaces)[:-1]:
         n.append(float(refractive_index(surfaces[k].glass, double(primary))))
         if not n[-1]:
             name = surfaces[k].glass.name or "the medium"

@@ -12,7 +12,7 @@ import torch
 
 from raytrace.files import encoding, read_bytes, write_text
 from raytrace.materials.glass import BY_NUMBER, FORMULAS, Glass
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
@@ -35,7 +35,7 @@ class CatalogError(ValueError):
     """A malformed glass catalog; the message has file and line, the text found, the text expected and a likely fix."""
 
 
-class CatalogWarning(UserWarning):
+class CatalogWarning(RaytraceWarning):
     """A catalog was read, but something in it was left aside."""
 
 

@@ -36,7 +36,7 @@ from raytrace.materials.agf import read_agf as read_agf
 from raytrace.materials.agf import read_text
 from raytrace.materials.agf import write_agf as write_agf
 from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, abbe_number, constant, model_glass, nd, refractive_index
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
 #: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
@@ -64,7 +64,7 @@ _PER_ABBE = 0.01
 SAME_INDEX = 1e-6
 
 
-class AmbiguousGlass(UserWarning):
+class AmbiguousGlass(RaytraceWarning):
     """Two catalogs define a name differently, and the lens file does not specify the catalog."""
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from raytrace.materials.glass import FORMULAS, WITH_ERRORS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide, value
+from raytrace.words import RaytraceWarning
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)
@@ -31,7 +32,7 @@ COLDEST, HOTTEST = -272.0, 1000.0
 FITTED = -100.0, 140.0
 
 
-class NoThermalCoefficients(UserWarning):
+class NoThermalCoefficients(RaytraceWarning):
     """A glass is used at another temperature than its catalog's without thermal coefficients, or beyond their range."""
 
 

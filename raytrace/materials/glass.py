@@ -22,7 +22,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------
 
@@ -243,7 +243,7 @@ class InvalidIndex(ValueError):
     """A glass has no real, positive refractive index at a wavelength asked of it."""
 
 
-class OutOfRange(UserWarning):
+class OutOfRange(RaytraceWarning):
     """A wavelength lies outside the range that the coefficients of a glass were fitted to."""
 
 

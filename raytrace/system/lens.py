@@ -21,7 +21,7 @@ from raytrace.materials.environment import (
     objection,
     unknown_change,
 )
-from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
+from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
 from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, is_any, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
@@ -355,6 +355,12 @@ class Lens:
     def __getattr__(self, name: str):
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
 
+    def __repr__(self) -> str:
+        several = "" if self.count is None else f"{self.count} lenses of "
+        kinds = {"surface": self.surfaces, "field": self.fields.y, "wavelength": self.wavelengths}
+        counts = ", ".join(f"{len(part)} {kind}{'' if len(part) == 1 else 's'}" for kind, part in kinds.items())
+        return f"<Lens: {self.name}{self.name and '; '}{several}{counts}>"
+
     def __str__(self) -> str:
         from raytrace.tracing.lens_report import text
 
@@ -632,8 +638,9 @@ def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
 def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     """Refractive index behind every surface, object first; positive also behind a mirror.
 
-    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
-    break keeps the medium. A medium that does not change is the same tensor, so that a trace refracts nothing there.
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror, a coordinate break
+    and the image keep the medium. A medium that does not change is the same tensor, so that a trace refracts nothing
+    there: rays on the sensor have the direction and the index of the last gap.
     """
     dtype, numbers = lens.surfaces[-2].thickness.dtype, medium_surfaces(lens.surfaces)
     in_air = lens.environment is None and all(surface.environment is None for surface in lens.surfaces)
@@ -651,6 +658,16 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
         indices = [index_behind(lens, number, wavelength) for number in distinct.values()]
     by_medium = {key: n.to(dtype) for key, n in zip(distinct, indices, strict=True)}
     return [by_medium[key] for key in keys]
+
+
+def glass_on_image(lens: Lens) -> str:
+    """The name of a glass on the image surface, "" where it is air or the medium in front of it.
+
+    No light enters it: rays, spots, wavefronts and PSFs are those in the last gap.
+    """
+    surface, before = lens.surfaces[-1], lens.surfaces[medium_surfaces(lens.surfaces)[-1]]
+    unused = not surface.is_mirror and not is_air(surface.glass) and not multiple.same(surface.glass, before.glass)
+    return label(surface.glass) if unused else ""
 
 
 def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:

@@ -113,10 +113,14 @@ def _thicker(surface: Surface, z: Tensor | None) -> Surface:
 
 
 def medium_surfaces(surfaces: Sequence[Surface]) -> list[int]:
-    """The surface whose glass fills the space behind each surface: mirrors and coordinate breaks keep the medium."""
+    """The surface whose glass fills the space behind each surface of a lens, object to image.
+
+    Mirrors, coordinate breaks and the image keep the medium: the sensor is in the last gap, and refracts nothing.
+    """
     media: list[int] = []
     for k, surface in enumerate(surfaces):
-        media.append(media[-1] if k and (surface.is_mirror or surface.is_break) else k)
+        keeps = surface.is_mirror or surface.is_break or k == len(surfaces) - 1
+        media.append(media[-1] if k and keeps else k)
     return media
 
 
