@@ -34,7 +34,7 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.poses import Pose, undone
-from raytrace.system.surface import SHAPE, Surface, is_posed
+from raytrace.system.surface import SHAPE, Surface
 
 #: More characters than the name of any glass has.
 _LONGEST = 80
@@ -326,7 +326,7 @@ def assemble(draft: LensDraft, file: str) -> Lens:
         raise LensFileError(f"{keyword}{message}", place)
 
     last = len(draft.surfaces) - 1
-    if is_posed(draft.surfaces[0]):
+    if draft.surfaces[0].before is not None or draft.surfaces[0].after is not None:
         raise LensFileError(TILTED_OBJECT, Place(file, None, 0))
     if not 0 < draft.stop < last:
         refuse("stop", f" is surface {draft.stop}, expected 1 to {last - 1}: a surface between object and image")
