@@ -61,7 +61,7 @@ from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.system.lens import Lens, glass_on_image
+from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, did_you_mean, named_value
 
@@ -195,11 +195,8 @@ def read_lens_with_report(
         raise LensFileError(message, Place(file))
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
     data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
-    unused, image = glass_on_image(lens), len(lens.surfaces) - 1
-    note = f"surface {image}: light does not enter {unused}, the glass of the image; results are those in front of it"
     report = dataclasses.replace(
         report,
-        notes=(*report.notes, *([note] if unused else [])),
         surfaces=len(lens.surfaces),
         stop_surface=lens.stop,
         primary_wavelength=lens.primary_wavelength,
