@@ -38,8 +38,8 @@ class WavefrontMap(Analysis):
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
     coefficients: (F, W, J) Zernike coefficients 1 … J over the entrance pupil, numbered as `numbering` says: "noll", in
         waves RMS, or "fringe", in waves at the rim.
-    rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over a square grid of 127 points across the pupil,
-        centre and ends of its axes among them.
+    rms: (F, W) waves about the mean, over the clear pupil up to its edges; peak_to_valley: (F, W) waves, over a square
+        grid of 127 points across the pupil, centre and ends of its axes among them.
     strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
         where the blur is too large for the sum of waves.
     fields: (2, F); listed: whether the text lists the coefficients.

@@ -59,10 +59,10 @@ from raytrace.io.zemax import write as zemax_write
 from raytrace.io.zemax.tolerances import read_lines
 from raytrace.materials.agf import write_agf
 from raytrace.materials.catalogs import UnknownGlass
-from raytrace.materials.glass import AIR, check_unit
+from raytrace.materials.glass import check_unit
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
-from raytrace.system.lens import Lens, glass_on_image
+from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.surface import is_posed
 from raytrace.words import calling_level, did_you_mean, named_value
@@ -197,12 +197,8 @@ def read_lens_with_report(
         raise LensFileError(message, Place(file))
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
     data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
-    image = len(lens.surfaces) - 1
-    unused = "" if lens.surfaces[image].glass is AIR else glass_on_image(lens)
-    note = f"surface {image}: light does not enter {unused}, the glass of the image; results are those in front of it"
     report = dataclasses.replace(
         report,
-        notes=(*report.notes, *([note] if unused else [])),
         surfaces=len(lens.surfaces),
         stop_surface=lens.stop,
         primary_wavelength=lens.primary_wavelength,

@@ -243,7 +243,9 @@ def psf(
         does not move. The kernels are the same.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
     normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
-    Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead.
+    Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead. Without an
+    order, that of each object distance or lens is chosen alone, and so is the model of "auto": its PSFs are those of a
+    call for it alone. `model` and `order` of the result are then the finest of them.
     execution: memory, processes and progress, see `Execution`.
 
     Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
@@ -313,12 +315,13 @@ def psf(
     )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
-    drive = _driver(lens, name, parameters, tol or 0.01, execution)
     shares = weights / weights.sum()
 
     def compute(chosen: Tensor) -> Psf:
-        centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
-        batch = scene(lens, fields, distances[chosen], wavelengths, execution.memo)
+        centre = base.centre[:, chosen] if base.centre.dim() > 1 and base.centre.shape[1] > 1 else base.centre
+        part = lens if lenses in (None, len(chosen)) else one_lens(lens, chosen)
+        drive = _driver(part, name, parameters, tol or 0.01, execution)
+        batch = scene(part, fields, distances[chosen], wavelengths, execution.memo)
         origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
         if center == "axis" or symmetry(batch) == "round":
             pass
@@ -326,7 +329,7 @@ def psf(
             alone = gaussian.kernels_alone(batch, make_grid(batch.wavelengths.new_tensor(1.0), 1), order=6)
             origin = polychromatic(alone, shares, "").centroid
         else:
-            origin = chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
+            origin = chief_landing(dataclasses.replace(batch, wavelengths=part.primary[None]))[..., 0]
         if origin is not None and window == "fixed":
             origin = origin.detach()
         if origin is not None or centre.dim() > 1:  # a single point stays a single point
@@ -335,12 +338,14 @@ def psf(
             centre = centre[..., None].expand(*centre.shape, len(wavelengths))
         return drive(batch, dataclasses.replace(base, centre=centre), None if per_wavelength else shares)
 
-    infinite = torch.isinf(distances)
+    # A choice by an estimate is made for each object distance, or lens, alone: no PSF depends on its neighbours.
+    # A fixed amount of work is done together, for finite distances and infinite ones apart.
+    infinite, numbers = torch.isinf(distances), torch.arange(len(distances), device=distances.device)
+    is_fixed = order is not None or (rays is not None and MODELS[name].plain is not None)
+    groups = [numbers[~infinite], numbers[infinite]] if is_fixed else list(numbers.split(1))
+    groups = [group for group in groups if len(group)]
     with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():
-        if bool(infinite.any()) and not bool(infinite.all()):
-            psfs = _merged(compute(~infinite), compute(infinite), infinite)
-        else:
-            psfs = compute(torch.ones_like(infinite))
+        psfs = _merged([compute(group) for group in groups], torch.cat(groups).argsort())
     points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
@@ -412,18 +417,31 @@ def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution)
     return stream
 
 
-def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
-    """The PSFs of finite and of infinite object distances, in their original order."""
-    order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
+def _merged(parts: Sequence[Psf], order: Tensor) -> Psf:
+    """One PSF of those of several object distances or lenses, in this order; of the finest model among them.
 
-    def in_order(parts: Sequence[Tensor], axis: int) -> Tensor:
-        return torch.cat(parts, axis).index_select(axis, order)
-
-    merged, centre = combined([finite, infinite], in_order), finite.grid.centre
+    `order` is the finest of that model's, for loops; a residual that a model does not have is nan.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    model = max((part.model for part in parts), key=list(MODELS).index)
+    finest = max((part for part in parts if part.model == model), key=lambda part: part.order or 0)
+    if any(part.residual is not None for part in parts):
+        known = (torch.full_like(part.error, torch.nan) if part.residual is None else part.residual for part in parts)
+        parts = [dataclasses.replace(part, residual=residual) for part, residual in zip(parts, known, strict=True)]
+    merged = combined(parts, lambda tensors, axis: torch.cat(tensors, axis).index_select(axis, order))
+    centre = finest.grid.centre
     if centre.dim() > 1:
-        centre = in_order([centre, infinite.grid.centre], 1)
-    reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
-    return dataclasses.replace(merged, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)
+        centre = torch.cat([part.grid.centre for part in parts], 1).index_select(1, order)
+    reason = "; ".join(dict.fromkeys(part.reason for part in parts if part.reason))
+    return dataclasses.replace(
+        merged,
+        grid=dataclasses.replace(finest.grid, centre=centre),
+        model=model,
+        waves=finest.waves,
+        order=finest.order,
+        reason=reason,
+    )
 
 
 def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, order: int) -> Psf:

@@ -23,7 +23,7 @@ from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
 _FINE = 5  # points of λ/NA: the highest of them has 0.8 of the largest intensity at the least
 _TOPS = 4  # points that are climbed from
-_WORTH = 4000  # rays from which on fewer are traced
+_WORTH, _MOST = 4_000, 800_000  # waves from which, and to which, they are series of fewer rays
 _DEGREE = 24  # of series over the pupil
 _MISSED = 1e-4  # waves that they may miss
 
@@ -39,7 +39,9 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
 
 def _of_field(scene: Scene, order: int) -> Tensor:
     probe = probe_of(scene)
-    width = 1e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)  # λ/NA (D, F, W) mm
+    spread = half_spread(probe)
+    spread = torch.where(spread > 0, spread, spread.max().clamp_min(1e-30))  # of a dark kernel any
+    width = 1e-3 * probe.wavelength / probe.index / spread  # λ/NA (D, F, W) mm
     landing = torch.where(probe.usable, probe.landing.detach(), 0.0)
     low, high = landing.amin(-1) - 4 * width, landing.amax(-1) + 4 * width  # (2, D, F, W)
     blur = torch.linalg.vector_norm(landing, dim=0).amax(-1)
@@ -136,11 +138,11 @@ def _smooth_waves(scene: Scene, probe: Wavefront, phase: float, order: int) -> C
     """`waves` by the radians of phase along a radius, of a pupil that nothing clips, from few rays.
 
     Path and directions are Zernike series of rays on Gauss rings, where these polynomials are orthonormal. None for
-    few waves, where a ray fails, and where the series miss other rays by more than _MISSED waves.
+    few waves or too many, where a ray fails, and where the series miss other rays by more than _MISSED waves.
     """
     fold, like = symmetry(scene), {"dtype": probe.opd.dtype, "device": probe.opd.device}
-    is_few = math.prod(dft.rings_and_arms(phase, order)) < _WORTH
-    if fold == "round" or is_few or not scene.everywhere(probe.valid.all()):
+    worth = _WORTH <= math.prod(dft.rings_and_arms(phase, order)) <= _MOST
+    if fold == "round" or not worth or not scene.everywhere(probe.valid.all()):
         return None
     orders = [zernike.noll(j) for j in range(1, (_DEGREE + 1) * (_DEGREE + 2) // 2 + 1)]
     points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, **like)

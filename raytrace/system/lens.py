@@ -665,9 +665,11 @@ def glass_on_image(lens: Lens) -> str:
 
     No light enters it: rays, spots, wavefronts and PSFs are those in the last gap.
     """
-    surface, before = lens.surfaces[-1], lens.surfaces[medium_surfaces(lens.surfaces)[-1]]
-    unused = not surface.is_mirror and not is_air(surface.glass) and not multiple.same(surface.glass, before.glass)
-    return label(surface.glass) if unused else ""
+    glass = lens.surfaces[-1].glass
+    if lens.surfaces[-1].is_mirror or is_air(glass):
+        return ""
+    before = lens.surfaces[medium_surfaces(lens.surfaces)[-1]].glass
+    return "" if multiple.same(glass, before) else label(glass)
 
 
 def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:
