@@ -34,7 +34,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
-from raytrace.imaging.field_kernels import check_model, order_of
+from raytrace.imaging.field_kernels import check_model, is_sampled_in_common, order_of
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.render import Rendering, element_in_stop, linearised, patch_kernels, render
 from raytrace.imaging.sensor import Sensor
@@ -279,7 +279,8 @@ class Camera(nn.Module):
                 about = self.lens(), self.sensor, self.model, self._places, distances, self.size, self.tol
                 self._order = order_of(*about, elements=self.elements())
                 return self._order
-            self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
+            each = self.fields.split(1, 1)  # alone, as in `order_of`
+            self._order = max(self._psf(distances, field, tol=self.tol, errors=errors).order for field in each)
         return self._order
 
     def kernels(
@@ -309,7 +310,7 @@ class Camera(nn.Module):
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
         parts = [(object_distances, errors)]
-        if MODELS[self.model].in_common:
+        if is_sampled_in_common(self.variables.lens, self.model):
             many = [errors] * len(object_distances) if errors is None or errors.dim() == 1 else errors.split(1)
             parts = zip(object_distances.expand(len(many)).split(1), many, strict=True)
         fields = self.fields[:, field : field + 1]

@@ -104,7 +104,8 @@ class FieldKernels:
             return [torch.nonzero(distances == distance)[:, 0] for distance in distances.unique()]
         sides = [torch.nonzero(side)[:, 0] for side in (distances.isfinite(), distances.isinf())]
         near_first = (side[distances[side].argsort()] for side in sides if len(side))
-        return [some for side in near_first for some in side.split(_DISTANCES)]
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _DISTANCES
+        return [some for side in near_first for some in side.split(count)]
 
     def _paired(self, points: Tensor) -> Tensor:
         """The same of a group."""
@@ -149,7 +150,7 @@ class FieldKernels:
         return kernels.flip(-1)
 
     def _in_parts(self, points: Tensor) -> Tensor:
-        count = 1 if MODELS[self.model].in_common else _TOGETHER
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
         return torch.cat([self._computed(part) for part in points.split(count, 1)])
 
     def _computed(self, points: Tensor) -> Tensor:
@@ -472,6 +473,11 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
     return float(reach)
 
 
+def is_sampled_in_common(lens: Lens, model: str) -> bool:
+    """Whether the sampling of a kernel depends on the others of a call: of DRT, and where apertures may clip one."""
+    return MODELS[model].in_common or any(surface.apertures for surface in lens.surfaces)
+
+
 def order_of(
     lens: Lens,
     sensor: Sensor,
@@ -496,8 +502,10 @@ def order_of(
             return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
         fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
         fields = fields[:, ~fields.isnan().any(0)]
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(sensor.pitch), size)}
-        return psf(lens, model, fields=fields, object_distances=object_distances, **about, tol=tol).order
+        about = {"center": "chief", "grid": make_grid(points.new_tensor(sensor.pitch), size), "tol": tol}
+        about |= {"object_distances": object_distances}
+        # Each place alone: a clipped beam has more rays of an order, which those of other places do not have.
+        return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))
 
 
 def _order_of_elements(
