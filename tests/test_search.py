@@ -462,11 +462,11 @@ def test_a_triplet_from_plates_with_two_limits_and_real_aiming():
     rows = [(4, "N-LAK9"), (4,), (4, "N-SF5"), (4,), (4,), (4, "N-LAK9"), (40,)]
     rows = [dict(zip(("thickness", "glass"), row, strict=False)) for row in rows]
     colours = {"wavelengths": [0.4861327, 0.5875618, 0.6562725], "primary_wavelength": 2, "catalogs": ["schott"]}
-    plates = rt.lens(rows, stop=5, f_number=4, fields=[0, 14, 20], **colours)
+    plates = rt.lens(rows, stop=5, entrance_pupil_diameter=12.5, fields=[0, 14, 20], **colours)
     plates = dataclasses.replace(plates, ray_aiming="real")
     merit = rt.DefaultMerit("spot", glass_thickness=(1.5, 8), air_thickness=(0.5, 12), edge=1)
     hold = "efl=50 bfd>=35 distortion<=2%"
-    found = rt.search(plates, merit=merit, vary="curvature thickness", hold=hold, starts=2)
+    found = rt.search(plates, merit=merit, vary="curvature thickness", hold=hold, starts=1)
     for lens in found.lenses:
         assert float(rt.first_order(lens).effective_focal_length) == pytest.approx(50, rel=1e-6)
         assert float(lens.surfaces[-2].thickness) >= 35 - 1e-4

@@ -486,11 +486,13 @@ def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
 
 
 def _draw_history(axes, found) -> None:
-    merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
+    of_glasses = [step.reached for step in found.glasses]
+    merit = np.concatenate([[found.merit_before], of_glasses, style.array(found.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
     _scale_merit(axes, merit)
     axes.locator_params(axis="x", integer=True)
-    axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
+    axis = "step of the choice of glasses, then cycle" if of_glasses else "cycle"
+    axes.set_xlabel(f"{axis} ({found.evaluations} evaluations, {found.seconds:.2g} s)")
     axes.set_ylabel("merit")
     axes.set_title("Merit function", fontweight="bold")
     axes.annotate(
@@ -580,13 +582,15 @@ class AsBuiltChange:
 
 @value
 class Optimized(Result):
-    """The lens at the lowest merit reached, and the initial one.
+    """The lens at the lowest merit reached, and the initial one, `before`.
 
-    merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
-    before and after; contributions: (R,) of each to the square of the merit, of sum 1; history: (cycles, 5) merit,
-    largest violation of a condition, step, damping and seconds of every cycle; stopped: a key of `checkpoint.STOPPED`;
-    glasses: the steps in which variable glasses were chosen; conditions: targets and attained values; as_built: spots
-    of the lens as built, if it is a term of the merit, which then includes it.
+    merit: the rows of the merit function (R,); merit_before, merit_after: its values. names: (n,) of the variables;
+    variables_before, variables_after: (n,) their values, lengths in mm. values_before, values_after: (R,) of the rows;
+    contributions_before, contributions: (R,) of each to the square of the merit, of sum 1. history: (cycles, 5) merit,
+    largest violation of a condition, step, damping and seconds of every cycle of the last descent. cycles, evaluations,
+    seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
+    glasses were chosen. conditions: targets and values reached of conditions and boundaries. as_built: spots of the
+    lens as built, if it is a term of the merit, which then includes it.
     """
 
     lens: Lens
