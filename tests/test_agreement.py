@@ -18,6 +18,7 @@ from problems import MICROMETRE, PICOMETRE
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import beam_share
 from raytrace.tracing.spot import chief_reference, image_rays
 from raytrace.tracing.wavefront import wavefront_of
 from raytrace.viewer.compute import spots_of
@@ -63,7 +64,7 @@ def _inches() -> Lens:
 
 
 def _zoom() -> Lens:
-    return _triplet(wavelengths=[0.5876]).with_configurations(thickness={3: [9.8, 10.2], 7: [77.4, 76.6]})
+    return _triplet(wavelengths=[0.5876]).with_configurations(thickness={2: [12.93, 12.8], 7: [77.4, 77.3]})
 
 
 #: Lenses that form an image; every field of each is lit.
@@ -82,7 +83,9 @@ ZOO = {
     "folded": lambda: rt.read_lens(EXAMPLES / "folded_relay.zmx"),
     "aspheres": lambda: rt.read_lens("phone"),
     "clipped": lambda: rt.read_lens("double_gauss_28deg"),
-    "one configuration of two": lambda: dataclasses.replace(_zoom().configuration(2), operands=()),
+    "one configuration of two": lambda: dataclasses.replace(
+        _zoom().configuration(2), operands=(), current_configuration=1
+    ),
     "inches": _inches,
 }
 
@@ -121,6 +124,11 @@ def operand(lens: Lens, name: str, integers: tuple = (), numbers: tuple = ()) ->
     return rt.evaluate(lens, merit=rt.Merit([rt.Row(name, integers, numbers, weight=1.0)])).values.item()
 
 
+def rule_of(lens: Lens) -> float:
+    """The relative error of the default quadratures: 12 rings, whose arms end at edges where the beam is clipped."""
+    return 1e-6 if bool(rt.spot(lens).arrivals.rays.valid.all()) else 1e-3
+
+
 def quiet(law):
     """A law is checked with warnings off: lost rays and unfilled stops are not its subject."""
     return pytest.mark.filterwarnings("ignore")(law)
@@ -140,10 +148,10 @@ def close(value, expected, **tolerance):
 def test_spot_radii(lens):
     """The radius about the centroid by `spot`, along the field, and in the viewer."""
     spots = rt.spot(lens)
-    radii = spots.whole.rms_radius
+    radii, rel = spots.whole.rms_radius, rule_of(lens)
     curve = rt.rms_over_field(lens, spot=True, fields=fields_of(lens))
-    assert close(curve.polychromatic, radii, rel=1e-4, abs=PICOMETRE)
-    assert close(curve.rms, spots.each.rms_radius, rel=1e-4, abs=PICOMETRE)
+    assert close(curve.polychromatic, radii, rel=rel, abs=PICOMETRE)
+    assert close(curve.rms, spots.each.rms_radius, rel=rel, abs=PICOMETRE)
     assert close(spots_of(lens, fields_of(lens))["rms"], radii / MICROMETRE, rel=1e-6, abs=1e-6)
 
 
@@ -187,6 +195,7 @@ def test_energy_of_kernels(lens):
     lens = lens.at(wavelengths=lens.primary[None])
     spots = rt.spot(lens, rings=48)
     share = torch.where(spots.arrivals.rays.valid, spots.arrivals.weight, 0.0).sum(-1)[:, 0]
+    share = share * beam_share(scene_of(lens, fields_of(lens)))[0, :, 0]
     window = dict(pixel=2.5 * float(spots.whole.geometric_radius.max()) / 21 + 1e-3, size=21)
     assert close(rt.psf(lens, rt.DRT(order=5), **window).energy[0], share, abs=2e-2)
 
@@ -203,7 +212,7 @@ def test_wavefront_rms(lens):
     mean = (light * map_.opd).sum((-2, -1), keepdim=True)
     assert close((light * (map_.opd - mean) ** 2).sum((-2, -1)).sqrt(), map_.rms, rel=5e-3, abs=1e-6)
     curve = rt.rms_over_field(lens, reference="own", fields=fields_of(lens))
-    assert close(curve.rms, map_.rms, rel=1e-4, abs=1e-7)
+    assert close(curve.rms, map_.rms, rel=rule_of(lens), abs=1e-7)
 
 
 @quiet

@@ -143,3 +143,13 @@ def test_rays_by_wavelength_show_the_spectrum_on_the_image():
     traced = rt.spot(lens, wavelengths=[0.45, 0.55, 0.65]).centroid[1, 0]
     drawn = [float(np.mean(line.get_ydata())) for line in lines]
     assert drawn == pytest.approx(traced.tolist(), abs=0.01)
+
+
+def test_two_planes_in_one_place_are_drawn(tmp_path):
+    """The length of the figure is then that of the beam's width."""
+    rows = [dict(thickness=0)]
+    flat = rt.lens(rows, stop=1, entrance_pupil_diameter=1, object_distance=3, wavelengths=[0.55])
+    for view in ("section", "3d"):
+        path = tmp_path / f"{view}.png"
+        rt.layout(flat, **({} if view == "section" else {"view": view})).plot(path)
+        assert path.stat().st_size > 1000

@@ -243,7 +243,7 @@ def _drawn(
         first, last = right
         distance = float(lens.surfaces[0].thickness)
         bent = cross_section.is_bent(lens)
-        size = max(last - first, up[1] - up[0]) if bent else last - first
+        size = max(last - first, up[1] - up[0]) if bent or first == last else last - first
         near = math.isfinite(distance) and 0 < distance <= _NEAR * size
         front = _front(places, radii, lens) if bent else first
         start = -distance if near else front - _LEAD * size

@@ -491,13 +491,11 @@ class Variables(Owned):
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
                 self.get_parameter(variable.name).clamp_(min(low, high), max(low, high))
-        if self._constraints is None:
-            return
-        x = self._values()
         fixed = {variable.name for variable, is_frozen in zip(self.variables, frozen, strict=True) if is_frozen}
-        nearest = self._constraints.nearest(
-            x, self._before, fixed=np.array([variable.name in fixed for variable in self._all])
-        )
+        fixed = np.array([variable.name in fixed for variable in self._all])
+        x = self._values()
+        with torch.device("cpu"):  # whatever the default device
+            nearest = x if self._constraints is None else self._constraints.nearest(x, self._before, fixed=fixed)
         for variable, before, after in zip(self._all, x, nearest, strict=True):
             if variable in self.variables and after != before:
                 self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
@@ -510,6 +508,10 @@ class Variables(Owned):
     def _load_from_state_dict(self, *arguments) -> None:
         super()._load_from_state_dict(*arguments)
         self._before = self._values()
+
+    def __getstate__(self) -> dict:
+        """All but the prepared conditions, which a copy prepares again."""
+        return {name: part for name, part in vars(self).items() if name not in ("_constraints", "_glasses")}
 
     def _conditions(self) -> tuple[Condition, ...]:
         """The conditions of `hold` on the lens. Raises BadVariables."""

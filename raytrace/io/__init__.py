@@ -114,7 +114,7 @@ FORMATS = {
     ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True, catalogs=True),
     ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format("seq", codev_read.read, codev_write.write),
-    ".len": Format("len", oslo.read),
+    ".len": Format("len", oslo.read, load=oslo.load),
     ".roa": Format("roa", ray_optics.read, load=read_content),
     ".csv": Format("table", table_read.read, table_write.write, catalogs=True),
     ".tsv": _TEXT_TABLE,

@@ -121,6 +121,17 @@ def read_content(path: Path, most: int = MAX_BYTES) -> bytes:
         raise LensFileError(f"cannot be opened: {error}", place) from error
 
 
+#: Bytes of ASCII text.
+_PLAIN = bytes([*b"\t\n\v\f\r", *range(32, 127)])
+
+
+def is_binary(content: bytes) -> bool:
+    """Whether bytes are no text: in their encoding more than a fifth of the characters is not of ASCII."""
+    text = content.decode(encoding(content), "replace")
+    ascii = text.encode("ascii", "ignore")
+    return len(ascii) - len(ascii.translate(None, _PLAIN)) < 0.8 * len(text)
+
+
 def decode(content: bytes, place: Place) -> str:
     """Bytes to text by the rules of `read_text`, with \\n as line end."""
     if not content.strip():

@@ -76,8 +76,8 @@ class GlassFigures(Result):
             "vd": number(abbe_number(glass)),
             **{name: number(getattr(glass, name)) for name in _FIGURES},
             "wavelengths": self.wavelengths.tolist(),
-            "indices": self.indices.tolist(),
             "transmittance": numbers(self.transmittance),
+            "indices": self.indices.tolist(),
         } | (
             {}
             if self.environment is None

@@ -119,6 +119,8 @@ class Model:
     is_rung: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
+    in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them:
+        cameras, whose kernels do not depend on the others of a batch, call it for each.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -142,6 +144,7 @@ class Model:
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
     by_field: bool = False
+    in_common: bool = False
     by_width: bool = False
     proof: float | None = None
     first: float | None = None
@@ -171,7 +174,7 @@ _ROWS = (
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
-        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0,
+        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0, in_common=True,
         compared={"model": DRT(rays=256)}, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.

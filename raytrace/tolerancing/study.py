@@ -127,7 +127,7 @@ class Study:
                 q, changes = self._compensated(some)
                 changes = changes.nan_to_num(0.0)  # of a lens with a field without light
                 kept = self.light(some, changes)
-                parts.append((torch.where(kept >= 1 - self.loss, q, torch.nan), changes, kept))
+                parts.append((torch.where(1 - kept > self.loss, torch.nan, q), changes, kept))
         return tuple(torch.cat(part) for part in zip(*parts, strict=True))
 
     def _compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
