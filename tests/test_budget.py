@@ -152,6 +152,8 @@ def test_long_computations_are_reported_before_they_start(lens):
         ("longitudinal-aberration --points 10000000000", "--points"),
         ("ray-fan --points 10000000000", "--points"),
         ("spot --rings 100000", "--rings"),
+        ("layout --rays 100000000", "--rays"),
+        ("tolerance --grade precision --trials 1000000000000", "--trials"),
     ],
 )
 def test_a_refusal_names_its_option_before_any_work(words, option, capsys):

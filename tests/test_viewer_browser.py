@@ -278,7 +278,7 @@ def test_a_number_that_is_no_number_is_one_message_and_changes_nothing(page):
 
 
 def test_a_lens_that_loses_all_rays_says_where_and_comes_back(page):
-    changed(page, lambda: typed(page, "radius:1", "1"))
+    changed(page, lambda: typed(page, "radius:1", "0.01"))
     settled(page)
     assert page.inner_text('[data-number="rms-0"]').strip() == "no ray arrives"
     assert page.locator('p[data-figure="mtf"]').inner_text() == "no MTF"

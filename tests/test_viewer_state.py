@@ -268,7 +268,7 @@ def test_every_kind_of_lens_has_a_document(name):
 
 
 def test_a_lens_that_loses_all_rays_says_where(state):
-    lost = edit(state, "radius", 1, 1)
+    lost = edit(state, "radius", 1, 0.01)  # at 1 mm rays near the axis pass, and `rt.spot` has their spots
     found = compute.refresh(lost)
     assert not lost.message
     assert found["analyses"]["spots"]["rms"] == [None] * 3

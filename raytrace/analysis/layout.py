@@ -12,6 +12,7 @@ from torch import Tensor
 
 from raytrace.analysis import cross_section, layout_3d
 from raytrace.analysis.panels import first_order_text
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, numbers
 from raytrace.maths.sampling import fan, hexapolar
@@ -128,6 +129,9 @@ def layout(
         warn_of_defects(one)
     every = ALL if configuration == ALL else None
     points = field_points(fields, like=lens)
+    count = rays * points.shape[1] * (1 if chosen is None else len(chosen))
+    surfaces = len(lens.surfaces)
+    afford(RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps="ask for fewer `rays`")
     warn_of_filling(lens, points)
     return Layout(lens, points, rays, view, chosen, every, fields is not None)
 

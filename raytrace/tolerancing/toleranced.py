@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.budget import afford
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
@@ -438,6 +439,7 @@ def tolerance(
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
+    afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer `trials`")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= loss <= 1:
