@@ -187,14 +187,12 @@ CRITERIA = {
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
     "angle": Criterion("RMS angle", "mrad", _mean_square_angle, allows_idle=True),
 }
+NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
 
 
 def size_of_image(lens: Lens) -> Criterion:
     """The criterion "rms": of spots, or of an afocal lens of angles."""
     return CRITERIA["angle" if lens.afocal else "rms"]
-
-
-NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
 
 
 def criterion_of(
