@@ -49,8 +49,10 @@ PUBLIC = {
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
+    "internal_transmittance": "materials.glass",
     "refractive_index": "materials.glass",
     # rays
+    "RaytraceWarning": "words",
     "BaseRay": "tracing.base_ray",
     "FirstOrder": "tracing.paraxial",
     "Rays": "system.rays",

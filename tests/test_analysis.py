@@ -480,7 +480,7 @@ def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
     assert len(document["results"]) >= 2
     assert picture.stat().st_size > 10_000
     assert main(arguments[:-2]) == 0
-    assert capsys.readouterr().out.split()[0] == "field"
+    assert capsys.readouterr().out.split()[0] == "field_y"
 
 
 def test_through_focus_counts_its_sensor_distances():

@@ -488,3 +488,15 @@ def test_the_window_follows_the_chief_ray_of_a_tilted_lens(points):
     with torch.no_grad():
         ends = [(tilt.fill_(change), own.kernels(distances)[0, 10, 8])[1] for change in (1e-4, -1e-4)]
     assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-5)
+
+
+@pytest.mark.parametrize("model", ["gaussian", "drt"])
+def test_a_kernel_does_not_depend_on_its_batch(model):
+    own = camera(read_lens(LENS), CodesignSettings(model=model, fields=(0.0, 7.0)))
+    distances = number([1.2e4, 4e4])
+    with torch.no_grad():
+        kernels, other = own.kernels(distances, 1), own.kernels(number([-1.2e4, 4e4]), 1)
+        alone = own.kernels(distances[1:], 1)
+    torch.testing.assert_close(other[1], kernels[1], rtol=0, atol=1e-11)
+    torch.testing.assert_close(alone[0], kernels[1], rtol=0, atol=1e-11)
+    torch.testing.assert_close(own.kernels(distances, 1).detach(), kernels, rtol=0, atol=1e-11)

@@ -66,6 +66,22 @@ def test_eight_threads_call_functions_first_in_a_fresh_process():
     assert done.stdout == "8\n", done.stderr
 
 
+def test_a_warning_is_given_once_for_all_lines_that_call():
+    for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
+        if not found.name.startswith(("raytrace.bench.peers", "raytrace.__main__")):
+            importlib.import_module(found.name)
+
+    def below(kind: type) -> set[type]:
+        return {kind}.union(*map(below, kind.__subclasses__()))
+
+    categories = {kind for kind in below(Warning) if kind.__module__.startswith("raytrace.")}
+    assert len(categories) > 15
+    assert all(issubclass(kind, rt.RaytraceWarning) for kind in categories)
+    code = "import raytrace as rt\nlens = rt.read_lens('double_gauss')\n" + 3 * "rt.spot(lens)\n" + "rt.ray_fan(lens)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stderr.count("rays miss the stop") == 1, done.stderr
+
+
 def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("cooke_triplet", "lenses/cooke_triplet.zmx", "cooke_triplet.zmx"):

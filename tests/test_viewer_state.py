@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.system.optimization_data import OptimizationData, Vary
 from raytrace.viewer import compute
 from raytrace.viewer.session import Optimisation, Session
 from raytrace.viewer.state import initial, limits, merit_of, reduce, shown_fields, variables
@@ -445,6 +446,33 @@ def test_variables_of_an_optimised_lens_and_new_ones_vary_together(triplet):
     assert reply["message"] == ""
     assert float(session.state.lens.surfaces[3].curvature) != float(found.lens.surfaces[3].curvature)
     assert 10 <= float(session.state.lens.surfaces[2].thickness) <= 15
+
+
+@pytest.mark.parametrize("weight", [-1.0, 1.0])
+def test_an_optimisation_keeps_what_the_file_requires(triplet, weight, tmp_path):
+    """A chosen merit function replaces the image's rows of the file; a focal length that the file asks for remains."""
+    rows = (rt.Row("EFFL", (0, 2), target=100.0, weight=weight * 10), *rt.Merit.default(triplet, rings=2).rows)
+    data = OptimizationData(tuple(Vary(k, "curvature") for k in (1, 2, 3, 4, 6, 7)), merit=rows)
+    rt.write_lens(dataclasses.replace(triplet, optimization_data=data), tmp_path / "held.zmx")
+    session = Session(rt.read_lens(tmp_path / "held.zmx"))
+    session.answer({"type": "merit", "kind": "wavefront"})
+    first = session.answer({"type": "optimise"})["optimisation"]
+    assert "with EFFL wavelength 2 = 100 of the file" in first["words"]
+    last = progress(session, ended=True)
+    assert "with EFFL wavelength 2 = 100 of the file" in last["optimisation"]["words"]
+    length = float(rt.first_order(session.state.lens).effective_focal_length)
+    assert length == pytest.approx(100, rel=1e-6 if weight < 0 else 1e-2)
+
+
+def test_a_file_of_conditions_alone_is_optimised_for_its_spots(triplet):
+    data = OptimizationData(
+        (Vary(1, "curvature"), Vary(4, "curvature")), merit=(rt.Row("EFFL", target=100, weight=-1),)
+    )
+    session = Session(dataclasses.replace(triplet, optimization_data=data))
+    assert session.state.merit == "spot"
+    session.answer({"type": "optimise"})
+    assert progress(session, ended=True)["message"] == ""
+    assert float(rt.first_order(session.state.lens).effective_focal_length) == pytest.approx(100, rel=1e-6)
 
 
 def test_a_failure_of_an_optimisation_is_one_message(triplet):

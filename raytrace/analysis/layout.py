@@ -239,7 +239,7 @@ def _drawn(
         first, last = right
         distance = float(lens.surfaces[0].thickness)
         bent = cross_section.is_bent(lens)
-        size = max(last - first, up[1] - up[0]) if bent else last - first
+        size = max(last - first, up[1] - up[0]) if bent or first == last else last - first
         near = math.isfinite(distance) and 0 < distance <= _NEAR * size
         front = _front(places, radii, lens) if bent else first
         start = -distance if near else front - _LEAD * size
@@ -360,7 +360,8 @@ def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii
                 bars = [(-rim - outward, -rim), (rim, rim + outward)]
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
-                height = centre + np.linspace(low, high, 41)
+                most = radii[k] + outward
+                height = np.linspace(*np.clip((centre + low, centre + high), -most, most), 41)
                 edge = 0.9999 * edge_radius(surface)
                 depth = cross_section.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
@@ -407,7 +408,7 @@ def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[flo
 
 
 def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
-    heights = [abs(path.y[0]) for field in paths for path in field]
+    heights = [abs(float(place.height(path.z[0], path.y[0]))) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
         y = np.linspace(-half, half, 81)

@@ -22,7 +22,6 @@ from raytrace.system.lens import (
     field_label,
     field_points,
     field_title,
-    name_of_field,
     one_lens,
     with_wavelengths,
 )
@@ -119,8 +118,12 @@ class Spots(Result):
         several = len(waves) > 1
         together = [""] * several
         whole, each = _figures(self.whole), _figures(self.each)
-        fields, lost = map(name_of_field, self.fields.unbind(1)), (self.launched - each.pop("rays")).tolist()
-        columns = {"field_y": [text for field in fields for text in (*[field] * len(waves), *together)]}
+        lost = (self.launched - each.pop("rays")).tolist()
+        columns = {
+            name: [text for place in row.tolist() for text in (*[f"{place:g}"] * len(waves), *together)]
+            for name, row in zip(("field_x", "field_y"), self.fields, strict=True)
+            if name == "field_y" or bool(row.any())
+        }
         columns["wavelength"] = [*waves, *["all"] * several] * self.fields.shape[1]
         for name, values in each.items():
             columns[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten()
@@ -338,10 +341,10 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
-    weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
-    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
-    from where radii count, the centroid by default. rings: of dots.
+    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`.
+    The dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are
+    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about:
+    (2, F) mm, from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
@@ -354,7 +357,12 @@ def field_spots(
         hits, valid = rays.position[:2], rays.valid
         whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten(), about=about)
         drawn = points.shape[1]
-        return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        seen = spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        if pupil is None and not bool(valid.all()):
+            lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+            fields, inside = field_points(fields, like=lens), points[:, weights[:drawn] > 0]
+            seen, whole = _of_clear_pupils(lens, fields, inside, SAMPLINGS["gauss"][2], about, seen, whole)
+        return whole, seen
 
 
 def even_hexapolar(rings: int, **like) -> Tensor:

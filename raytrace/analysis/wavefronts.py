@@ -1,6 +1,7 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import dataclasses
+import math
 import warnings
 from typing import Literal
 
@@ -17,7 +18,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
-from raytrace.psf_models.wave import strehl
+from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
@@ -147,6 +148,7 @@ def wavefront(
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
         helps="ask for a smaller `size`, or fewer fields or wavelengths",
     )
+    zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
     parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
     over = 0 if lens.count is None else 1

@@ -102,19 +102,17 @@ def tolerances() -> Tolerances:
 
 def sampling(lens: Lens, points: Tensor, weights: Tensor) -> Sampling:
     fields = torch.stack([lens.fields.x, lens.fields.y])
-    return Sampling(fields, torch.full_like(fields[0], 1 / fields.shape[1]), points, weights, _RINGS)
+    return Sampling(fields, torch.full_like(fields[0], 1 / fields.shape[1]), points, weights)
 
 
-def _parabola(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Mean over fields and wavelengths of the mean square spot radius (L,) as the sensor moves, mm; and the light."""
+def _parabola(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+    """The mean over fields and wavelengths of the mean square spot radius (L,) as the sensor moves, mm."""
     rays = image_rays(lens, given.points, fields=given.fields)
-    parts = *spot_parabola(rays, given.weights), rays.valid.to(rays.position).mean(-1)
-    return tuple(part.mean((-1, -2)) for part in parts)
+    return tuple(part.mean((-1, -2)) for part in spot_parabola(rays, given.weights))
 
 
-def _square(lens: Lens, given: Sampling) -> tuple[Tensor, Tensor]:
-    q0, *_, light = _parabola(lens, given)
-    return q0, light
+def _square(lens: Lens, given: Sampling) -> Tensor:
+    return _parabola(lens, given)[0]
 
 
 CRITERION = Criterion("RMS spot radius of each wavelength", "mm", _square, _parabola)

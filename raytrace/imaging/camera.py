@@ -2,18 +2,20 @@
 
 A training step of lens and network, in colour, at random places of the sensor:
 
+    lens = rt.read_lens("cooke_triplet")
     sensor = rt.Sensor(size=(24, 16), pixels=(4800, 3200), response="rgb", full_well=2e4, read_noise=3)
     camera = rt.Camera(rt.Variables(lens, "curvature thickness"), rt.UNet(channels=3), sensor=sensor)
     optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
-    origins = sensor.random_patches(index, size=128)        # index (B,): global numbers of the samples
-    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
-    where = {"points": sensor.patch_points(origins, 128), "origins": origins, "index": index}
-    restored = camera(pictures, distances, **where)         # (B, 3, H, W): blurred, recorded, restored
+    index = torch.arange(2)                                  # (B,): global numbers of the samples
+    points = sensor.patch_points(sensor.random_patches(index, size=32), 32)
+    pictures = torch.rand(2, 3, 32 + camera.margin, 32 + camera.margin)
+    distances = 10e3 + 40e3 * torch.rand(len(pictures))      # mm, one per image
+    restored = camera(pictures, distances, points=points, index=index)  # (B, 3, 32, 32): blurred, recorded, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-    camera.variables.project()                              # onto the bounds, if there are any
+    camera.variables.project()                               # onto the bounds, if there are any
 
 Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise. A phase element at the
 stop, whose heights are learned with the lens, or an element without a lens:
@@ -282,7 +284,7 @@ class Camera(nn.Module):
 
     def kernels(
         self,
-        object_distances: Tensor,
+        object_distances: Tensor | Sequence[float] | float,
         field: int = 0,
         errors: Tensor | None = None,
         *,
@@ -290,27 +292,35 @@ class Camera(nn.Module):
     ) -> Tensor:
         """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, in a window about its `center`.
 
+        object_distances: a tensor, a sequence or one number.
         errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, one for each distance: PSFs
-        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
+        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination, 0 where no light arrives, with the
+        warning DarkPlaces. Raises ValueError for points that are not finite.
         """
         if (points is None) != (self.sensor is None):
             missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
             raise ValueError(f"the camera has no {missing}")
+        object_distances = self._distances(object_distances)
         if self.sensor is not None:
             if errors is not None:
                 raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
-            return self._kernels_of_places(points.to(self.fields), object_distances.to(self.fields))
+            return self._kernels_of_places(points.to(self.fields), object_distances)
         if self.pupil_points is not None:
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
-        return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
+        parts = [(object_distances, errors)]
+        if MODELS[self.model].in_common:
+            many = [errors] * len(object_distances) if errors is None or errors.dim() == 1 else errors.split(1)
+            parts = zip(object_distances.expand(len(many)).split(1), many, strict=True)
+        fields = self.fields[:, field : field + 1]
+        return torch.cat([self._psf(z, fields, order=order, errors=some).kernel[:, 0] for z, some in parts])
 
     def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
 
         points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
         """
-        points, distances = self._places if points is None else points, object_distances.to(self.fields)
+        points, distances = self._places if points is None else points, self._distances(object_distances)
         pairs = points.to(distances).repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
         return self._kernels_of_places(*pairs).unflatten(0, (len(distances), -1))
 
@@ -327,6 +337,14 @@ class Camera(nn.Module):
             illumination=self.illumination,
             elements=self.elements(),
         )
+
+    def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
+        """Object distances (B,) mm. Raises ValueError for none and for other shapes."""
+        distances = torch.as_tensor(object_distances, dtype=self.fields.dtype, device=self.fields.device)
+        if distances.dim() > 1 or not distances.numel():
+            shape = tuple(distances.shape)
+            raise ValueError(f"object_distances of shape {shape}: expected (B,) mm, one for each of B images, B ≥ 1")
+        return distances.reshape(-1)
 
     def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
         """The current lens with its stored rays, or as built, whose rays are of one call."""
@@ -350,7 +368,7 @@ class Camera(nn.Module):
             Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
             tol=tol,
             fields=fields if traces else torch.zeros_like(fields),
-            object_distances=distances.to(self.fields.dtype),
+            object_distances=distances,
             grid=self.pixels,
             center=self.center if traces or self.center == "centroid" else "axis",
             normalise=self.normalise,
@@ -359,7 +377,7 @@ class Camera(nn.Module):
 
     def _kernels_of_points(self, distances: Tensor, fields: Tensor, errors: Tensor | None) -> Tensor:
         """PSFs (B, rows, columns) of the rays through the pupil points alone."""
-        (lens, memo), distances = self._lens(errors), distances.to(fields.dtype)
+        lens, memo = self._lens(errors)
         light = scene(lens, fields, distances, lens.wavelengths, memo)
         chief = chief_landing(dataclasses.replace(light, wavelengths=lens.primary[None]))
         centre = self.pixels.centre[:, None, None, None] + chief.expand(2, *light.shape)
@@ -395,15 +413,18 @@ class Camera(nn.Module):
 
         picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
         With a sensor (B, C, H, W), centred at points (2, B) mm on it; integers are levels of sRGB (`linearised`).
+        Pictures of half precision are blurred in float32, which the image has.
         errors: of manufacture, (N,) of one lens or (B, N).
         Raises ValueError for other shapes and other ranges, as 0 to 255.
         """
+        object_distances = self._distances(object_distances)
         if self.sensor is None:
             picture = _grey(picture, object_distances)
         else:
             picture = self._of_channels(picture, object_distances)
         kernels = self.kernels(object_distances, field, errors, points=points)
-        return blur(picture, kernels.to(picture.dtype))
+        light = picture.to(torch.promote_types(picture.dtype, torch.float32))
+        return blur(light, kernels.to(light.dtype))
 
     def _of_channels(self, picture: Tensor, object_distances: Tensor) -> Tensor:
         """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,)."""

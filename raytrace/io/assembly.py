@@ -34,7 +34,7 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.poses import Pose, undone
-from raytrace.system.surface import SHAPE, Surface
+from raytrace.system.surface import SHAPE, Surface, is_posed
 
 #: More characters than the name of any glass has.
 _LONGEST = 80
@@ -313,6 +313,11 @@ class LensDraft:
     sources: Sources = dataclasses.field(default_factory=dict)
 
 
+TILTED_OBJECT = (
+    "a tilt or decentre of the object, which lens files do not hold here; tilt the axes of surface 1, a break, instead"
+)
+
+
 def assemble(draft: LensDraft, file: str) -> Lens:
     """The lens of a draft. Raises LensFileError for a quantity out of range, at the keyword that gave it."""
 
@@ -321,6 +326,8 @@ def assemble(draft: LensDraft, file: str) -> Lens:
         raise LensFileError(f"{keyword}{message}", place)
 
     last = len(draft.surfaces) - 1
+    if is_posed(draft.surfaces[0]):
+        raise LensFileError(TILTED_OBJECT, Place(file, None, 0))
     if not 0 < draft.stop < last:
         refuse("stop", f" is surface {draft.stop}, expected 1 to {last - 1}: a surface between object and image")
     if not draft.aperture > 0:

@@ -32,7 +32,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Surface, is_freeform, is_posed
-from raytrace.words import named
+from raytrace.words import RaytraceWarning, named
 
 #: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
 MAX_BYTES = 16 * 2**20
@@ -81,7 +81,7 @@ class UnsupportedSurface(LensFileError):
     """A surface of a type that is not modelled; it is never dropped and never read as another type."""
 
 
-class LensFileWarning(UserWarning):
+class LensFileWarning(RaytraceWarning):
     """A lens file was read, but something in it was left out or assumed."""
 
 
@@ -119,6 +119,17 @@ def read_content(path: Path, most: int = MAX_BYTES) -> bytes:
         if isinstance(error, LensFileError):
             raise
         raise LensFileError(f"cannot be opened: {error}", place) from error
+
+
+#: Bytes of ASCII text.
+_PLAIN = bytes([*b"\t\n\v\f\r", *range(32, 127)])
+
+
+def is_binary(content: bytes) -> bool:
+    """Whether bytes are no text: in their encoding more than a fifth of the characters is not of ASCII."""
+    text = content.decode(encoding(content), "replace")
+    ascii = text.encode("ascii", "ignore")
+    return len(ascii) - len(ascii.translate(None, _PLAIN)) < 0.8 * len(text)
 
 
 def decode(content: bytes, place: Place) -> str:

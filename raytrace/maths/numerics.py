@@ -381,11 +381,14 @@ def _summary(item: object) -> str:
         return repr(item)
     array = item.detach().cpu().resolve_conj()
     if array.numel() <= 9:
-        array = array.double() if array.is_floating_point() else array
-        text = np.array2string(array.numpy(), separator=", ", formatter={"float": "{:.6g}".format})
-        return text.replace("\n", "")
+        return _listed(array.tolist(), "{:.6g}".format if array.is_floating_point() else str)
     limits = "" if array.is_complex() else " … ".join(f"{float(end):.6g}" for end in array.aminmax())
     return f"<{tuple(array.shape)} {str(array.dtype).removeprefix('torch.')}{limits and ', '}{limits}>"
+
+
+def _listed(entry: object, form: Callable[[object], str]) -> str:
+    """Nested lists of numbers as text."""
+    return f"[{', '.join(_listed(part, form) for part in entry)}]" if isinstance(entry, list) else form(entry)
 
 
 def value(cls: type) -> type:

@@ -71,7 +71,7 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 # -- conditions: what is required, and what is reached -----------------------------------------------------------------
 
@@ -84,7 +84,7 @@ _TRIES = 4
 _NAMED = 4  # variables in one sentence
 
 
-class NotReached(UserWarning):
+class NotReached(RaytraceWarning):
     """A condition or a boundary that the optimised lens does not meet."""
 
 
@@ -130,7 +130,7 @@ class Reached:
 
 def reached(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> tuple[Reached, ...]:
     """Every condition, then every boundary of the merit function, at variables (n,) between bounds (n,)."""
-    results = [*_conditions(problem, x), *_boundaries(problem, x)]
+    results = [*conditions_at(problem, x), *_boundaries(problem, x)]
     if all(result.met for result in results):
         return tuple(results)
     reasons, rows = _reasons(problem, x, lower, upper), [*_held_rows(problem), *_bounding_rows(problem)]
@@ -148,7 +148,7 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     if conflict is None or not _holds_elsewhere(problem, conflict, x, lower, upper):
         return
     named = [_condition_text(problem, number) for number in conflict.numbers]
-    values = {condition.words: condition.reached for condition in _conditions(problem, x)}
+    values = {condition.words: condition.reached for condition in conditions_at(problem, x)}
     listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
     raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
 
@@ -172,7 +172,8 @@ def _bounding_rows(problem: Problem) -> list[int]:
     ]
 
 
-def _conditions(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+def conditions_at(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+    """Every condition at variables (n,), without reasons."""
     evaluated, model = problem.evaluated(x), problem.model
     excesses = _largest_excesses(evaluated)
     for k, condition in zip(_held_rows(problem), problem.conditions, strict=True):

@@ -54,11 +54,11 @@ from raytrace.system.parameter_paths import (
 )
 from raytrace.system.phases import power_of
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
+from raytrace.system.surface import Surface, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of
-from raytrace.words import calling_level, did_you_mean
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -97,7 +97,7 @@ _PICKUP = re.compile(rf"([-+]?)(?:({_NUMBER})\*)?([a-z]\w*):(\d+)(?:([-+])({_NUM
 _SOLVE = re.compile(r"([a-z]\w*)\(([^()]*)\)")
 
 
-class VariedGlass(UserWarning):
+class VariedGlass(RaytraceWarning):
     """A glass of a catalog is replaced by a model glass, whose numbers can vary."""
 
 
@@ -758,8 +758,7 @@ class View:
             given[surface][:, None] if surface in given else n
             for surface, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
         ]
-        gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None
-        structure, table = structure_of(surfaces, indices, 1, gap, wavelength)
+        structure, table = structure_of(surfaces, indices, 1, None, wavelength)
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
         return surfaces, structure, torch.stack(rows, -1)
 

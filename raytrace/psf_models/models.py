@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import OverBudget, within
+from raytrace.budget import OverBudget, afford, within
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.maths.sampling import grid as make_grid
@@ -33,9 +33,10 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
+_PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
 
 
 @value
@@ -118,6 +119,8 @@ class Model:
     is_rung: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
+    in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them:
+        cameras, whose kernels do not depend on the others of a batch, call it for each.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -141,6 +144,7 @@ class Model:
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
     by_field: bool = False
+    in_common: bool = False
     by_width: bool = False
     proof: float | None = None
     first: float | None = None
@@ -170,7 +174,7 @@ _ROWS = (
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
-        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0,
+        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0, in_common=True,
         compared={"model": DRT(rays=256)}, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
@@ -182,7 +186,7 @@ _ROWS = (
 MODELS = {row.name: row for row in _ROWS}
 
 
-class NotConverged(UserWarning):
+class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
 
@@ -300,6 +304,13 @@ def psf(
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+    D, F, W = len(distances), fields.shape[1], len(wavelengths) if per_wavelength else 1
+    rows, columns = base.shape
+    afford(
+        _PIXEL_BYTES * D * F * W * rows * columns,
+        f"{D * F * W:,} PSFs of {rows:,} × {columns:,} pixels",
+        helps="ask for a smaller `size`, or fewer `fields` at once",
+    )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
     drive = _driver(lens, name, parameters, tol or 0.01, execution)

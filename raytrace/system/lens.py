@@ -22,7 +22,7 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
-from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, value
+from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, is_any, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
@@ -445,7 +445,8 @@ class Lens:
         surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
         x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
-        Raises ValueError naming what the surface does not have, UnknownGlass.
+        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. Raises
+        ValueError naming what the surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
@@ -455,6 +456,7 @@ class Lens:
             numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
         surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
         found = dataclasses.replace(self, surfaces=tuple(surfaces))
+        _check_object(found)
         return multiple.kept(found) if self.operands else found
 
 
@@ -772,6 +774,7 @@ def check(lens: Lens) -> None:
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
     _check_environments(lens)
     _check_cone(lens)
+    _check_object(lens)
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
@@ -812,6 +815,25 @@ def _check_cone(lens: Lens) -> None:
         index = float(index_behind(lens, 0, lens.primary).min())
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")
+
+
+def _check_object(lens: Lens) -> None:
+    """Refuse poses of the object other than tilts of a surface at a finite distance whose points are the fields."""
+    source = lens.surfaces[0]
+    if source.after is not None:
+        raise ValueError("surface 0: a pose behind the object; expected tilt_x, tilt_y or tilt_z, which tilt it alone")
+    if source.before is None:
+        return
+    moved = ", ".join(name for name in ("x", "y", "z") if getattr(source.before, name) is not None)
+    if moved:
+        message = f"surface 0: the object is decentred ({moved})"
+        raise ValueError(f"{message}; its place is that of the fields and of the object distance: expected tilts alone")
+    if is_any(torch.isinf(source.thickness)):
+        raise ValueError("surface 0: a tilted object at infinity; give an object distance")
+    if lens.fields.kind not in ("object_height", "real_image_height"):
+        kind = lens.fields.kind.replace("_", " ")
+        message = f"surface 0: a tilted object, with fields of the kind {kind}, which does not locate its points"
+        raise ValueError(f"{message}; expected object heights, along its tilted axes, or real image heights")
 
 
 def is_round_about_axis(lens: Lens) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.catalogs import medium
+from raytrace.materials.catalogs import ENVIRONMENT, SHIPPED, medium, missing_catalogs
 from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
@@ -47,13 +47,17 @@ def lens(
     entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
     FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: its number, from 1, the first by default.
-    object_distance: mm from surface 1. Raises BadPrescription, UnknownGlass.
+    object_distance: mm from surface 1. catalogs: names of glass catalogs, sought first; one that is not
+    shipped is found by the environment variable RAYTRACE_CATALOGS. Raises BadPrescription, UnknownGlass.
     """
     rows = rows.to_dict("records") if hasattr(rows, "to_dict") else list(rows)
     if not rows:
         raise BadPrescription(
             "no rows: give one mapping for each surface, as dict(radius=50, thickness=5, glass='N-BK7')"
         )
+    if missing := missing_catalogs(catalogs):
+        message = f"catalogs: {missing[0]!r} is no shipped catalog, and no file of {ENVIRONMENT} has this name"
+        raise BadPrescription(f"{message}; expected some of {', '.join(SHIPPED)}, or the path of its AGF file there")
     surfaces = [surface(row, number, catalogs) for number, row in enumerate(rows, 1)]
     wavelengths = _vector(wavelengths, "wavelengths")
     weights = torch.ones_like(wavelengths) if wavelength_weights is None else _vector(wavelength_weights, "weights")

@@ -15,41 +15,41 @@ from torch import Tensor
 from raytrace.analysis.setting import scene_of, wavelength_shares
 from raytrace.analysis.sheared_batch import ShearedPupils
 from raytrace.maths.numerics import value
+from raytrace.maths.sampling import square
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
-from raytrace.system.lens import Lens, aligned, one_lens
+from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
-from raytrace.tracing.clear_pupil import clear_rays
 from raytrace.tracing.focus import shift_to_focus, spot_parabola
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import trace_scene
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import wavefront_of, without
 from raytrace.words import did_you_mean
 
-_CLIPPED = 16  # fields of lenses whose clear pupils are found at once
+_ACROSS = 10  # points across the pupil, by which lost light is measured
 
 
 @value
 class Sampling:
-    """Fields (2, F) with weights (F,), and pupil points (2, P) with weights (P,); rings: of the clear pupil."""
+    """Fields (2, F) with weights (F,), and pupil points with weights: (2, P) and (P,), or (2, 1, F, W, P) and
+    (1, F, W, P) where apertures clip the beams."""
 
     fields: Tensor
     field_weights: Tensor
     points: Tensor
     weights: Tensor
-    rings: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
     """A measure of image quality f(q) of a quantity q that the compensators minimise.
 
-    quantity: of a batch of lenses, ready for rays (`aligned`), q (L,) and the share (L,) of the light of the pupils
-    that arrives. parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂ with the sensor s mm further along its normal, and
-    that share; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
+    quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
+    with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
     where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
     derivatives. settings: what q depends on beyond lens, fields and pupil. angle: radians of a unit, 0 for no angle.
     allows_idle: whether compensators without effect on q stay at 0; else they are refused.
@@ -57,8 +57,8 @@ class Criterion:
 
     name: str
     unit: str
-    quantity: Callable[[Lens, Sampling], tuple[Tensor, Tensor]]
-    parabola: Callable[[Lens, Sampling], tuple[Tensor, ...]] | None = None
+    quantity: Callable[[Lens, Sampling], Tensor]
+    parabola: Callable[[Lens, Sampling], tuple[Tensor, Tensor, Tensor]] | None = None
     value: Callable[[Tensor], Tensor] = torch.sqrt
     quantity_of: Callable[[float], float] = lambda f: f * f
     sign: int = 1
@@ -69,70 +69,45 @@ class Criterion:
     allows_idle: bool = False
 
 
-def mean_square_radius(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
-    """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field; and the light."""
-    q0, *_, light = _spot_parabola(lens, sampling)
-    return q0, light
+def mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field."""
+    return _spot_parabola(lens, sampling)[0]
 
 
-def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The mean square spot radius as a parabola of the position of the sensor, µm², µm²/mm, µm²/mm²; and the light.
-
-    Of lenses that clip rays, over the clear pupil, as `spot`.
-    """
-    shares = wavelength_shares(lens)[:, None]
-
-    def moments(rays: Rays, weights: Tensor) -> list[Tensor]:
-        """The parabola (L, F) of each field, all wavelengths together, mm², and the light."""
-        weights = (shares * weights).flatten(-2)
-        rays = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
-        found = *spot_parabola(rays, weights), torch.where(rays.valid, weights, 0.0).sum(-1)
-        return [part.reshape(-1, part.shape[-1]) for part in found]
-
-    rays = image_rays(lens, sampling.points, fields=sampling.fields)
-    parts = moments(rays, sampling.weights)
-    if not bool(rays.valid.all()):
-        failing = (~rays.valid).reshape(len(parts[0]), -1).any(-1).nonzero()[:, 0]
-        for some in failing.split(max(1, _CLIPPED // sampling.fields.shape[1])):
-            chosen = lens if lens.count is None else one_lens(lens, some)
-            clear = moments(*clear_rays(scene_of(chosen, sampling.fields), sampling.rings))
-            parts = [old.index_copy(0, some, new) for old, new in zip(parts, clear, strict=True)]
-    q0, q1, q2, light = ((sampling.field_weights * part).sum(-1) for part in parts)
-    return 1e6 * q0, 1e6 * q1, 1e6 * q2, light
+def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+    """The mean square spot radius as a parabola of the position of the sensor, µm², µm²/mm, µm²/mm²."""
+    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
+    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
+    return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
 
 
-def _wavefront_variance(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
-    """Mean square (L,) of the OPD about its mean and tilt, waves², and the light."""
+@torch.no_grad()
+def light(lens: Lens, sampling: Sampling) -> Tensor:
+    """Share (L,) of the light of the pupils that arrives, at the primary wavelength, of `square` points."""
+    points, _ = square(_ACROSS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    arriving = image_rays(lens, points, fields=sampling.fields, wavelengths=lens.primary[None]).valid
+    return (sampling.field_weights * arriving[..., 0, :].to(points).mean(-1)).sum(-1)
+
+
+def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square (L,) of the OPD about its mean and tilt, waves²."""
     front = wavefront_of(scene_of(lens, sampling.fields), sampling.points, sampling.weights)
     lit = (front.energy > 0).sum(-1, keepdim=True) >= 3  # fewer rays have no mean and tilt
-    arriving = torch.where(front.valid, sampling.weights, 0.0).sum(-1)
     front = dataclasses.replace(front, energy=torch.where(lit, front.energy, 1.0))
     flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
     share = front.energy / front.energy.sum(-1, keepdim=True)
     squares = torch.where(lit[..., 0], (share * flat * flat).sum(-1), torch.nan)
-    shares = wavelength_shares(lens)
-    parts = (squares * shares).sum(-1), (arriving * shares).sum(-1)
-    return tuple((sampling.field_weights * part).sum(-1) for part in parts)
-
-
-def _whole(q: Tensor) -> tuple[Tensor, Tensor]:
-    """q (L,) and the light of lenses whose rays arrive all, or none."""
-    return q, q.detach().isfinite().to(q)
-
-
-@torch.no_grad()
-def _light(lens: Lens, sampling: Sampling) -> Tensor:
-    """Share (L,) of the light of the pupils that arrives."""
-    return mean_square_radius(lens, sampling)[1].expand(lens.count or 1)
+    return (sampling.field_weights * (squares * wavelength_shares(lens)).sum(-1)).sum(-1)
 
 
 def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
     """Mean of tangential and sagittal MTF over the fields; q is what is missing to 1."""
     pupils = ShearedPupils(lens, sampling.fields, frequency)
 
-    def quantity(lenses: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
         tangential, sagittal = pupils(lenses)
-        return _whole(1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1))
+        return 1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1)
 
     name = f"MTF at {frequency:g} cycles/mm"
 
@@ -154,10 +129,10 @@ def _psf_change(lens: Lens, sampling: Sampling, model: str, pixel: float | None,
         nominal = psf(lens, kinds[model](order=order), **options).kernel
     energy = nominal.square().sum((-2, -1))
 
-    def quantity(lenses: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
         kernel = psf(lenses, kinds[model](order=order), **options).kernel
         change = (kernel - nominal).square().sum((-2, -1)) / energy
-        return (sampling.field_weights * change).sum(-1), _light(lenses, sampling)
+        return (sampling.field_weights * change).sum(-1)
 
     settings = (model, order, pixel, size)
     return Criterion("change of the PSF", "", quantity, scale=1.0, settings=settings, together=32)
@@ -175,8 +150,8 @@ def _boresight(lens: Lens, sampling: Sampling) -> Criterion:
         nominal = place(lens)
         focal_length = float(first_order(lens).effective_focal_length)
 
-    def quantity(lenses: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
-        return _whole(1e6 * (place(lenses) - nominal.reshape(2, 1)).square().sum(0).expand(lenses.count or 1))
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
+        return 1e6 * (place(lenses) - nominal.reshape(2, 1)).square().sum(0).expand(lenses.count or 1)
 
     angle = 1e-3 / abs(focal_length) if math.isfinite(focal_length) else 0.0
     return Criterion("boresight error", "µm", quantity, scale=1.0, angle=angle, allows_idle=True)
@@ -186,10 +161,9 @@ def _merit(lens: Lens, merit) -> Criterion:
     """A merit function, of the file or as `optimize` takes it; q is its square."""
     function = merit_for(lens, merit) if merit is None or isinstance(merit, Merit) else None
 
-    def quantity(lenses: Lens, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
         # a default merit function has the rays of the symmetry that the lens with errors has
-        rows = function or merit_for(aligned(lenses, 0, exactly=True)[0], merit)
-        return MeritOfBatch(lenses, rows).square(), _light(lenses, sampling)
+        return MeritOfBatch(lenses, function or merit_for(aligned(lenses, 0, exactly=True)[0], merit)).square()
 
     rows = merit_for(lens, merit)
     return Criterion("merit function", "", quantity, settings=(repr(rows.rows), rows.unit))

@@ -171,7 +171,8 @@ def tolerances(
         the lens's own file.
     distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "parabolic" or "end_points", of rows
         that the file does not have.
-    compensators: what is adjusted after manufacture; by default that of the file, or the distance of the sensor.
+    compensators: what is adjusted after manufacture; by default those of the file for its own tolerances, of which
+        there may be none, and the distance of the sensor for those of a grade or of limits alone.
 
     A thickness of glass is taken up by the first gap of air behind it. Raises BadTolerance.
     """
@@ -194,7 +195,7 @@ def tolerances(
             rows += _rows(lens, parts, limit, drawn)
     if compensators is None:
         sensor = Compensator(len(lens.surfaces) - 2, "thickness")
-        compensators = stored.compensators or (sensor,)
+        compensators = stored.compensators if stored.rows else (sensor,)
     check_tolerances(lens, rows)
     changed = len(rows) != len(stored.rows) or any(a is not b for a, b in zip(rows, stored.rows, strict=True))
     saves = () if changed else stored.saves  # which count the rows of the file

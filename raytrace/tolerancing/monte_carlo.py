@@ -48,7 +48,7 @@ def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Shar
     chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
     mine = (share or Share()).of(range(len(chunks)))
     stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
-    bar = progress(trials, "lens") if progress and trials else None
+    bar = progress(trials, "trial") if progress and trials else None
     for k in mine:
         part = chunks[k]
         rows = stored.found.get(part.start) if stored else None

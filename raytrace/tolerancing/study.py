@@ -14,17 +14,18 @@ import torch
 from scipy.special import ndtr
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide
-from raytrace.maths.sampling import SAMPLINGS, gauss_rings, with_rim
+from raytrace.analysis.setting import scene_of
+from raytrace.maths.sampling import SAMPLINGS, gauss_rings
 from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, mean_square_radius
+from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, light, mean_square_radius
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tracing.clear_pupil import arms_of, is_clipped
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
@@ -32,7 +33,6 @@ _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
 _ALIKE = 1e-10  # of the curvatures, each by itself 1: the least one of compensators that differ
 _RINGS, _SAME = (4, 6, 8), 1e-4  # rings of the pupil that are tried, and the accepted relative error of q
-_RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
 #: Lenses traced at once.
 CHUNK = 1024
 
@@ -66,27 +66,26 @@ class Study:
         self.unsettled = 0  # lenses whose compensators still gained 1e-6 of q in the last step
         with torch.no_grad():
             zero = self.half.new_zeros(1, len(self.half))
-            self.nominal_light = self._each(zero, zero.new_zeros(1, len(self.compensators)))[1]
+            self.nominal_light = self._of_views(light, zero, zero.new_zeros(1, len(self.compensators)))
 
-    def _each(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor]:
-        """q and the light (V, L) of every configuration."""
+    def _of_views(self, judge: Callable[[Lens, Sampling], Tensor], errors: Tensor, changes: Tensor) -> Tensor:
+        """A number (V, L) of every configuration of lenses with errors (L, N) and compensators moved by (L, C)."""
         found = []
         for view, perturbation in zip(self.views, self.perturbations, strict=True):
             lens = aligned(with_changes(perturbation(errors), self.compensators, changes), 3)
-            found.append([part.expand(len(errors)) for part in view.criterion.quantity(lens, view.sampling)])
-        return tuple(torch.stack(part) for part in zip(*found, strict=True))
+            found.append((judge or view.criterion.quantity)(lens, view.sampling).expand(len(errors)))
+        return torch.stack(found)
 
-    def quantity(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor]:
-        """q (L,) of lenses with errors (L, N) and compensators moved by (L, C), and the `_kept` light (L,)."""
-        q, light = self._each(errors, changes)
-        return q.mean(0), self._kept(light)
+    def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
+        """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
+        return self._of_views(None, errors, changes).mean(0)
 
-    def _kept(self, light: Tensor) -> Tensor:
-        """The least share (L,) of the light of the nominal lens, of any configuration."""
-        return safe_divide(light.detach(), self.nominal_light.expand_as(light)).amin(0).clamp_max(1.0)
+    def light(self, errors: Tensor, changes: Tensor) -> Tensor:
+        """Share (L,) of the light of the nominal lens that arrives, of the configuration that loses most."""
+        return (self._of_views(light, errors, changes) / self.nominal_light).amin(0).clamp_max(1.0)
 
-    def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-        """q (L,) with the sensor at its least, its shift (L, 1), and the light; None where no parabola has it."""
+    def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor] | None:
+        """q (L,) with the sensor at its least, and its shift (L, 1); None where no parabola has it."""
         parts = []
         for (lens, criterion, sampling), perturbation in zip(self.views, self.perturbations, strict=True):
             if criterion.parabola is None or not focuses(lens, self.compensators):
@@ -95,25 +94,25 @@ class Study:
             if not is_plain_sensor(lenses.surfaces[-1]):
                 return None
             parts.append([part.expand(len(errors)) for part in criterion.parabola(aligned(lenses, 3), sampling)])
-        *parabola, light = (torch.stack(part) for part in zip(*parts, strict=True))
-        q, shift = at_best_focus([part.mean(0) for part in parabola], self.least, self.most)
-        return q, shift[:, None], self._kept(light)
+        parabola = (torch.stack(part).mean(0) for part in zip(*parts, strict=True))
+        q, shift = at_best_focus(tuple(parabola), self.least, self.most)
+        return q, shift[:, None]
 
     def slope(self, errors: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) and its derivatives by the errors (L, N) and the compensators (L, C)."""
-        return self._slopes(errors, changes, by_errors=True)[:3]
+        return self._slopes(errors, changes, by_errors=True)
 
-    def _slopes(self, errors: Tensor, changes: Tensor, *, by_errors: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _slopes(self, errors: Tensor, changes: Tensor, *, by_errors: bool) -> tuple[Tensor, Tensor, Tensor]:
         rows = []
         for e, c in zip(*(x.detach().split(self.criterion.together) for x in (errors, changes)), strict=True):
             with torch.enable_grad():
                 e, c = e.requires_grad_(by_errors), c.requires_grad_()
-                q, light = self.quantity(e, c)
+                q = self.quantity(e, c)
                 asked = [x for x in (e, c) if x.requires_grad]
                 unused = [None] * len(asked)
                 found = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
             slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(found, asked, strict=True)]
-            rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1], light))
+            rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1]))
         return tuple(torch.cat(part) for part in zip(*rows, strict=True))
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -122,25 +121,27 @@ class Study:
         Newton's method with the curvature of the nominal lens, scaled for each lens by the last two slopes. A step that
         does not improve q is shortened. q is nan for a lens that loses more light than `loss`.
         """
+        parts = []
         with torch.no_grad():
-            parts = [self._compensated(part) for part in errors.split(CHUNK)]
-        q, changes, light = (torch.cat(part) for part in zip(*parts, strict=True))
-        return torch.where(light >= 1 - self.loss, q, torch.nan), changes, light
+            for some in errors.split(CHUNK):
+                q, changes = self._compensated(some)
+                changes = changes.nan_to_num(0.0)  # of a lens with a field without light
+                kept = self.light(some, changes)
+                parts.append((torch.where(1 - kept > self.loss, torch.nan, q), changes, kept))
+        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
 
-    def _compensated(self, errors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
         at = errors.new_zeros(len(errors), len(self.compensators))
         if not self.compensators:
-            parts = [self.quantity(part, at[: len(part)]) for part in errors.split(self.criterion.together)]
-            q, light = (torch.cat(part) for part in zip(*parts, strict=True))
-            return q, at, light
+            parts = errors.split(self.criterion.together)
+            return torch.cat([self.quantity(part, at[: len(part)]) for part in parts]), at
         if (refocused := self.refocused(errors)) is not None:
             return refocused
         curvature, trial, count = self.nominal_curvature(), at, len(errors)
         q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(at), torch.zeros(count).to(errors)
         scale, least, moving = errors.new_ones(count, 1), 1e-6 * self.criterion.scale, torch.arange(count)
-        light = errors.new_zeros(count)
         for step in range(_NEWTON + 1):
-            q_trial, _, slopes_trial, light_trial = self._slopes(errors[moving], trial, by_errors=False)
+            q_trial, _, slopes_trial = self._slopes(errors[moving], trial, by_errors=False)
             better, start, before = ~(q_trial > q[moving]), at[moving], slopes[moving]
             if step:
                 moved = trial - start
@@ -149,7 +150,6 @@ class Study:
                 secant = torch.where((expected > 0) & (ratio > 0), ratio, 1.0).clamp(0.2, 25.0)
                 scale[moving] = torch.where(better, secant, torch.maximum(secant, 4 * scale[moving, 0]))[:, None]
             q[moving] = torch.where(better, q_trial, q[moving])
-            light[moving] = torch.where(better, light_trial, light[moving])
             at[moving] = start = torch.where(better[:, None], trial, start)
             slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
             full = torch.linalg.solve(curvature, before[..., None])[..., 0] * self.acting
@@ -160,7 +160,7 @@ class Study:
             if not len(moving):
                 break
         self.unsettled += int((gain > 1e-6 * (q + least)).sum())
-        return q, at, light
+        return q, at
 
     def harm(self, errors: Tensor) -> tuple[Tensor, Tensor]:
         """How much worse the criterion (L,) of compensated lenses is than that of the nominal one; their light (L,)."""
@@ -176,7 +176,7 @@ class Study:
             zero = self.half.new_zeros(2 * count, len(self.half))
             steps = self.scale_of_compensators()
             moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
-            q, _, slopes, _ = self._slopes(zero, moved, by_errors=False)
+            q, _, slopes = self._slopes(zero, moved, by_errors=False)
             found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
             found = 0.5 * (found + found.T)
             self.acting = self._acting(torch.diagonal(found), q)
@@ -301,8 +301,9 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
     """Fields and pupil points of a lens and of lenses near it.
 
     fields: by default those of the lens with their weights; as errors are not symmetric, a lens that is round about its
-    axis has each also mirrored along y, and the two share its weight. rings: of `gauss_rings`; by default the fewest
-    by which the mean square spot radius is that of `spot`, to _SAME.
+    axis has each also mirrored along y, and the two share its weight. rings: of `gauss_rings`, or of the clear pupil
+    (`tracing.clear_pupil`) of a nominal lens that clips rays; by default the fewest that give the mean square spot
+    radius of `spot`, to _SAME.
     """
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
@@ -314,22 +315,21 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
         share[new] = 0.5 * weights[new]
         points, weights = torch.cat([points, mirrored[:, new]], 1), torch.cat([share, share[new]])
     weights = weights / weights.sum()
-    has_rims = any(surface.apertures for surface in lens.surfaces)
 
-    def rule(rings: int) -> Sampling:
+    def rule(rings: int, arms: int | None) -> Sampling:
         at, shares = gauss_rings(rings, arms, **like)
-        if has_rims:  # rays just inside the edge show a beam that is clipped between the outermost ring and the edge
-            rim, none = with_rim(at[:, :0], shares[:0], 4 * rings)
-            at, shares = torch.cat([at, _RIM * rim], 1), torch.cat([shares, none])
-        return Sampling(points, weights, at, shares, rings)
+        view = scene_of(lens, points)
+        if is_clipped(view, at):
+            at, shares = arms_of(view, 4 * rings if arms is None else arms).rule(rings)
+        return Sampling(points, weights, at, shares)
 
-    finest = SAMPLINGS["gauss"][2]
-    if rings is not None:
-        return rule(rings)
     with torch.no_grad():
-        ready = aligned(lens, 3)
-        square, _ = mean_square_radius(ready, rule(finest))
+        if rings is not None:
+            return rule(rings, arms)
+        finest = rule(SAMPLINGS["gauss"][2], None)
+        square = mean_square_radius(lens, finest)
         for rings in _RINGS:
-            if bool((mean_square_radius(ready, rule(rings))[0] - square).abs() <= _SAME * square):
-                return rule(rings)
-    return rule(finest)
+            fewer = rule(rings, arms)
+            if bool((mean_square_radius(lens, fewer) - square).abs() <= _SAME * square):
+                return fewer
+    return finest

@@ -76,7 +76,7 @@ class Toleranced(Result):
     lost: Tensor
     lost_minimum: Tensor
     lost_maximum: Tensor
-    loss: float = 0.01
+    loss: float = 0.05
     holds: str = ""
     configurations: int = 1
     seed: int = 0
@@ -119,8 +119,9 @@ class Toleranced(Result):
     def worst(self) -> Tensor:
         """Places (G,) of the tolerances, the largest change to the worse first; of a group that of its first row."""
         changes = torch.maximum(self.sign * self.minimum, self.sign * self.maximum)
-        order, leaders = torch.argsort(changes.nan_to_num(torch.inf), descending=True), self.tolerances.leaders
-        return order[leaders[order] == order]  # nan: the lens fails
+        order = torch.argsort(changes.nan_to_num(torch.inf), descending=True)  # nan: the lens fails
+        leaders = self.tolerances.leaders
+        return order[leaders[order] == order]
 
     @property
     def labels(self) -> list[str]:
@@ -384,7 +385,7 @@ def tolerance(
     fields: Tensor | Sequence | None = None,
     rings: int | None = None,
     arms: int | None = None,
-    loss: float = 0.01,
+    loss: float = 0.05,
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
@@ -420,7 +421,7 @@ def tolerance(
         that of its own fields.
     rings: of the pupil, Gaussian quadrature; by default the fewest that give the spots of `spot`.
     arms: of the pupil, 4·rings by default.
-    loss: share of the light of the nominal lens that a lens may lose, 0.01 by default; one that loses more has failed.
+    loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has failed.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
@@ -440,7 +441,7 @@ def tolerance(
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= loss <= 1:
-        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.01")
+        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.05")
     options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
     views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
     chosen, study, given = views[0].criterion, Study(views, tolerances, loss), tolerances
@@ -461,7 +462,7 @@ def tolerance(
                 chosen.quantity_of(goal), yield_, seed + 1,
             )  # fmt: skip
             study = Study(views, tolerances, loss)
-        alone = torch.cat([tolerances.alone(tolerances.minimum), tolerances.alone(tolerances.maximum)]).to(study.half)
+        alone = torch.cat([tolerances.alone(each) for each in (tolerances.minimum, tolerances.maximum)]).to(study.half)
         changes, light = study.harm(alone)
         start, slope = second(torch.zeros_like(alone[:1]))
         seconds = chosen.value(second(alone)[0].clamp_min(0)) - chosen.value(start.clamp_min(0))
@@ -478,9 +479,8 @@ def tolerance(
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
         slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
         estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
-        trials=values, changes=moved,
-        lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss, holds=holds,
-        configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
+        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss,
+        holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
@@ -508,7 +508,7 @@ def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -
 
 
 def _slope(criterion: Criterion, q0: Tensor, g: Tensor, H: Tensor, errors: Tensor) -> Tensor:
-    """Changes (L,) of the criterion by errors (L, N), to first order; where its square is 0 of the nominal lens, by
+    """Changes (L,) of the criterion along errors (L, N) to first order; where its square is 0 of the nominal lens, by
     their sizes."""
     if float(q0) <= 1e-12 * criterion.scale:
         return torch.sqrt((0.5 * ((errors @ H) * errors).sum(-1)).clamp_min(0))

@@ -50,16 +50,17 @@ from raytrace.system.lens import (
     shared,
     wavelengths_of,
 )
+from raytrace.system.poses import point_out
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
-from raytrace.words import calling_level, named_value
+from raytrace.words import RaytraceWarning, calling_level, named_value
 
 
-class MarginalRayLost(UserWarning):
+class MarginalRayLost(RaytraceWarning):
     """The real marginal ray does not reach the stop, so that it cannot define its radius."""
 
 
@@ -224,6 +225,14 @@ def field_of_object(lens: Lens, extent: Tensor, paraxial: FirstOrder) -> Tensor:
     return torch.rad2deg(torch.atan(extent)) if kind == "angle" else extent
 
 
+def object_point(lens: Lens, height: Tensor) -> Tensor:
+    """The points (3, ...) mm of object heights (2, ...) mm along the object's axes, in the frame of surface 1."""
+    source = lens.surfaces[0]
+    point = [height[0], height[1], sag(source, dot_2(height, height))]
+    x, y, z = point if source.before is None else point_out(source.before, point)
+    return torch.stack(torch.broadcast_tensors(x, y, z - source.thickness))
+
+
 def _paraxial_scale(lens: Lens, paraxial: FirstOrder) -> Tensor | float:
     """`field_scale` of the kind of field of a lens."""
     return field_scale(
@@ -319,8 +328,7 @@ def _through_entrance_pupil(
     lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor, entrance: Entrance | None
 ) -> Rays:
     """Rays from a slope or object height (2, ...) to fractions (2, ...) of the entrance pupil, by default paraxial."""
-    distance = lens.surfaces[0].thickness
-    at_infinity = is_at_infinity(lens)
+    point = None if is_at_infinity(lens) else object_point(lens, field)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
     if lens.fields.telecentric:
         # The pupil is at infinity: equal cones about chief rays parallel to the axis.
@@ -329,19 +337,21 @@ def _through_entrance_pupil(
                 "object space is telecentric, which needs an aperture given as object NA or cone angle, not "
                 f"{lens.aperture.kind}"
             )
-        radius, depth = distance * torch.tan(cone_angle(lens, index)), torch.zeros_like(distance)
-        aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
+        radius, depth = -point[2] * torch.tan(cone_angle(lens, index)), torch.zeros_like(depth)
+        aim_x, aim_y = point[0] + radius * pupil[0], point[1] + radius * pupil[1]
     elif entrance is not None:
         aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
         depth = entrance.position
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
     # Not the index: all wavelengths start alike, and only their paths differ.
-    x, y, aim_x, aim_y, depth, distance = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
-    aim = torch.stack([aim_x, aim_y, depth])
-    if at_infinity:
+    if point is None:
+        distance = lens.surfaces[0].thickness
+        x, y, aim_x, aim_y, depth, _ = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
+        aim = torch.stack([aim_x, aim_y, depth])
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
-    point = torch.stack([x, y, sag(lens.surfaces[0], x * x + y * y) - distance])
+    *point, aim_x, aim_y, depth = torch.broadcast_tensors(*point, aim_x, aim_y, depth)
+    point, aim = torch.stack(point), torch.stack([aim_x, aim_y, depth])
     # Rays travel towards +z and start at the nearer of object point O and pupil point A. A virtual object lies behind
     # surface 1, and an entrance pupil may lie before the object: then light runs from A to O on the same line.
     rays = rays_from_point(point, aim, index=index)
@@ -488,7 +498,7 @@ TOLERANCE = 0.02
 MOST_FIELDS = 64  # measured per call: a map of the field has thousands
 
 
-class UnfilledStop(UserWarning):
+class UnfilledStop(RaytraceWarning):
     """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
 
     of_result = True  # about a result: not printed with an error that ends the command

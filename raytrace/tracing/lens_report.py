@@ -157,6 +157,7 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
+            "telecentric": _telecentric(lens),
             "ray_aiming": lens.ray_aiming,
             "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
@@ -204,6 +205,7 @@ class Info(Result):
         lines += [
             f"  {'wavelengths':<24} {', '.join(shown)} µm"
             + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
+            *([f"  {'telecentric':<24} in {' and '.join(spaces)} space"] if (spaces := _telecentric(lens)) else []),
             f"  {'ray aiming':<24} {aiming}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
@@ -261,6 +263,15 @@ def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
     data, real = first_order(lens), working_f_number(lens)
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
+
+
+def _telecentric(lens: Lens) -> list[str]:
+    """The spaces in which chief rays are parallel: where the pupil is a thousand lengths of the lens away, and more."""
+    data = first_order(lens)
+    far = 1e3 * max(sum(abs(float(surface.thickness)) for surface in lens.surfaces[1:-1]), 1.0)
+    object_space = lens.fields.telecentric or abs(float(data.entrance_pupil_position)) > far
+    image_space = abs(float(data.exit_pupil_position)) > far
+    return [*["object"] * object_space, *["image"] * image_space]
 
 
 def _base_ray_document(lens: Lens) -> dict:

@@ -290,6 +290,10 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     else:
         at_object = lens.fields.kind == "object_height"
         invariant = (n_object * slope_object if at_object else n_image * slope_image) * largest
+    # Of an entrance pupil at infinity the exit pupil is as large as the axial beam there.
+    finite, exit_distance = torch.isfinite(diameter), data.exit_pupil_distance
+    beam = 2 * (scale * (A + data.B * vergence) + slope_image * exit_distance).abs()
+    exit_diameter = torch.where(finite, torch.where(finite, diameter, 1.0) * data.pupil_magnification, beam)
     petzval = petzval_sum([vertex_curvature(s) for s in surfaces], n) * torch.ones_like(n_object)
     return FirstOrder(
         power=-C,
@@ -298,8 +302,8 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         front_focal_distance=n_object * D / C,
         entrance_pupil_position=data.entrance_pupil_position,
         entrance_pupil_diameter=diameter,
-        exit_pupil_position=data.exit_pupil_distance - surfaces[-1].thickness,
-        exit_pupil_diameter=diameter * data.pupil_magnification,
+        exit_pupil_position=exit_distance - surfaces[-1].thickness,
+        exit_pupil_diameter=exit_diameter,
         stop_height=0.5 * diameter * data.front[0],
         f_number=focal_length.abs() / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),

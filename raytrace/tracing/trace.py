@@ -322,8 +322,11 @@ def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ..
 
 
 def is_bent(lens: Lens) -> bool:
-    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
-    return _bends(lens, lens.surfaces)
+    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray.
+
+    A tilted object counts, whose image along the axis depends on the field.
+    """
+    return is_posed(lens.surfaces[0]) or _bends(lens, lens.surfaces)
 
 
 def aiming_of(lens: Lens) -> str:
@@ -341,7 +344,7 @@ def aiming_of(lens: Lens) -> str:
 
 def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
     """Whether the first surfaces of a lens, which these are, bend its axis."""
-    if any(map(is_posed, surfaces)):
+    if any(map(is_posed, surfaces[1:])):
         return True
     if all(map(is_round, surfaces)):
         return False

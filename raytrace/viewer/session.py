@@ -23,10 +23,12 @@ from raytrace.viewer.state import (
     Event,
     State,
     edited,
+    in_words,
     initial,
     merit_of,
     reduce,
     refusal,
+    requirements,
     variables,
 )
 
@@ -42,6 +44,7 @@ SESSION_EVENTS = {
 }
 #: Events that change what is shown but not the lens: they are answered while an optimisation runs.
 _VIEWS = ("open", "compare", "frequency")
+_SHOWN = 4  # requirements of the file that are listed
 
 
 class Optimisation:
@@ -49,6 +52,8 @@ class Optimisation:
 
     def __init__(self, state: State):
         self.lens, self.merits, self.is_stopped = state.lens, [], False
+        rows = [row for row in requirements(state.lens) if row.weight != 0]
+        self.required = [*dict.fromkeys(map(in_words, rows))]
         self.result: Optimized | None = None
         self.failure = ""
         self.thread = threading.Thread(target=self._run, args=(state,), daemon=True)
@@ -73,8 +78,15 @@ class Optimisation:
             missed = [str(one) for one in self.result.conditions if not one.met]
             before, after = self.result.merit_before, self.result.merit_after
             reason = STOPPED[self.result.stopped]
-            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *missed])
-        return f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
+            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *self._of_file, *missed])
+        running = f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
+        return "; ".join([running, *self._of_file])
+
+    @property
+    def _of_file(self) -> list[str]:
+        """The requirements of the file, in words."""
+        more = f", and {len(self.required) - _SHOWN} more" if len(self.required) > _SHOWN else ""
+        return [f"with {', '.join(self.required[:_SHOWN])}{more} of the file"] if self.required else []
 
 
 class Session:

@@ -17,17 +17,27 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.mtf import frequency_range
-from raytrace.optimization.merit import KINDS, DefaultMerit
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, arguments, merit_for
+from raytrace.optimization.operands.mtf import MODULATION
+from raytrace.optimization.operands.rays import RAYS
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.operands.wavefront import PATH, QUALITY
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
-from raytrace.system.optimization_data import Vary
+from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
 from raytrace.tracing.geometry import gaps
 from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import named_value
+
+#: Operands of the quality of the image, which a chosen merit function replaces.
+OF_IMAGE = {
+    *(name for name in RAYS if name[:3] in ("TRA", "TRC", "ANA", "ANC")),
+    *(name for table in (PATH, QUALITY, MODULATION) for name in table),
+}
 
 #: Steps of undo that are kept.
 DEPTH = 500
@@ -66,7 +76,8 @@ def initial(lens: Lens) -> State:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
         highest = 100.0
-    return State(lens, lens, tuple(words), "" if data and data.merit else "spot", frequency=highest)
+    has_merit = data is not None and any(row.weight > 0 for row in data.merit)  # and not conditions alone
+    return State(lens, lens, tuple(words), "" if has_merit else "spot", frequency=highest)
 
 
 def shown_fields(lens: Lens) -> Tensor:
@@ -152,12 +163,31 @@ def variables(state: State) -> list[str | Vary]:
     return [*of_file, *(word for word in state.vary if word not in map(word_of, of_file))]
 
 
-def merit_of(state: State) -> DefaultMerit | None:
-    """The merit function for `optimize`; None: the file's. The MTF is that at 1/4 and 1/2 of the highest frequency."""
+def merit_of(state: State) -> Merit | None:
+    """The merit function for `optimize`; None: the file's. The MTF is that at 1/4 and 1/2 of the highest frequency.
+
+    A chosen one replaces what the file says of the image; conditions, boundaries and other rows of the file remain.
+    """
     if not state.merit:
         return None
     frequencies = (state.frequency / 4, state.frequency / 2) if state.merit == "mtf" else ()
-    return DefaultMerit(state.merit, frequencies=frequencies)
+    chosen = merit_for(state.lens, DefaultMerit(state.merit, frequencies=frequencies))
+    return dataclasses.replace(chosen, skip_unknown=True) + requirements(state.lens)
+
+
+def requirements(lens: Lens) -> Merit:
+    """The merit function of the file in which rows of the image, unless they are conditions, have no weight."""
+    data = lens.optimization_data
+    rows = data.merit if data else ()
+    of_image = [row.operand in OF_IMAGE and row.weight > 0 for row in rows]
+    free = (dataclasses.replace(row, weight=0.0) if image else row for row, image in zip(rows, of_image, strict=True))
+    return Merit(tuple(free), data.unit if data else 1.0)
+
+
+def in_words(row: Row) -> str:
+    """A row and its target, as "EFFL = 50"."""
+    relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
+    return " ".join(filter(None, (row.name, arguments(row), relation, f"{row.target:.6g}")))
 
 
 # -- numbers
