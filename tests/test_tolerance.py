@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
+from raytrace.tracing.spot import image_rays
 
 LIMITS = "radius=0.1% thickness=0.03 element_decenter=0.03 element_tilt=0.05"
 
@@ -416,3 +417,27 @@ def test_trials_without_light_leave_the_figures_of_the_others(triplet, decentre,
     assert summary["failed"] == (24 if decentre == 60 else int(found.trials.isnan().sum())) > 0
     assert math.isfinite(summary["mean"]) == (decentre == 30)
     found.draw().savefig(tmp_path / "figure.png")
+
+
+def rms_angle(lens):
+    """RMS angle, mrad, of the directions of rays at the sensor about their mean, of all fields."""
+    points, weights = rt.gauss_rings(12)
+    directions = image_rays(lens, points).direction.flatten(-2)
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    weights = (shares[:, None] * weights).flatten()
+    offset = directions - (weights * directions).sum(-1, keepdim=True)
+    return 1e3 * float((weights * offset.square().sum(0)).sum(-1).mean().sqrt())
+
+
+def test_an_afocal_lens_is_judged_in_angle(tmp_path):
+    """Against the directions of the rays; a file keeps the kind of image space."""
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0, 8.4, -8.4])
+    lens = dataclasses.replace(lens, afocal=True)
+    rt.write_lens(lens, tmp_path / "afocal.zmx")
+    with pytest.warns(UserWarning, match="afocal image space"):
+        assert rt.read_lens(tmp_path / "afocal.zmx").afocal
+    found = rt.tolerance(lens, rt.tolerances(lens, "element_decenter:3=0.05"), trials=4)
+    assert (found.criterion, found.unit) == ("RMS angle", "mrad")
+    assert not bool(found.changes.any())  # the sensor distance has no effect
+    for judged, each in ((found.nominal, lens), (found.trials[2], found.trial(2))):
+        assert float(judged) == pytest.approx(rms_angle(each), rel=1e-4)

@@ -309,6 +309,7 @@ class LensDraft:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "auto"
+    afocal: bool = False
     environment: Environment | None = None
     sources: Sources = dataclasses.field(default_factory=dict)
 
@@ -370,6 +371,7 @@ def assemble(draft: LensDraft, file: str) -> Lens:
         notes=draft.notes,
         catalogs=draft.catalogs,
         ray_aiming=draft.ray_aiming,
+        afocal=draft.afocal,
         environment=draft.environment,
     )
     _refuse_overflow(lens, file)

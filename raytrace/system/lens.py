@@ -320,6 +320,7 @@ class Lens:
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
     optimization_data: variables, solves and the merit function of the file; None without any.
+    afocal: whether image space is afocal: the lens as built is judged in angle. Spots are those on the image surface.
     A number of the surfaces, the aperture or the environment may be a tensor (L,), and a coefficient (m, L): a batch of
     `count` lenses, of which `lens[k]` is one and `lens[:10]` some.
     """
@@ -339,6 +340,7 @@ class Lens:
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
     optimization_data: OptimizationData | None = None
+    afocal: bool = False
 
     count = property(lens_count)
     __getitem__ = one_lens

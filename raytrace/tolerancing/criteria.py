@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.analysis.setting import scene_of, wavelength_shares
 from raytrace.analysis.sheared_batch import ShearedPupils
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import square
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
@@ -69,7 +69,7 @@ class Criterion:
     allows_idle: bool = False
 
 
-def mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
+def _mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field."""
     return _spot_parabola(lens, sampling)[0]
 
@@ -80,6 +80,18 @@ def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tens
     weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
     together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
     return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+
+
+def _mean_square_angle(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square angle (L,) mrad² of the rays at the sensor, of all wavelengths, about the mean of each field."""
+    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
+    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    weights = torch.where(rays.valid.flatten(-2), weights, 0.0)
+    total, directions = weights.sum(-1, keepdim=True), rays.direction.flatten(-2)
+    share = safe_divide(weights, total)
+    offset = directions - (share * directions).sum(-1, keepdim=True)
+    squares = (share * (offset * offset).sum(0)).sum(-1)
+    return 1e6 * (sampling.field_weights * torch.where(total[..., 0] > 0, squares, torch.nan)).sum(-1)
 
 
 @torch.no_grad()
@@ -171,9 +183,17 @@ def _merit(lens: Lens, merit) -> Criterion:
 
 #: Criteria of every lens by name, and those that are made of the nominal lens.
 CRITERIA = {
-    "rms": Criterion("RMS spot radius", "µm", mean_square_radius, _spot_parabola),
+    "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
+    "angle": Criterion("RMS angle", "mrad", _mean_square_angle, allows_idle=True),
 }
+
+
+def size_of_image(lens: Lens) -> Criterion:
+    """The criterion "rms": of spots, or of an afocal lens of angles."""
+    return CRITERIA["angle" if lens.afocal else "rms"]
+
+
 NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
 
 
@@ -197,7 +217,7 @@ def criterion_of(
     if word != "psf" and (model, pixel, size) != ("gaussian", None, None):
         raise ValueError(f"criterion {word!r}: `model`, `pixel` and `size` belong to the criterion psf; leave them out")
     if word in CRITERIA:
-        return CRITERIA[word]
+        return size_of_image(lens) if word == "rms" else CRITERIA[word]
     if word == "merit":
         return _merit(lens, merit)
     if word == "psf":

@@ -20,7 +20,7 @@ from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axi
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, light, mean_square_radius
+from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, light, size_of_image
 from raytrace.tolerancing.perturbation import Perturbation, path_of
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
@@ -327,9 +327,10 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
         if rings is not None:
             return rule(rings, arms)
         finest = rule(SAMPLINGS["gauss"][2], None)
-        square = mean_square_radius(lens, finest)
+        quantity = size_of_image(lens).quantity
+        square = quantity(lens, finest)
         for rings in _RINGS:
             fewer = rule(rings, arms)
-            if bool((mean_square_radius(lens, fewer) - square).abs() <= _SAME * square):
+            if bool((quantity(lens, fewer) - square).abs() <= _SAME * square):
                 return fewer
     return finest

@@ -405,11 +405,12 @@ def tolerance(
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
-        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
-        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; "psf", the change of the
-        PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the chief
-        ray; "boresight", the distance in µm by which the chief ray of the axial field misses its nominal place on the
-        sensor; "merit", a merit function. The compensators of every lens bring it to its best.
+        centroid of its light, of an afocal lens that of "angle", the RMS angle in mrad of the rays; "wavefront", the
+        RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of diffraction at 30 cycles/mm, mean of
+        tangential and sagittal over the fields; "psf", the change of the PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the
+        nominal lens, mean square over the fields, in windows about the chief ray; "boresight", the distance in µm by
+        which the chief ray of the axial field misses its nominal place on the sensor; "merit", a merit function. The
+        compensators of every lens bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
