@@ -111,9 +111,7 @@ def decoded(content: bytes, *, low_bytes: bool = False) -> Image.Image:
     except PictureError:
         raise
     except UnidentifiedImageError as error:
-        raise PictureError(
-            f"no picture of a layout that is read: expected {', '.join(_FORMATS)}, colours of integers"
-        ) from error
+        raise PictureError(f"no picture of a layout that is read: expected {', '.join(_FORMATS)}") from error
     except Exception as error:  # decoders raise whatever their parsing meets, struct.error and KeyError too
         raise PictureError(" ".join(str(error).split())[:200] or type(error).__name__) from error
     return picture
