@@ -62,7 +62,8 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
             if rendering is None or rendering.optics.sensor != sensor:
                 rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=advance)
             else:
-                rendering = rendering.another(load(), options["depth"], boundary=options["boundary"], progress=advance)
+                how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
+                rendering = rendering.another(load(), options["depth"], **how)
             recorded = (rendering.recorded if arguments.raw else rendering.captured)(number, arguments.seed)
         if targets[number] is not None:
             targets[number].parent.mkdir(parents=True, exist_ok=True)
