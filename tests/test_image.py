@@ -228,7 +228,7 @@ def test_light_adds_up():
 
 
 def test_a_blurred_near_edge_lies_over_the_sharp_background():
-    """Two flat half planes: a in front and blurred, b behind and sharp: outside the edge α a + (1 - α) b, inside a."""
+    """Two flat half planes: a in front and blurred, b behind and sharp, which continues behind a: α a + (1 - α) b."""
     masks = torch.zeros(2, 1, 40, dtype=torch.float64)
     masks[1, :, :20], masks[0, :, 20:] = 1.0, 1.0
     picture = 0.9 * masks[1] + 0.2 * masks[0]
@@ -237,14 +237,14 @@ def test_a_blurred_near_edge_lies_over_the_sharp_background():
     kernels = torch.stack([sharp, near])[:, None]
     found = blur_layers(picture[None], masks, kernels, boundary="reflect")[0]
     alpha = blur(masks[1], near, boundary="reflect")
-    expected = torch.where(masks[0] > 0, 0.9 * alpha + 0.2 * (1 - alpha), 0.9)
+    expected = 0.9 * alpha + 0.2 * (1 - alpha)
     torch.testing.assert_close(found, expected, atol=ROUNDING, rtol=0)
     # The other way round the sharp near edge hides all of the blurred background: no halo on either side.
     found = blur_layers(picture[None], masks, kernels.flip(0), boundary="reflect")[0]
     torch.testing.assert_close(found, picture, atol=ROUNDING, rtol=0)
     # By the sum, the background shines through the edge from outside: not the same picture.
     added = blur_layers(picture[None], masks, kernels, composition="sum", boundary="reflect")[0]
-    assert float((added - expected).abs().max()) > 0.1
+    assert float((added - expected).abs().max()) > 0.05
 
 
 @pytest.mark.parametrize("composition", COMPOSITIONS)

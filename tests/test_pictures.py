@@ -1,6 +1,7 @@
 """Pictures to train on: read, split by picture, cropped by keys."""
 
 import struct
+import warnings
 import zlib
 
 import numpy as np
@@ -9,7 +10,7 @@ from PIL import Image
 
 from raytrace.imaging import pictures
 from raytrace.imaging.pictures import NoPictures, Pictures, crop, dead_leaves, digest, draws, files, order, read, split
-from raytrace.io.pictures import read_levels
+from raytrace.io.pictures import PictureChanged, read_colour, read_depth, read_grey, read_levels, write_light
 
 LEAVES = "2, blake2 25e579926550d3b2"  # of two grey pictures, before there were colours
 
@@ -214,12 +215,16 @@ def tiff(values: np.ndarray, order: str, deflate: str = "") -> bytes:
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("kind", ["png", "<", ">", "<deflate", ">deflate"])
 def test_colours_of_16_bits_keep_them(tmp_path, channels, kind):
-    """All 16 bits of red, green and blue, whose alpha is ignored; rounded to 8 for training; luma of 16 bits."""
+    """All 16 bits of the colours, on black where they have alpha; rounded to 8 for training; luma of 16 bits."""
     values = draws(1).integers(0, 2**16, (90, 85, channels)).astype(np.uint16)
     path = tmp_path / ("a.png" if kind == "png" else "a.tif")
     path.write_bytes(png(values) if kind == "png" else tiff(values, kind[0], kind[1:]))
     colours = values[..., :3]
-    levels = read_levels(path)
+    if channels == 4:
+        colours = np.round(colours * (values[..., 3:] / 65535)).astype(np.uint16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PictureChanged)
+        levels = read_levels(path)
     assert levels.dtype == np.uint16
     np.testing.assert_array_equal(levels, colours.transpose(2, 0, 1))
     luma = read_levels(path, 1)
@@ -236,3 +241,40 @@ def test_layouts_of_16_bits_that_would_lose_bits_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"a\.png: pixels of the layout LA with 16 bits; expected grey or RGB ones"):
         read_levels(tmp_path / "a.png")
     assert read([tmp_path / "a.png"], least=4).samples[0].shape == (6, 7)
+
+
+def test_exif_orientation_is_applied_and_alpha_shown_on_black(tmp_path):
+    values = draws(4).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    picture = Image.fromarray(values)
+    exif = picture.getexif()
+    exif[0x0112] = 6  # turned by 90°
+    picture.save(tmp_path / "a.png", exif=exif)
+    with pytest.warns(PictureChanged, match=r"a\.png: turned upright, by its EXIF orientation 6"):
+        np.testing.assert_array_equal(read_colour(tmp_path / "a.png"), np.rot90(values, -1))
+    alpha = np.dstack([values, np.full((4, 6), 255, np.uint8)])
+    alpha[0, 0, 3] = 0
+    Image.fromarray(alpha).save(tmp_path / "b.png")
+    with pytest.warns(PictureChanged, match="its transparent parts are shown on black"):
+        levels = read_levels(tmp_path / "b.png")
+    assert not levels[:, 0, 0].any()
+    np.testing.assert_array_equal(levels[:, 1:], values[1:].transpose(2, 0, 1))
+
+
+def test_webp_and_floating_point_tiff(tmp_path):
+    values = draws(5).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    Image.fromarray(values).save(tmp_path / "a.webp", lossless=True)
+    np.testing.assert_array_equal(read_levels(tmp_path / "a.webp"), values.transpose(2, 0, 1))
+    light = draws(6).random((3, 4, 6)).astype(np.float32)
+    write_light(tmp_path / "colour.tif", light)
+    np.testing.assert_array_equal(read_levels(tmp_path / "colour.tif"), light)
+    write_light(tmp_path / "grey.tif", light[:1])
+    np.testing.assert_array_equal(read_levels(tmp_path / "grey.tif"), light[:1])
+    np.testing.assert_allclose(read_grey(tmp_path / "grey.tif"), 255 * light[0], atol=0.51)
+    distances = np.float32(800 + 4000 * light[:1])
+    write_light(tmp_path / "depth.tif", distances)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), distances[0])
+    with pytest.raises(ValueError, match="floating-point distances in mm need no `depth_range`"):
+        read_depth(tmp_path / "depth.tif", (1.0, 2.0))
+    (tmp_path / "b.png").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="no picture of a layout that is read: expected JPEG, PNG, WEBP, BMP, TIFF"):
+        read_levels(tmp_path / "b.png")

@@ -9,18 +9,21 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge
+from raytrace.budget import OverBudget, within
+from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge, channel_moments
 from raytrace.imaging.image import blur, blur_layers, depth_masks
 from raytrace.imaging.render import (
     ImageFormation,
+    Rendering,
+    _over_response,
     default_sensor,
     encoded,
     linearised,
     optics,
     render_patches,
-    resampled,
 )
 from raytrace.imaging.varying_blur import bilinear, varying_blur
+from raytrace.imaging.warp import resampled
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.system.lens import with_field_kind
 
@@ -44,7 +47,8 @@ def triplet():
 def ready(lens, sensor=FIELD, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return optics(lens, sensor, **{"nodes": (3, 4), "order": 4, "tol": 1e-9, **options})  # no low rank
+        how = {"model": "gaussian", "wavelengths": lens.wavelengths, "nodes": (3, 4), "order": 4, "tol": 1e-9}
+        return optics(lens, sensor, **{**how, **options})  # no low rank
 
 
 def random(*shape, seed=0):
@@ -164,7 +168,7 @@ def test_a_kernel_off_the_meridian_is_the_turned_one(triplet):
 def test_window_that_would_be_too_large_is_refused(triplet):
     fine = rt.Sensor(size=(18.0, 12.0), pixels=(18000, 12000))
     with pytest.raises(WindowTooLarge, match=r"focus the lens.*larger pixels"):
-        optics(triplet, fine)
+        optics(triplet, fine, model="gaussian")
 
 
 # -- rendering
@@ -258,14 +262,48 @@ def test_the_distortion_is_that_of_chief_rays(name):
 
 
 def test_a_picture_of_lines_is_bent_as_the_distortion_says():
-    """A ramp of columns is the column itself, the interpolation being exact of it."""
+    """A ramp of columns is the column itself, to the change of width of a pixel: squares are of constant light."""
     lens = rt.read_lens("phone")
     system = ready(lens, whole_field(lens), illumination=False, nodes=(1, 1), size=3)
     ramp = torch.arange(60.0, dtype=torch.float64).expand(1, 40, 60)
     inside = (slice(8, -8), slice(8, -8))
     bent = resampled(ramp, system.ideal, "reflect")[0]
     assert float((bent - ramp[0])[inside].abs().max()) > 0.02
-    torch.testing.assert_close(bent[inside], system.ideal[0][inside], rtol=0, atol=1e-9)
+    wider = float((system.ideal[0].diff(dim=1) - 1).abs().max())
+    assert wider < 0.05
+    torch.testing.assert_close(bent[inside], system.ideal[0][inside], rtol=0, atol=0.5 * wider)
+
+
+def barrel(rows=24, columns=30, strength=2e-4):
+    row, column = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (rows, columns)), indexing="ij")
+    middle = torch.tensor([0.5 * (columns - 1), 0.5 * (rows - 1)], dtype=torch.float64)[:, None, None]
+    away = torch.stack([column, row]) - middle
+    return middle + away * (1 + strength * away.square().sum(0)), away.square().sum(0)
+
+
+def test_a_distorted_picture_has_no_negative_light_and_keeps_it():
+    """Squares of 0 and 0.8, and a point, whose light is that times the area of its image."""
+    places, square = barrel()
+    row, column = torch.meshgrid(torch.arange(24), torch.arange(30), indexing="ij")
+    squares = 0.8 * ((row // 3 + column // 3) % 2).double()[None]
+    seen = resampled(squares, places, "reflect")
+    assert float(seen.min()) == 0.0
+    assert float(seen.max()) <= 0.8 + 1e-12
+    picture = random(1, 24, 30)
+    picture[:, :4] = picture[:, -4:] = picture[:, :, :4] = picture[:, :, -4:] = 0
+    light = resampled(picture, places, "zero")
+    jacobian = (1 + 2e-4 * square) * (1 + 6e-4 * square)  # of the picture by the image
+    assert float((light * jacobian).sum()) == pytest.approx(float(picture.sum()), rel=2e-3)
+    assert float(jacobian.max()) > 1.15
+
+
+def test_derivatives_of_a_distorted_picture():
+    places, _ = barrel(5, 6, 1e-2)
+    picture = random(2, 5, 6)
+    assert torch.autograd.gradcheck(
+        lambda picture, places: resampled(picture, places, "reflect"),
+        [x.requires_grad_() for x in (picture, places + 0.013)], eps=1e-7, atol=1e-6,
+    )  # fmt: skip
 
 
 def test_without_lateral_colour_every_wavelength_lies_about_its_own_chief_ray(triplet):
@@ -331,15 +369,22 @@ def test_layers_are_those_of_blur_layers(triplet):
     assert torch.equal(system.planes, (1 / distances).sort().values)
 
 
-def test_no_depth_lies_between_two_objects(triplet):
-    """A step of the depth map stays a step where distortion moves it: every pixel is of one of both layers."""
-    distances = torch.tensor([2e3, math.inf], dtype=torch.float64)
-    system = ready(triplet.at(object_distance=4e3), object_distances=distances, nodes=(1, 1), illumination=False)
-    inverse = torch.zeros(1, ROWS, COLUMNS, dtype=torch.float64)
-    inverse[..., COLUMNS // 2 + 9 :] = 1 / 2e3
-    moved = resampled(inverse, system.ideal, "reflect", mode="nearest")
-    assert set(moved.unique().tolist()) == {0.0, 1 / 2e3}
-    assert len(resampled(inverse, system.ideal, "reflect").unique()) > 2
+def test_a_blurred_near_object_has_a_soft_silhouette(triplet):
+    """A near half plane a in front of a far one b, 0.9 and 0.2: α a + (1 - α) b, on either side of its edge."""
+    distances = torch.tensor([1e3, math.inf], dtype=torch.float64)
+    grey = dataclasses.replace(FIELD, response=None)
+    system = ready(triplet, grey, object_distances=distances, nodes=(1, 1), distortion=False, illumination=False)
+    near = torch.zeros(ROWS, COLUMNS, dtype=torch.float64)
+    near[:, : COLUMNS // 2] = 1
+    depth = torch.where(near > 0, 1e3, math.inf)
+    alpha = blur(near[None], system.kernels[0, 0, 1], boundary="reflect")
+    image = system((0.2 + 0.7 * near)[None], depth)
+    torch.testing.assert_close(image, 0.9 * alpha + 0.2 * (1 - alpha), rtol=0, atol=1e-9)
+    assert float(image[0, ROWS // 2].diff().abs().max()) < 0.3
+    shown = system((0.2 + 0.7 * near)[None], depth, background=torch.full((1, ROWS, COLUMNS), 0.5).double())
+    behind = 0.5 * blur(near[None], system.kernels[0, 0, 0], boundary="reflect")
+    behind = behind + 0.2 * blur(1 - near[None], system.kernels[0, 0, 0], boundary="reflect")
+    torch.testing.assert_close(shown, 0.9 * alpha + (1 - alpha) * behind, rtol=0, atol=1e-9)
 
 
 def test_rendering_maps_over_pictures(triplet):
@@ -353,10 +398,11 @@ def test_a_flat_depth_map_is_that_distance(triplet):
     flat = torch.full((ROWS, COLUMNS), 3e3, dtype=torch.float64)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        deep = rt.render(triplet, picture, sensor=FIELD, depth=flat, distortion=False, illumination=False)
+        how = {"model": "gaussian", "distortion": False, "illumination": False}
+        deep = rt.render(triplet, picture, sensor=FIELD, depth=flat, **how)
         alone = optics(
             triplet, FIELD, object_distances=torch.tensor([3e3]), distortion=False, illumination=False,
-            order=deep.optics.order, nodes=deep.optics.kernels.shape[:2],
+            model=deep.optics.model, order=deep.optics.order, nodes=deep.optics.kernels.shape[:2],
         )(picture)  # fmt: skip
     torch.testing.assert_close(deep.image, alone, rtol=0, atol=1e-9)
 
@@ -366,7 +412,7 @@ def test_a_flat_depth_map_is_that_distance(triplet):
 
 def test_render_chooses_sensor_grid_and_window(triplet):
     picture = (random(3, 24, 36) * 255).to(torch.uint8)
-    result = rt.render(triplet, picture, tol=0.05)
+    result = rt.render(triplet, picture, model="gaussian", tol=0.05)
     assert result.image.shape == (3, 24, 36)
     corner = torch.hypot(*result.optics.sensor.corners[:, 0])
     largest = result.optics.sensor.landing(triplet, torch.tensor([[0.0], [11.9]], dtype=torch.float64))[1]
@@ -378,7 +424,7 @@ def test_render_chooses_sensor_grid_and_window(triplet):
 
 def test_a_grey_picture_and_one_smaller_than_a_kernel(triplet):
     fine = rt.Sensor(size=(0.09, 0.07), pixels=(9, 7))
-    image = rt.render(triplet, random(7, 9), sensor=fine, tol=0.1).image
+    image = rt.render(triplet, random(7, 9), sensor=fine, model="gaussian", tol=0.1).image
     assert image.shape == (1, 7, 9)
     assert bool(torch.isfinite(image).all())
 
@@ -399,13 +445,14 @@ def test_bad_input_is_one_clear_error(triplet, picture, options, message):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(ValueError, match=message):
-            rt.render(triplet, picture, sensor=FIELD, tol=0.3, **options)
+            rt.render(triplet, picture, sensor=FIELD, **{"model": "gaussian", "tol": 0.3, **options})
 
 
 def test_the_grid_is_refined_to_the_tolerance(triplet):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        errors = [optics(triplet, FIELD, tol=tol, illumination=False, distortion=False).error for tol in (0.2, 0.02)]
+        how = {"model": "gaussian", "illumination": False, "distortion": False}
+        errors = [optics(triplet, FIELD, tol=tol, **how).error for tol in (0.2, 0.02)]
     assert errors[0] <= 0.1
     assert errors[1] <= 0.01
 
@@ -414,6 +461,92 @@ def test_no_error_is_estimated_of_requested_nodes(triplet):
     system = ready(triplet, nodes=(2, 2))
     assert isinstance(system, ImageFormation)
     assert np.isnan(system.error)
+
+
+def test_the_model_is_the_first_that_the_next_confirms(triplet):
+    """Coarse pixels: a Gaussian; the blur of a defocused lens: rays, a disc; with what is left out."""
+    coarse = rt.Sensor(size=(18.0, 12.0), pixels=(6, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert optics(triplet, coarse, tol=0.5, illumination=False, distortion=False).model == "gaussian"
+        small = rt.Sensor(size=(1.2, 0.8), pixels=(48, 32))
+        result = rt.render(triplet.at(fields=[1.0]), torch.ones(32, 48).double(), sensor=small, tol=0.05)
+    assert result.optics.model == "drt"
+    assert "PSF model drt, 3 wavelengths; left out: diffraction" in str(result)
+    kernel = result.optics.kernels[0, 0, 0, 0]
+    lines = torch.arange(len(kernel), dtype=torch.float64)
+    row, column = ((kernel.sum(axis) * lines).sum() for axis in (1, 0))
+    square = (lines[:, None] - row) ** 2 + (lines - column) ** 2
+    rim = 2 * float((kernel * square).sum())  # squared radius of a disc of this mean square
+    assert float(kernel[square < 1.3 * rim].sum()) > 0.99  # of a Gaussian 1 - exp(-2.6) = 0.93
+
+
+def test_the_response_is_sampled_to_the_tolerance():
+    """Lateral colour of the channels of the corner: that of 61 wavelengths, which three of the file miss by a third."""
+    lens = rt.read_lens("cooke_triplet")
+    sensor = rt.Sensor((36, 24), (1200, 800), response="rgb")
+    point = sensor.corners[:, :1]
+    fine = torch.linspace(0.347, 0.702, 61, dtype=torch.float64)
+
+    def apart(lens):
+        mean = channel_moments(lens, sensor, point, lens.surfaces[0].thickness.reshape(1), lateral_colour=True)[0]
+        return float(torch.hypot(*(mean[:, 0, 0, 1] - mean[:, 0, 0, 2]))) / sensor.pitch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exact = apart(lens.at(wavelengths=[float(lens.primary), *fine.tolist()]))
+        sampled = _over_response(lens, sensor, point, lens.surfaces[0].thickness.reshape(1), True, 1e-3)
+        assert apart(sampled) == pytest.approx(exact, rel=0.03)
+        assert abs(apart(lens) / exact - 1) > 0.2
+    assert len(sampled.wavelengths) < 30
+    assert float(sampled.primary) == float(lens.primary)
+
+
+def test_outside_the_image_circle_it_is_black(triplet):
+    """No ray of a field that misses the lens arrives; kernels inside are not mixed with any from outside."""
+    wide = rt.Sensor(size=(240.0, 160.0), pixels=(COLUMNS, ROWS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system = optics(triplet, wide, model="drt", order=2, nodes=(3, 3), size=5, wavelengths=[0.5876])
+    white = torch.ones(ROWS, COLUMNS).double()
+    image, lit = system(white)[0], system.lit
+    assert 0 < float(lit.double().mean()) < 0.9
+    assert float(image.max()) < 1.02
+    outside = torch.nn.functional.max_pool2d(lit[None].double(), 7, 1, 3)[0] == 0
+    assert float(image[outside].abs().max()) < 1e-12
+    assert float(image[lit].min()) > 0
+    words = str(Rendering(image[None], white[None], triplet, system))
+    assert "% of the sensor is outside the image circle, black" in words
+    assert "distortion of the diagonal inside the image circle" in words
+
+
+def test_a_lens_of_one_wavelength_has_no_colours(triplet):
+    single = triplet.at(wavelengths=[0.55])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        text = str(rt.render(single, random(3, ROWS, COLUMNS), sensor=FIELD, model="gaussian", tol=0.5))
+    assert "all channels at the single wavelength of the lens, 0.55 µm" in text
+
+
+def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
+    with within(1e8), pytest.raises(OverBudget, match=r"kernels of 399 × 399 pixels at 3 × 3 places.*--tol.*--size"):
+        optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
+
+
+def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
+    """2 × 2 pixels of the scene in one of the sensor: the mean of the image on the finer pixels."""
+    fine = dataclasses.replace(FIELD, pixels=(2 * COLUMNS, 2 * ROWS))
+    picture, how = (
+        random(3, 2 * ROWS, 2 * COLUMNS),
+        {"model": "gaussian", "tol": 0.3, "wavelengths": triplet.wavelengths},
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        whole, small = (rt.render(triplet, picture, sensor=one, **how) for one in (fine, FIELD))
+    wanted = torch.nn.functional.avg_pool2d(whole.image, 2)
+    torch.testing.assert_close(small.image, wanted, rtol=0, atol=1e-12)
+    assert small.picture.shape == small.image.shape
+    assert small.optics.sensor.pixels == (COLUMNS, ROWS)
 
 
 # -- a camera

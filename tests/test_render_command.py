@@ -17,7 +17,7 @@ from raytrace.system.lens import field_points
 COLUMNS, ROWS = 60, 40
 LENS = "cemented_achromat"
 #: A coarse grid of kernels on a small sensor.
-QUICK = ("--sensor", "6x4", "--tol", "0.3")
+QUICK = ("--sensor", "6x4", "--tol", "0.3", "--model", "gaussian")
 
 
 def levels(*shape, most=256, seed=0):
@@ -39,7 +39,7 @@ def sensor(lens=LENS, response="rgb", **others):
 
 def rendered(picture, lens=LENS, *, camera=None, seed=0, index=0, **options):
     with torch.no_grad():
-        one = rt.render(lens, picture, sensor=camera or sensor(), **{"tol": 0.3, **options})
+        one = rt.render(lens, picture, sensor=camera or sensor(), **{"tol": 0.3, "model": "gaussian", **options})
     return one.captured(index, seed).image
 
 
@@ -66,7 +66,7 @@ def test_the_written_picture_is_the_rendering_to_8_bits(command, photo):
 
 
 def test_without_a_size_the_largest_field_lies_in_the_corners(command, photo):
-    code, out, err = command("render", LENS, photo[0], "--tol", 0.3, "-o", "out.png", "--json")
+    code, out, err = command("render", LENS, photo[0], *QUICK[2:], "-o", "out.png", "--json")
     assert code == 0, err
     size = json.loads(out)["pictures"][0]["sensor"]["size"]
     camera, lens = sensor(size=size), rt.read_lens(LENS)
@@ -95,7 +95,7 @@ def test_conditions_are_those_of_other_commands(command, photo):
     code, _, err = command("render", LENS, photo[0], *QUICK, *words, "-o", "out.png")
     assert code == 0, err
     lens = rt.read_lens(LENS).at(f_number=8, wavelengths=[0.53, 0.46, 0.61], object_distance=2000.0)
-    assert_written(rendered(photo[1], lens))
+    assert_written(rendered(photo[1], lens, wavelengths=lens.wavelengths))
 
 
 def test_several_object_distances_are_a_picture_each(command, photo):
@@ -209,9 +209,34 @@ def test_the_figure_shows_details_at_their_places_and_the_kernels_there():
             np.testing.assert_allclose(found, one, atol=1e-6)
 
 
+def test_the_window_of_the_kernels(command, photo):
+    assert command("render", LENS, photo[0], *QUICK, "--size", 31, "-o", "out.png")[0] == 0
+    assert_written(rendered(photo[1], size=31))
+
+
+def test_light_and_raw_pictures(command, photo):
+    """16 bits, floating-point numbers, and the mosaic before its colours are interpolated."""
+    assert command("render", LENS, photo[0], *QUICK, "-o", "out.png", "--png-bits", 16)[0] == 0
+    image = rendered(photo[1])
+    assert np.abs(read_levels("out.png") - 65535 * encoded(image).numpy()).max() < 0.51
+    for name in ("out.tif", "out.npy"):
+        assert command("render", LENS, photo[0], *QUICK, "-o", name)[0] == 0
+    np.testing.assert_allclose(read_levels("out.tif"), image.numpy(), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(np.load("out.npy"), image.numpy())
+    words = ("--mosaic", "RGGB", "--full-well", 500, "--raw")
+    assert command("render", LENS, photo[0], *QUICK, *words, "-o", "raw.npy")[0] == 0
+    camera = sensor(mosaic="RGGB", full_well=500)
+    with torch.no_grad():
+        raw = rt.render(rt.read_lens(LENS), photo[1], sensor=camera, tol=0.3, model="gaussian").recorded(0).image
+    np.testing.assert_array_equal(np.load("raw.npy"), raw.numpy())
+    code, _, err = command("render", LENS, photo[0], *QUICK, *words, "-o", "raw.png")
+    assert code == 1
+    assert "--raw writes light" in err
+
+
 def test_a_picture_of_one_pixel(command):
     Image.new("L", (1, 1), 255).save("white.png")
-    code, out, err = command("render", LENS, "white.png", "--sensor", "0.05x0.05", "--tol", 0.3, "-o", "out.png")
+    code, out, err = command("render", LENS, "white.png", "--sensor", "0.05x0.05", *QUICK[2:], "-o", "out.png")
     assert code == 0, err
     assert "distortion" not in out
     assert written().tolist() == [[[255]]]
@@ -264,6 +289,7 @@ def test_bad_input_is_one_line(command, photo, words, message):
     "words",
     [
         ("--sensor", "6"), ("--sensor", "0x4"), ("--distortion",), ("--bits", "0"), ("--model", "auto"),
+        ("--black-level", "-1"), ("--png-bits", "12"),
         ("-o", "out.jpg"), ("--mosaic", "RGB"), ("--boundary", "taper"), ("--depth-range", "1"),
     ],
     ids=" ".join,

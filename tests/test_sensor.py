@@ -468,3 +468,18 @@ def test_points_on_the_diagonal_begin_at_the_middle_of_a_shifted_sensor():
     sensor = rt.Sensor((24, 16), (240, 160), offset=(1.0, -2.0))
     points = sensor.on_diagonal([0.0, 0.5, 1.0])
     assert points.T.tolist() == [[1.0, -2.0], [7.0, -6.0], [13.0, -10.0]]
+
+
+def test_dark_frames_keep_the_mean_and_the_variance_of_their_noise():
+    """25 e² of read noise and Δ²/12 of quantisation; without a black level the lower half would be cut."""
+    dark = torch.zeros(1, 200, 300, dtype=torch.float64)
+    one = rt.Sensor(size=(3.0, 2.0), pixels=(300, 200), full_well=2000, read_noise=5, bits=10)
+    electrons = 2000 * one.capture(dark)
+    step = 2000 * (1 + one.black) / 1023
+    assert float(electrons.mean()) == pytest.approx(0, abs=0.1)
+    assert float(electrons.var()) == pytest.approx(25 + step**2 / 12, rel=0.03)
+    cut = 2000 * dataclasses.replace(one, black_level=0).capture(dark)
+    assert float(cut.mean()) > 1.9
+    assert float(one.capture(torch.ones_like(dark)).max()) == 1.0
+    with pytest.raises(ValueError, match="black_level -1: expected 0 or more"):
+        dataclasses.replace(one, black_level=-1)

@@ -145,7 +145,8 @@ def bench(request: Request) -> Measured:
         rows.append(Row(what, None, kernels, None, statistics.median(seconds), _peak()))
         for tol in TOLERANCES:
             start = now()
-            system = optics(lens, SENSOR, tol=tol, distortion=False, illumination=False)
+            how = {"model": "gaussian", "wavelengths": lens.wavelengths, "distortion": False, "illumination": False}
+            system = optics(lens, SENSOR, tol=tol, **how)
             ready = now()
             bar.update(1)
             with torch.no_grad():

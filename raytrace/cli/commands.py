@@ -587,10 +587,10 @@ COMMANDS = (
 Compute the image that a lens projects onto its sensor. Every picture is the upright view of a scene; its image has the
 blur, distortion, lateral colour and relative illumination of each place, and with --depth the blur of each distance.
 
-Pictures (.png, .jpg, .tif, .bmp) hold sRGB levels of 8 bits, grey ones also of 16. They are decoded to light; 1 is
-white on the axis. The image is encoded as sRGB of 8 bits. With --mosaic, --full-well, --read-noise or --bits the sensor
-records it first, and colours that the mosaic lacks are interpolated. -o names a .png file, or a folder for several
-pictures, which share the kernels if they have one size.""",
+Pictures (.png, .jpg, .webp, .tif, .bmp) hold sRGB levels of 8 or 16 bits, which are decoded to light, or light (.tif of
+floating-point numbers); 1 is white on the axis. The image is encoded as sRGB (.png) or is light (.tif, .npy). With
+--mosaic, --full-well, --read-noise or --bits the sensor records it first, and colours that the mosaic lacks are
+interpolated. -o names a file, or a folder for several pictures, which share the kernels if they have one size.""",
         """
         cooke_triplet photo.jpg -o rendered.png --plot comparison.png
         double_gauss photo.png --sensor 36x24 --f-number 2.8 --mosaic RGGB --full-well 3e4 --bits 12 -o raw.png
@@ -600,7 +600,9 @@ pictures, which share the kernels if they have one size.""",
         option("picture", metavar="PICTURE", type=file_name, nargs="+", help="pictures to render, sRGB levels"),
         partial(conditions, several="one result after the other, in files named by the distance"),
         option("-o", "--output", metavar="OUT", type=picture_or_folder,
-            help="picture to write (.png), of several pictures a folder of them"),
+            help="picture to write: .png, sRGB; .tif or .npy, light; of several pictures a folder of .png files"),
+        option("--png-bits", metavar="N", type=int, choices=(8, 16), default=8, help="of a .png file (default 8)"),
+        option("--raw", action="store_true", help="write the mosaic that the sensor records (.tif, .npy)"),
         option("--compare", "--plot", dest="plot", metavar="FILE", type=picture_file,
             help="save the pictures of an ideal lens and of this one, whole and in detail, as .png, .pdf or .svg"),
         group(
@@ -617,7 +619,9 @@ pictures, which share the kernels if they have one size.""",
             option("--full-well", metavar="E", type=positive_finite, help="electrons of white: adds shot noise"),
             option("--read-noise", metavar="E", type=not_negative,
                 help="standard deviation in electrons; without --full-well a fraction of white"),
-            option("--bits", metavar="N", type=count, help="bits of the quantisation, before the 8 of the file"),
+            option("--bits", metavar="N", type=count, help="bits of the quantisation, before those of the file"),
+            option("--black-level", metavar="E", type=not_negative,
+                help="offset of the quantisation, unit of --read-noise (default five times that)"),
             row("seed", default=0, help="of the noise, which differs from picture to picture"),
         ),
         group(
@@ -626,6 +630,8 @@ pictures, which share the kernels if they have one size.""",
                 help="distance of every pixel from surface 1: an array of mm (.npy), or a grey picture, dark is near"),
             option("--depth-range", metavar=("NEAR", "FAR"), type=positive_finite, nargs=2,
                 help="mm of black and of white of the picture MAP, linear between them"),
+            option("--background", metavar="PICTURE", type=file_name,
+                help="the scene behind the objects, without them (default: it continues as around them)"),
             parameters("render", "planes", planes={
                 "help": "layers, at equally spaced reciprocal distances; near ones cover far ones",
             }),
@@ -637,8 +643,9 @@ pictures, which share the kernels if they have one size.""",
             illumination={"help": "no relative illumination: as bright in the corners as on the axis"},
         )),
         run=_render,
-        model={"choices": Names(_psf_models), "default": "gaussian",
-            "help": "of the PSF: paraxial, fourier, gaussian, drt or wave, in order of fidelity"},
+        model={"choices": Names(_psf_models),
+            "help": "of the PSF: paraxial, fourier, gaussian, drt or wave, in order of fidelity (default: the first of "
+            "the last three that differs from the next by less than --tol)"},
         tol="bound on the estimated error of the kernels, of the light of a point",
         boundary={"choices": ("reflect", "zero"),
             "help": "the scene beyond the edge of the picture: reflect, its mirror image, or zero, black"},

@@ -46,9 +46,13 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
     """Render and write pictures one after the other; all are read once before the first is rendered."""
     files, targets = arguments.picture, _targets(arguments.picture, arguments.output)
     options = {name: value for name, value in options_of(arguments).items() if name in _names(raytrace.render)}
-    for name in ("picture", "sensor", "progress", "wavelengths", "sensor_distance"):  # the last two are of the lens
+    for name in ("picture", "sensor", "progress", "sensor_distance"):  # the last one is of the lens
         options.pop(name, None)
     lens, options["depth"] = open_lens(arguments), _depth(arguments)
+    if arguments.background is not None:
+        options["background"] = linearised(read_levels(arguments.background))
+    if arguments.raw and any(target is not None and target.suffix == ".png" for target in targets):
+        raise CommandError("--raw writes light: expected -o with a .tif or .npy file")
     pictures = [_picture(arguments, lens, file, options["depth"]) for file in files]
     texts, records, rendering = [], [], None
     for number, file in enumerate(progress(files, "picture", what="render") if len(files) > 1 else files):
@@ -58,11 +62,12 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
             if rendering is None or rendering.optics.sensor != sensor:
                 rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=advance)
             else:
-                rendering = rendering.another(load(), options["depth"], boundary=options["boundary"], progress=advance)
-            recorded = rendering.captured(number, arguments.seed)
+                how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
+                rendering = rendering.another(load(), options["depth"], **how)
+            recorded = (rendering.recorded if arguments.raw else rendering.captured)(number, arguments.seed)
         if targets[number] is not None:
             targets[number].parent.mkdir(parents=True, exist_ok=True)
-            recorded.save(targets[number])
+            recorded.save(targets[number], arguments.png_bits)
             say(f"written: {targets[number]}")
         if path := arguments.plot:
             path = Path(path) if len(files) == 1 else Path(path).with_stem(f"{Path(path).stem}_{Path(file).stem}")
@@ -126,7 +131,8 @@ def _picture(
     arguments: argparse.Namespace, lens: Lens, file: str, depth: Tensor | None
 ) -> tuple[Callable[[], Tensor], Sensor]:
     """How to read a picture as light (C, H, W), and its sensor."""
-    options = {name: value for name, value in vars(arguments).items() if name in _names(Sensor) and value is not None}
+    names = _names(Sensor) - {"size"}  # which is --sensor; --size is the window of the kernels
+    options = {name: value for name, value in vars(arguments).items() if name in names and value is not None}
     channels = None
     if "response" in options:
         options["response"] = read_response(options["response"])

@@ -94,14 +94,14 @@ def folder_or_lens(text: str) -> OutputFolder:
 
 
 def picture_or_folder(text: str) -> OutputFile | OutputFolder:
-    """A picture to write (.png), or a folder of pictures."""
+    """A picture to write (.png, .tif, .npy), or a folder of pictures."""
     suffix = PurePath(file_name(text)).suffix.lower()
-    if suffix not in ("", ".png"):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a picture that ends in .png, or a folder")
+    if suffix not in ("", ".png", ".tif", ".npy"):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a picture that ends in .png, .tif or .npy, or a folder")
     if not suffix or Path(text).is_dir():
         return OutputFolder(text)
     file = OutputFile(text)
-    file.suffixes = (".png",)
+    file.suffixes = (".png", ".tif", ".npy")
     return file
 
 

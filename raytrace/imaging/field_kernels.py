@@ -309,6 +309,24 @@ def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
     return distances.unique(return_inverse=True)
 
 
+def channel_moments(
+    lens: Lens, sensor: Sensor, points: Tensor, object_distances: Tensor, *, lateral_colour: bool
+) -> tuple[Tensor, Tensor]:
+    """Centroid mm and variance mm² (2, D, N, C) in x and y of the rays of each channel at places (2, N) mm.
+
+    About the origin of the kernels, and to a few percent: to compare spectra.
+    """
+    fields = sensor.fields(lens, points)
+    fields = fields[:, ~fields.isnan().any(0)]
+    about = {"fields": fields, "object_distances": object_distances, "per_wavelength": True}
+    spots = psf(lens, model_of("gaussian", order=4), **about, grid=make_grid(points.new_tensor(1.0), 1))
+    place = spots.centroid - origin(lens, sensor, fields, object_distances, lateral_colour=lateral_colour)
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(place)
+    mean = (place.nan_to_num(0.0)) @ weights.T
+    square = (spots.covariance[::2] + place.square()).nan_to_num(0.0) @ weights.T
+    return mean, square - mean.square()
+
+
 def field_kernels(
     lens: Lens,
     sensor: Sensor,
@@ -502,7 +520,9 @@ def order_of(
             return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
         fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
         fields = fields[:, ~fields.isnan().any(0)]
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(sensor.pitch), size), "tol": tol}
+        # The error of a Gaussian is that of its width and of its light in the window: a single pixel is enough.
+        pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
+        about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size), "tol": tol}
         about |= {"object_distances": object_distances}
         # Each place alone: a clipped beam has more rays of an order, which those of other places do not have.
         return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))

@@ -8,7 +8,7 @@ shift, and so does origin="grid".
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ EXTENSIONS = ("zero", "reflect", "taper")
 BOUNDARIES = ("valid", "circular", *EXTENSIONS)
 COMPOSITIONS = ("masked", "sum", "occlusion")
 _ORIGINS = ("pixel", "grid")
+_LITTLE = 1e-3  # share of a layer that nearer ones leave visible, below which it continues as its surroundings do
 #: White of integer pictures.
 _WHITE = {torch.uint8: 255, torch.uint16: 65535}
 
@@ -159,17 +160,18 @@ def blur_layers(
     *,
     composition: str = "occlusion",
     boundary: str = "valid",
+    background: Tensor | None = None,
 ) -> Tensor:
     """The image of a layered colour scene, each layer blurred by its own kernels.
 
         masked:     y = Σ_d m_d (h_d ∗ x)          each pixel as if the whole scene were at its depth
         sum:        y = Σ_d h_d ∗ (m_d x)          no occlusion
-        occlusion:  y = Y_D/A_D,   Y_d = (1 - a_d) Y_(d-1) + h_d ∗ (m_d x),   a_d = h_d ∗ m_d,  A likewise from a
+        occlusion:  y_d = (1 - h_d ∗ α_d) y_(d-1) + h_d ∗ (α_d x_d),   y = y_D
 
-    With occlusion a blurred near layer covers the layers behind; division by the coverage A fills in the parts of them
-    that the image does not show (after Ikoma et al., 2021). A uniform image stays uniform with "masked" and
-    "occlusion". picture: (..., C, H, W); masks: (..., D, H, W) from far to near, summing to one; kernels: (..., D, C,
-    h, w). boundary: as for `blur`. Raises ValueError for other shapes.
+    With occlusion a blurred near layer covers the layers behind, which continue behind it: α_d and x_d are those of
+    `extended_layers`. A uniform image stays uniform with "masked" and "occlusion". picture: (..., C, H, W); masks:
+    (..., D, H, W) from far to near, summing to one; kernels: (..., D, C, h, w). background: (..., C, H, W), the scene
+    behind the objects, for "occlusion". boundary: as for `blur`. Raises ValueError for other shapes.
     """
     picture = as_picture(picture)
     _check_kernel(kernels)
@@ -188,26 +190,75 @@ def blur_layers(
     if composition == "masked":
         shown = visible(layers, kernels.shape[-2:]) if boundary == "valid" else layers
         return (shown * blur(scene, kernels, boundary=boundary)).sum(-4)
-    light = blur(layers * scene, kernels, boundary=boundary)
     if composition == "sum":
-        return light.sum(-4)
+        return blur(layers * scene, kernels, boundary=boundary).sum(-4)
     # Coverage by normalised kernels: a kernel of energy below 1 darkens its layer without making it transparent.
-    cover = blur(layers, safe_divide(kernels, kernels.sum((-2, -1), keepdim=True)), boundary=boundary)
-    return occlusion(zip(light.unbind(-4), cover.unbind(-4), strict=True))
+    unit = safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+    each = enumerate(extended_layers(layers * scene, masks, background))
+    of = [(d if kernels.shape[-4] > 1 else 0, *layer) for d, layer in each]
+    return occlusion(
+        (
+            blur(light, kernels[..., d, :, :, :], boundary=boundary),
+            blur(cover, unit[..., d, :, :, :], boundary=boundary),
+        )
+        for d, light, cover in of
+    )
 
 
 def occlusion(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
-    """The image (..., C, H, W) of layers from far to near, of which each is its light and its coverage (..., C, H, W).
-
-    The formula is that of `blur_layers`.
-    """
-    total = covered = None
+    """The image (..., C, H, W) of layers from far to near, each its light and its coverage; the first one is opaque."""
+    total = 0.0
     for light, cover in layers:
-        total = light if total is None else (1 - cover) * total + light
-        covered = cover if covered is None else (1 - cover) * covered + cover
-    # Where nothing covers, the FFT leaves ±1e-16: neither light nor a division by it.
-    floor = 1e3 * torch.finfo(covered.dtype).eps
-    return safe_divide(total, torch.where(covered > floor, covered, 0.0))
+        total = (1 - cover) * total + light
+    return total
+
+
+def extended_layers(light: Tensor, masks: Tensor, background: Tensor | None = None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Light α_d x_d (..., C, H, W) and coverage α_d (..., 1, H, W) of layers from far to near, hidden parts included.
+
+        α_d = m_d/v_d,   v_d = Σ_(k ≤ d) m_k     where nearer layers leave a share v_d visible
+
+    Where they hide it, a layer continues as its visible surroundings do (`_filled`), the farthest one as `background`,
+    if this is given. light: (..., D, C, H, W), that of each layer's own part, m_d x; masks: (..., D, H, W).
+    """
+    count, visible = masks.shape[-3], masks.cumsum(-3)[..., None, :, :]
+    for d in range(count):
+        known, mask = visible[..., d, :, :, :], masks[..., d, None, :, :]
+        if d == 0 and background is not None:
+            seen = _sure(known)
+            yield seen * safe_divide(light[..., d, :, :, :], known) + (1 - seen) * background, torch.ones_like(mask)
+        elif d == count - 1:  # nothing is in front of it
+            yield light[..., d, :, :, :], torch.ones_like(mask) if d == 0 else mask
+        else:
+            cover = mask.expand(*light.shape[:-4], *mask.shape[-3:])
+            parts = _filled(torch.cat([light[..., d, :, :, :], cover], -3), known)
+            yield parts[..., :-1, :, :], torch.ones_like(cover) if d == 0 else parts[..., -1:, :, :]
+
+
+def _filled(values: Tensor, known: Tensor) -> Tensor:
+    """Values (..., K, H, W), of which pixels know a share (..., 1, H, W), over the share; unknown ones are averages.
+
+    Those are of the known pixels around, over a square twice as large for as long as it has none (Gortler et al., The
+    lumigraph, SIGGRAPH 1996), bilinear between the squares.
+    """
+    rows, columns = values.shape[-2:]
+    mean = safe_divide(values, known)
+    if max(rows, columns) == 1:
+        return mean
+    batch = torch.cat([values, known.expand(*values.shape[:-3], 1, rows, columns)], -3)
+    pooled = torch.nn.functional.avg_pool2d(
+        batch.reshape(-1, *batch.shape[-3:]), 2, ceil_mode=True, count_include_pad=False
+    )
+    pooled = pooled.reshape(*batch.shape[:-2], *pooled.shape[-2:])
+    coarse = _filled(pooled[..., :-1, :, :], pooled[..., -1:, :, :])
+    how = {"size": (rows, columns), "mode": "bilinear", "align_corners": False}
+    around = torch.nn.functional.interpolate(coarse.reshape(-1, *coarse.shape[-3:]), **how).reshape(values.shape)
+    return around + _sure(known) * (mean - around)
+
+
+def _sure(known: Tensor) -> Tensor:
+    """Weights of values that pixels know to a share, 1 but for the smallest shares."""
+    return known * (1 + _LITTLE) / (known + _LITTLE)
 
 
 def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tensor:

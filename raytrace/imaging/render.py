@@ -25,10 +25,13 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.illumination import relative_illumination
+from raytrace.budget import OverBudget, afford
 from raytrace.imaging.field_kernels import (
     FieldKernels,
+    WindowTooLarge,
     along,
     by_angle,
+    channel_moments,
     check_model,
     field_kernels,
     order_of,
@@ -36,14 +39,19 @@ from raytrace.imaging.field_kernels import (
     warn_of_dark_places,
     window_size,
 )
-from raytrace.imaging.image import as_picture, blur, depth_masks, occlusion
+from raytrace.imaging.image import as_picture, blur, depth_masks, extended_layers, occlusion
 from raytrace.imaging.sensor import Sensor
+from raytrace.imaging.spectral_response import band
 from raytrace.imaging.varying_blur import bilinear, varying_blur
-from raytrace.io.pictures import write_picture
+from raytrace.imaging.warp import resampled
+from raytrace.io.pictures import write_light, write_picture
+from raytrace.materials.glass import OutOfRange
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
-from raytrace.system.lens import Lens, field_points, is_round_about_axis
+from raytrace.psf_models.dft import TooManyPoints
+from raytrace.system.lens import Lens, check_media, field_points, is_round_about_axis, with_wavelengths
+from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order
 from raytrace.wave_optics.compute import COLOURS, DESIGN
@@ -59,8 +67,21 @@ _RADII = 257  # at which the chief rays of a round lens are traced
 _COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
 _ROUNDS = 4
 _PLANES = 8
-#: Shares of the tolerance: of the PSF model, of the interpolation between nodes and of low rank.
-_MODEL, _BETWEEN, _LOW_RANK = 0.3, 0.5, 0.2
+_AZIMUTHS, _BISECTIONS = 64, 20  # at which the edge of the image circle of other lenses is searched
+_WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
+_WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
+_BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
+_COPIES = 6  # of the kernels and of the image, which are in memory together
+#: Shares of the tolerance: of the PSF model, of the wavelengths, of the interpolation between nodes and of low rank.
+_MODEL, _SPECTRUM, _BETWEEN, _LOW_RANK = 0.2, 0.1, 0.5, 0.2
+#: What the kernels of each PSF model leave out.
+_NEGLECTED = {
+    "paraxial": "aberrations and diffraction",
+    "fourier": "aberrations",
+    "gaussian": "the shape of the blur, a Gaussian as wide, and diffraction",
+    "drt": "diffraction",
+    "wave": "nothing of the wavefront",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +92,9 @@ class ImageFormation:
     a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
-    middle of a cell, the mean over the cells; nan of requested nodes; order: of the model; haze: (D, C), of elements
+    middle of a cell, the mean over the cells; nan of requested nodes; model, order: of the PSF; reason: for the model;
+    wavelengths: (W,) µm; lit: (H, W), pixels at which a chief ray and light arrive, or None for all; sampling: pixels
+    of the picture in one of the sensor, along a side: these numbers are of the finer ones; haze: (D, C), of elements
     alone, the light beyond the window of the kernels, which is spread evenly over the image, or None.
     """
 
@@ -82,8 +105,13 @@ class ImageFormation:
     ideal: Tensor | None
     planes: Tensor
     error: float
+    model: str
     order: int
     tol: float
+    wavelengths: Tensor
+    reason: str = ""
+    lit: Tensor | None = None
+    sampling: int = 1
     haze: Tensor | None = None
 
     def __call__(
@@ -91,56 +119,83 @@ class ImageFormation:
         picture: Tensor,
         depth: Tensor | None = None,
         *,
+        background: Tensor | None = None,
         softness: float = 0.0,
         boundary: str = "reflect",
         progress: Callable[[int, int], object] | None = None,
     ) -> Tensor:
         """Images (..., C, H, W) of pictures (..., C, H, W), noise-free; depth: (..., H, W) mm; others: see `render`."""
-        picture = checked_picture(picture, self.sensor)
+        picture = checked_picture(picture, self.sensor, self.sampling)
+        background = None if background is None else checked_picture(background, self.sensor, self.sampling)
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
         depth = None if depth is None else checked_depth(depth, picture)
-        return self.image_of(picture, depth, softness=softness, boundary=boundary, progress=progress)
+        how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
+        return self.image_of(picture, depth, **how)
 
     def image_of(
         self,
         picture: Tensor,
         depth: Tensor | None,
         *,
+        background: Tensor | None,
         softness: float,
         boundary: str,
         progress: Callable[[int, int], object] | None,
     ) -> Tensor:
-        """The same of a picture and a depth map that are checked."""
-        inverse = None if depth is None else 1 / depth
-        if self.ideal is not None:
-            picture = resampled(picture, self.ideal, boundary)
-            if inverse is not None:  # the mean of two depths is that of no object
-                inverse = resampled(inverse[..., None, :, :], self.ideal, boundary, mode="nearest")[..., 0, :, :]
-        blurs = 1 if inverse is None else 2 * len(self.planes)
+        """The same of a picture, a depth map and a background that are checked."""
+        image = self._on_fine_pixels(picture, depth, background, softness, boundary, progress)
+        return binned(image, self.sampling)
+
+    def _on_fine_pixels(
+        self,
+        picture: Tensor,
+        depth: Tensor | None,
+        background: Tensor | None,
+        softness: float,
+        boundary: str,
+        progress: Callable[[int, int], object] | None,
+    ) -> Tensor:
+        def warped(part: Tensor) -> Tensor:
+            return part if self.ideal is None else resampled(part, self.ideal, boundary)
+
+        blurs = 1 if depth is None else 2 * len(self.planes)
         each = None if progress is None else _of_several(progress, blurs)
         how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": each}
         flux = [enlarged(part, picture) for part in self.flux]
+        flux = flux if self.lit is None else [part * self.lit for part in flux]
         window, haze = [1.0] * len(self.planes), 0.0
         if self.haze is not None:
             share = self.haze.to(picture)[..., None, None]
             window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
-        if inverse is None:
-            return window[0] * varying_blur(flux[0] * picture, self.kernels[:, :, 0], **how) + haze
+        if depth is None:
+            return window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
-        planes = self.planes.to(inverse)
+        shade = shade if self.lit is None else torch.where(self.lit, shade, 1.0)
+        planes = self.planes.to(depth)
         step = float(planes.diff().min()) if len(planes) > 1 else 0.0
-        masks = depth_masks(inverse, planes, softness=softness * step)
+        masks = depth_masks(1 / depth, planes, softness=softness * step)
+        # Light and mask of a layer are distorted alike: pixels at the edge of an object see a share of it.
+        parts = warped(torch.cat([masks[..., None, :, :] * picture[..., None, :, :, :], masks[..., None, :, :]], -3))
+        behind = None if background is None else warped(background)
 
         def layers():
-            for d, mask in enumerate(masks.unbind(-3)):
-                cover = flux[d] * mask[..., None, :, :]
+            each = extended_layers(parts[..., :-1, :, :], parts[..., -1, :, :], behind)
+            for d, (light, cover) in enumerate(each):
                 light, coverage = (
-                    varying_blur(part, self.kernels[:, :, d], **how) for part in (cover * picture, cover / shade)
+                    varying_blur(flux[d] * part, self.kernels[:, :, d], **how) for part in (light, cover / shade)
                 )
                 yield window[d] * light, coverage
 
         return occlusion(layers()) + haze
+
+
+def binned(image: Tensor, count: int) -> Tensor:
+    """The mean (..., H, W) of count × count pixels of images (..., count H, count W)."""
+    if count == 1:
+        return image
+    pooled = torch.nn.functional.avg_pool2d(image.reshape(-1, 1, *image.shape[-2:]), count)
+    return pooled.reshape(*image.shape[:-2], *pooled.shape[-2:])
 
 
 def _of_several(progress: Callable[[int, int], object], blurs: int) -> Callable[[int, int], None]:
@@ -157,15 +212,27 @@ def _of_several(progress: Callable[[int, int], object], blurs: int) -> Callable[
     return advance
 
 
-def checked_picture(picture: Tensor, sensor: Sensor) -> Tensor:
-    """Pictures (..., C, H, W) of the channels of the sensor. Raises ValueError for others."""
-    picture = as_picture(picture)
-    (columns, rows), channels = sensor.pixels, len(sensor.channels)
-    picture = picture[None] if picture.dim() == 2 else picture
-    if picture.dim() < 2 or picture.shape[-2:] != (rows, columns):
+def sampling_of(picture: Tensor, sensor: Sensor) -> int:
+    """Pixels of pictures (..., C, H, W) in one of the sensor, along a side. Raises ValueError for no whole number."""
+    (columns, rows), (height, width) = sensor.pixels, picture.shape[-2:]
+    count = height // rows
+    if (height, width) != (count * rows, count * columns) or not count:
         raise ValueError(
-            f"a picture of {picture.shape[-1]} × {picture.shape[-2]} pixels on a sensor of {columns} × {rows}: resize "
-            "it, or give the sensor its number of pixels"
+            f"a picture of {width} × {height} pixels on a sensor of {columns} × {rows}: resize it, or give the sensor "
+            "its number of pixels, or that over a whole number, by which the scene is then sampled more finely"
+        )
+    return count
+
+
+def checked_picture(picture: Tensor, sensor: Sensor, sampling: int = 1) -> Tensor:
+    """Pictures (..., C, H, W) of the channels of the sensor, sampled so finely. Raises ValueError for others."""
+    picture = as_picture(picture)
+    channels = len(sensor.channels)
+    picture = picture[None] if picture.dim() == 2 else picture
+    rows, columns = picture.shape[-2:]
+    if sampling_of(picture, sensor) != sampling:
+        raise ValueError(
+            f"a picture of {columns} × {rows} pixels for a lens prepared for {sampling} × {sampling} of them in a pixel"
         )
     if picture.shape[-3] not in (1, channels):
         raise ValueError(
@@ -200,6 +267,7 @@ def optics(
     *,
     elements: Element | Sequence[Element] = (),
     model: str | None = None,
+    wavelengths: Sequence[float] | Tensor | None = None,
     object_distances: Tensor | None = None,
     tol: float = 1e-2,
     distortion: bool = True,
@@ -208,17 +276,23 @@ def optics(
     nodes: tuple[int, int] | None = None,
     order: int | None = None,
     size: int | None = None,
+    sampling: int = 1,
 ) -> ImageFormation:
     """Prepare a lens and its sensor for `ImageFormation.__call__`; arguments as for `render`.
 
     elements: at the stop; of elements alone the lens is `wave_optics.hybrid.stop_alone`. object_distances: (D,) mm of
     layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
-    needs; order, size: of the PSF model and of its window, as of an earlier call, for loops.
+    needs; order, size: of the PSF model and of its window, as of an earlier call, for loops; sampling: pixels of the
+    pictures in one of the sensor, along a side.
     """
-    elements = in_contact(elements)
-    model = model or ("wave" if elements else "gaussian")
-    if model not in MODELS:
+    elements, whole = in_contact(elements), sensor
+    if sampling > 1:
+        sensor = dataclasses.replace(sensor, pixels=tuple(sampling * count for count in sensor.pixels), mosaic="none")
+    if model not in (None, *MODELS):
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    if order is not None and model is None and not elements:
+        raise ValueError(f"order {order} of no model: give model=…, one of {', '.join(MODELS)}")
+    model = model or ("wave" if elements else None)
     check_model(model, elements)
     like = lens.surfaces[-2].thickness
     lens = lens if object_distances is None else by_angle(lens)
@@ -226,23 +300,225 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
-    corners = _places(sensor, 5, 5, like)
+    circle = None if is_stop_alone(lens) else _image_circle(lens, sensor, like)
+    corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     how = {"lateral_colour": lateral_colour, "elements": elements}
-    chosen = size or window_size(lens, sensor, model, corners, distances, **how, tol=tol)
-    if order is None:
-        order = order_of(lens, sensor, model, corners[:, ::6], distances, chosen, _MODEL * tol, elements=elements)
-    kernels, haze = field_kernels(lens, sensor, model, order, chosen, distances, weights, **how), None
+    if wavelengths is not None:
+        lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
+    elif sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
+        lens = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
+    chosen, reason = _model_of(lens, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
+    model, order, size = chosen
+    _afford_kernels((3, 3) if nodes is None else nodes, len(distances), weights, size, sensor)
+    kernels, haze = field_kernels(lens, sensor, model, order, size, distances, weights, **how), None
     if isinstance(kernels, FieldKernels):
-        grid, error = _grid(kernels, sensor, nodes, _BETWEEN * tol, like)
+        grid, error = _grid(kernels, circle, nodes, _BETWEEN * tol, like)
     else:
         light = kernels.light()
         grid, haze, error = kernels.of_light(light)[None, None], 1 - kernels.share(light), 0.0
     along_radii = is_round_about_axis(lens) and (illumination or distortion)
-    pixels = _every_pixel(sensor, like) if along_radii else None
-    shade = _illumination(lens, sensor, pixels, like) if illumination else None
-    ideal = _ideal(lens, sensor, pixels, like) if distortion and not is_stop_alone(lens) else None
-    return ImageFormation(sensor, grid, _flux(grid, shade, sensor), shade, ideal, planes, error, order, tol, haze)
+    pixels = _every_pixel(sensor, like) if along_radii or circle is not None else None
+    lit = None if circle is None else _is_lit(circle, pixels)
+    pixels = _within(circle, pixels) if along_radii else None
+    shade = _illumination(lens, sensor, circle, pixels, like) if illumination else None
+    ideal = _ideal(lens, sensor, circle, pixels, like) if distortion and not is_stop_alone(lens) else None
+    flux = _flux(grid, shade, sensor)
+    shade = shade if lit is None or shade is None else shade * lit
+    return ImageFormation(
+        whole, grid, flux, shade, ideal, planes, error, model, order, tol, lens.wavelengths.detach(), reason, lit,
+        sampling, haze,
+    )  # fmt: skip
+
+
+def _diagonal(lens: Lens, sensor: Sensor) -> Tensor:
+    """Places (2, N) mm on the diagonal: on one half of it where the other is its image."""
+    half = is_round_about_axis(lens) and not any(sensor.offset)
+    shares = (0.0, 0.5, 1.0) if half else (-1.0, -0.5, 0.0, 0.5, 1.0)
+    return sensor.on_diagonal(shares).to(lens.surfaces[-2].thickness)
+
+
+@torch.no_grad()
+def _over_response(
+    lens: Lens, sensor: Sensor, places: Tensor, distances: Tensor, lateral_colour: bool, tol: float
+) -> Lens:
+    """The lens at as many equidistant wavelengths over the response as the kernels of the channels need.
+
+    The error of a number is the change of the channels' Gaussian kernels to about 1.5 times as many: of a shift d and a
+    difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². Warns NotConverged.
+    """
+    sensor.weights(lens.wavelengths)  # a lens of another band is an error
+    before = None
+    for count in _WAVELENGTHS:
+        sampled = _at_wavelengths(lens, *band(sensor.response), count)
+        mean, variance = channel_moments(sampled, sensor, places, distances, lateral_colour=lateral_colour)
+        if before is not None:
+            square = variance + sensor.pitch**2 / 12
+            shift, wider = mean - before[1], variance - before[2]
+            change = math.sqrt(2 / math.pi) * shift.abs() / square.sqrt()
+            change = float((change + math.sqrt(2 / (math.pi * math.e)) * wider.abs() / square).max())
+            if change <= tol:
+                return before[0]
+        before = sampled, mean, variance
+    message = (
+        f"the kernels of {len(sampled.wavelengths)} wavelengths over the response of the sensor have an estimated "
+        f"error of {change:.1e}, above {tol:.1e}"
+    )
+    warnings.warn(message, NotConverged, stacklevel=calling_level())
+    return sampled
+
+
+def _at_specified(lens: Lens, wavelengths: Tensor) -> Lens:
+    """The lens at wavelengths (W,) µm, whose primary one, to which distortion refers, stays if it is among them."""
+    if torch.equal(wavelengths, lens.wavelengths):
+        return lens
+    same = torch.nonzero(wavelengths == lens.primary)[:, 0].tolist()
+    return dataclasses.replace(with_wavelengths(lens, wavelengths), primary_wavelength=1 + (same or [0])[0])
+
+
+def _at_wavelengths(lens: Lens, low: float, high: float, count: int) -> Lens:
+    """The lens at about so many equidistant wavelengths from low to high, µm, first the primary one."""
+    step, primary = (high - low) / count, float(lens.primary)
+    numbers = range(math.ceil((low - primary) / step), math.floor((high - primary) / step) + 1)
+    wavelengths = [lens.primary]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OutOfRange)  # at the ends, where the sensor hardly responds
+        for number in numbers:
+            try:
+                check_media(lens, lens.primary[None] + number * step)
+            except ValueError:
+                continue
+            wavelengths += [lens.primary + number * step] if number else []
+        return with_wavelengths(lens, torch.stack(wavelengths))
+
+
+def _model_of(
+    lens: Lens,
+    sensor: Sensor,
+    model: str | None,
+    order: int | None,
+    size: int | None,
+    corners: Tensor,
+    diagonal: Tensor,
+    distances: Tensor,
+    weights: Tensor,
+    tol: float,
+    how: dict,
+) -> tuple[tuple[str, int, int], str]:
+    """Model, order and window of the kernels, and the reason for the model.
+
+    Without a model: the first one of the ladder of `psf_models` that traces rays whose kernels on the diagonal differ
+    from those of the next by less than the tolerance. Warns NotConverged where waves need too many rays.
+    """
+
+    def fitted(name: str) -> tuple[str, int, int]:
+        window = size or window_size(lens, sensor, name, corners, distances, **how, tol=tol)
+        if order is not None:
+            return name, order, window
+        about = lens, sensor, name, diagonal, distances, window, _MODEL * tol
+        return name, order_of(*about, elements=how["elements"]), window
+
+    if model is not None:
+        return fitted(model), ""
+    ring = 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))  # λN
+    airy, chosen, before = 1.22 * ring, None, None
+    with torch.no_grad():
+        for row in (row for row in MODELS.values() if row.is_rung and row.traces):
+            try:
+                if row.waves and chosen and (reach := 0.5 * chosen[2] * sensor.pitch / ring) > _WIDE:
+                    raise TooManyPoints(
+                        f"the rays reach {reach:.0f} λN from their middle, waves are tried up to {_WIDE:g}"
+                    )
+                rung = fitted(row.name)
+                kernels = field_kernels(lens, sensor, *rung, distances, weights, how["lateral_colour"]).at(diagonal)
+            except WindowTooLarge:  # the tails of a Gaussian, which rays and waves do not have
+                if row.name != "gaussian":
+                    raise
+                continue
+            except (TooManyPoints, OverBudget) as error:
+                # Of a point in the middle of a pixel: a circular pupil has 2/(π² R) of its light beyond R λN.
+                share = _BEYOND * ring / sensor.pitch
+                reason = f"{100 * share:.2g} % of the light of a point, or less"
+                if share > tol:
+                    message = f"{chosen[0]}: diffraction is left out, {reason}; {error}"
+                    warnings.warn(message, NotConverged, stacklevel=calling_level())
+                return chosen, reason
+            if chosen is not None:
+                gap = _apart(kernels, before)
+                if gap <= tol and (row.waves or sensor.pitch > 4 * airy):
+                    return chosen, f"{row.name} differs by {gap:.1e} of the light"
+                reason = f"{chosen[0]} differs by {gap:.1e} of the light"
+            chosen, before = rung, kernels
+    return chosen, reason
+
+
+def _apart(kernels: Tensor, others: Tensor) -> float:
+    """Largest Σ |h - ĥ| of kernels (..., h, w) in windows of any size with one middle."""
+    size = max(kernels.shape[-1], others.shape[-1])
+    padded = [torch.nn.functional.pad(one, [(size - one.shape[-1]) // 2] * 4) for one in (kernels, others)]
+    return float((padded[0] - padded[1]).abs().sum((-2, -1)).max())
+
+
+def _afford_kernels(nodes: tuple[int, int], count: int, weights: Tensor, size: int, sensor: Sensor) -> None:
+    """Raise OverBudget for kernels of `count` distances, or images, that memory does not hold."""
+    (m, n), channels = nodes, len(weights)
+    (columns, rows), each = sensor.pixels, _COPIES * weights.element_size()
+    what = f"kernels of {size} × {size} pixels at {m} × {n} places of the sensor need too much memory"
+    helps = "take a larger --tol or a smaller --sensor, or focus the lens (--size sets their window)"
+    afford(each * channels * count * m * n * size * size, what, helps=helps)
+    what = f"{columns} × {rows} pixels of {channels} channels need too much memory"
+    afford(each * channels * columns * rows, what, helps="take a picture of fewer pixels")
+
+
+def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Middle (2, 1) mm and radii (A,) mm of the image circle at equidistant azimuths, or None if it holds the sensor.
+
+    Outside no chief ray arrives, or no light. Of a round lens a single radius.
+    """
+    with torch.no_grad():
+        round_ = is_round_about_axis(lens)
+        middle = like.new_zeros(2, 1) if round_ else sensor.landing(lens, like.new_zeros(2, 1)).nan_to_num(0.0)
+        angle = torch.arange(1 if round_ else _AZIMUTHS, dtype=like.dtype, device=like.device)
+        angle = 2 * math.pi / len(angle) * angle
+        ray = torch.stack([torch.sin(angle), torch.cos(angle)])
+        inside, outside = (
+            torch.zeros_like(angle),
+            torch.hypot(*(sensor.corners.to(like) - middle)).max().expand(angle.shape),
+        )
+        if bool(_has_light(lens, sensor, middle + outside * ray).all()):
+            return None
+        for _ in range(_BISECTIONS):
+            radius = 0.5 * (inside + outside)
+            arrives = _has_light(lens, sensor, middle + radius * ray)
+            inside, outside = torch.where(arrives, radius, inside), torch.where(arrives, outside, radius)
+        return middle, inside
+
+
+def _has_light(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+    return _illumination_at(lens, sensor, points) > 0
+
+
+def _radius(circle: tuple[Tensor, Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances (...) of points (2, ...) from the middle of an image circle, and its radius in their directions."""
+    middle, radii_ = circle
+    x, y = points - middle.reshape(2, *(1,) * (points.dim() - 1))
+    turns = torch.atan2(x, y) / (2 * math.pi) % 1 * len(radii_)
+    left = turns.floor().long() % len(radii_)
+    part = turns - turns.floor()
+    return torch.hypot(x, y), (1 - part) * radii_[left] + part * radii_[(left + 1) % len(radii_)]
+
+
+def _is_lit(circle: tuple[Tensor, Tensor], points: Tensor) -> Tensor:
+    distance, radius = _radius(circle, points)
+    return distance <= radius
+
+
+def _within(circle: tuple[Tensor, Tensor] | None, points: Tensor) -> Tensor:
+    """Points (2, ...) mm, those outside the image circle moved to its edge, towards its middle."""
+    if circle is None:
+        return points
+    (distance, radius), middle = _radius(circle, points), circle[0].reshape(2, *(1,) * (points.dim() - 1))
+    return middle + (points - middle) * (radius / distance.clamp_min(1e-9)).clamp_max(1.0)
 
 
 def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) -> Tensor:
@@ -257,24 +533,34 @@ def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) ->
 
 
 def _grid(
-    kernels: FieldKernels, sensor: Sensor, nodes: tuple[int, int] | None, tol: float, like: Tensor
+    kernels: FieldKernels,
+    circle: tuple[Tensor, Tensor] | None,
+    nodes: tuple[int, int] | None,
+    tol: float,
+    like: Tensor,
 ) -> tuple[Tensor, float]:
     """Kernels (m, n, D, C, h, w) at as many nodes as the tolerance needs, and the error of their interpolation.
 
-    The error is that in the middle of a cell, where four kernels are averaged, the mean over the cells.
+    The error is that in the middle of a cell, where four kernels are averaged, the mean over the cells. Nodes outside
+    the image circle have the kernels of its edge. Raises OverBudget.
     """
+    sensor = kernels.sensor
+
+    def at(*about: float) -> Tensor:
+        return kernels.at(_within(circle, _places(sensor, *about)))
+
     if nodes is not None:
-        return kernels.at(_places(sensor, *nodes, like)).unflatten(0, nodes), math.nan
+        return at(*nodes, like).unflatten(0, nodes), math.nan
     columns, rows = sensor.pixels
     longer = max(columns, rows)
     count = 3
     with torch.no_grad():
-        at = kernels.at
         while True:
             m, n = (max(2, round((count - 1) * side / longer) + 1) for side in (rows, columns))
-            grid = at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+            _afford_kernels((m, n), len(kernels.object_distances), kernels.weights, kernels.size, sensor)
+            grid = at(m, n, like).unflatten(0, (m, n))
             mean = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-            middle = at(_places(sensor, m, n, like, 0.5)).unflatten(0, (m - 1, n - 1))
+            middle = at(m, n, like, 0.5).unflatten(0, (m - 1, n - 1))
             error = float((mean - middle).abs().sum((-2, -1)).amax((2, 3)).mean())
             if error <= tol or count >= _MOST_NODES:
                 break
@@ -284,7 +570,7 @@ def _grid(
         message = f"the kernels between {m} × {n} nodes have an estimated error of {error:.1e}, above {tol:.1e}"
         warnings.warn(message, NotConverged, stacklevel=calling_level())
     if torch.is_grad_enabled():
-        grid = at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+        grid = at(m, n, like).unflatten(0, (m, n))
     return grid, error
 
 
@@ -330,12 +616,17 @@ def enlarged(light: Tensor, picture: Tensor) -> Tensor:
     return torch.nn.functional.interpolate(light.to(picture)[None], **how)[0]
 
 
-def _illumination(lens: Lens, sensor: Sensor, pixels: Tensor | None, like: Tensor) -> Tensor:
-    """Relative illumination (H, W) of the pixels; 0 where no chief ray arrives. pixels: places of a round lens."""
+def _illumination(
+    lens: Lens, sensor: Sensor, circle: tuple[Tensor, Tensor] | None, pixels: Tensor | None, like: Tensor
+) -> Tensor:
+    """Relative illumination (H, W) of the pixels, outside the image circle that of its edge.
+
+    pixels: places of a round lens within the circle.
+    """
     if pixels is not None:
         nodes = radii(pixels, _LIT)
         return along(nodes, _illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), pixels)
-    grid = _illumination_at(lens, sensor, _places(sensor, _FIT, _FIT, like)).reshape(_FIT, _FIT)
+    grid = _illumination_at(lens, sensor, _within(circle, _places(sensor, _FIT, _FIT, like))).reshape(_FIT, _FIT)
     across, down = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
     return down.T @ grid @ across
 
@@ -347,17 +638,21 @@ def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     return torch.where(arrives & ~values.isnan(), values, 0.0)
 
 
-def _ideal(lens: Lens, sensor: Sensor, pixels: Tensor | None, like: Tensor) -> Tensor:
+def _ideal(
+    lens: Lens, sensor: Sensor, circle: tuple[Tensor, Tensor] | None, pixels: Tensor | None, like: Tensor
+) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
     The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, whose pixels are given,
-    linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays.
+    linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays. Outside the image circle the
+    displacement is in proportion to the radius, or that of the edge.
     """
     if pixels is not None:
         nodes = radii(pixels, _RADII)
         image = _paraxial_image(lens, sensor, torch.stack([torch.zeros_like(nodes[1:]), nodes[1:]]))[1] / nodes[1:]
-        return sensor.pixel_of(along(nodes, torch.cat([torch.ones_like(image[:1]), image]), pixels) * pixels)
-    points = _places(sensor, _FIT, _FIT, like)
+        scale = along(nodes, torch.cat([torch.ones_like(image[:1]), image]), pixels)
+        return sensor.pixel_of(scale * _every_pixel(sensor, like))
+    points = _within(circle, _places(sensor, _FIT, _FIT, like))
     shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
     columns, rows = sensor.pixels
     row, column = (_chebyshev(count, _FIT, like) for count in (rows, columns))
@@ -395,25 +690,6 @@ def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
     return sensor.points(column, row)
 
 
-def resampled(picture: Tensor, places: Tensor, boundary: str, mode: str = "bicubic") -> Tensor:
-    """Pictures (..., C, H, W) at columns and rows (2, H, W).
-
-    mode: "bicubic", cubic convolution (Keys, IEEE Trans. ASSP 29, 1153 (1981)) that is exact of ramps, or "nearest".
-    boundary: "reflect" repeats the border pixel in a mirror, others continue by 0.
-    """
-    rows, columns = picture.shape[-2:]
-    if mode == "bicubic":
-        # The cubic of torch, of a = -3/4, gives ½ + u³ + ¾u of a ramp at ½ + u between two pixels: solved for u.
-        part = places - places.floor()
-        places = places.floor() + 0.5 + torch.sinh(torch.asinh(4 * part - 2) / 3)
-    size = places.new_tensor([columns, rows])[:, None, None]
-    grid = ((2 * places + 1) / size - 1).movedim(0, -1).to(picture.dtype)
-    stack = picture.reshape(1, -1, rows, columns)
-    beyond = "reflection" if boundary == "reflect" else "zeros"
-    how = {"mode": mode, "align_corners": False, "padding_mode": beyond}
-    return torch.nn.functional.grid_sample(stack, grid[None], **how).reshape(picture.shape)
-
-
 def render(
     lens: Lens | Element | Sequence[Element],
     picture: Tensor,
@@ -423,6 +699,7 @@ def render(
     sensor_distance: float | Tensor | None = None,
     wavelengths: Sequence[float] | Tensor | None = None,
     depth: Tensor | None = None,
+    background: Tensor | None = None,
     model: str | None = None,
     tol: float = 1e-2,
     planes: int = _PLANES,
@@ -437,21 +714,27 @@ def render(
     """The picture that a lens projects onto its sensor, without noise, differentiable in the numbers of the lens.
 
     lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
-        or of `depth`; wavelengths: (W,) µm of theirs, by default 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
+        or of `depth`.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
-    sensor: its pixels are those of the picture; by default of the size that the largest field of the lens fills to its
-        corners, one channel, or "rgb" of three.
+    sensor: its pixels are those of the picture, or k × k of them, by which the scene is then sampled more finely; by
+        default of the size that the largest field of the lens fills to its corners, one channel, or "rgb" of three.
+    wavelengths: (W,) µm; of a sensor with a response by default as many over it as `tol` needs, else, and where the
+        lens has a single one, those of the lens; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
         equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
         layers, a logistic function of so large a share of the difference of their reciprocal distances.
+    background: a picture of the farthest layer without the objects in front of it, which a blurred silhouette shows;
+        by default every layer continues behind nearer ones as its visible surroundings do.
     elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
-    model: of the PSF, see `rt.psf`, by default "gaussian"; with elements "wave".
-    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|; size: pixels across their window, an odd
-        number, by default as many as hold the light.
+    model: of the PSF, see `rt.psf`; by default the first of "gaussian", "drt" and "wave" whose kernels differ from
+        those of the next by less than `tol`; with elements "wave".
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice that of a picture from 0 to 1; size:
+        pixels across their window, an odd number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call, and their total.
-    Raises ValueError for a picture, depth map or sensor that do not fit, WindowTooLarge for a blur of over 401 pixels.
+    Raises ValueError for a picture, depth map or sensor that do not fit, WindowTooLarge for a blur of over 401 pixels,
+    OverBudget for kernels that memory does not hold.
     """
     light = linearised(picture)
     light = light[None] if light.dim() == 2 else light
@@ -459,19 +742,24 @@ def render(
         if elements:
             raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
         lens, elements = element_in_stop(lens, sensor, sensor_distance, wavelengths), lens
-    elif sensor_distance is not None or wavelengths is not None:
-        raise ValueError("a lens has a sensor distance and wavelengths: give lens.at(sensor_distance=…, wavelengths=…)")
+        wavelengths = None
+    elif sensor_distance is not None:
+        raise ValueError("a lens has a sensor distance: give lens.at(sensor_distance=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
-    light, distances = checked_picture(light, sensor), None
+    sampling, distances = sampling_of(light, sensor), None
+    light = checked_picture(light, sensor, sampling)
     if depth is not None:
         depth = checked_depth(depth, light)
         distances = 1 / plane_distances(depth.double(), planes)
+    elif background is not None:
+        raise ValueError("a background without a depth map: give depth, which says what lies in front of it")
+    background = None if background is None else checked_picture(linearised(background), sensor, sampling)
     ready = optics(
-        lens, sensor, elements=elements, model=model, object_distances=distances, tol=tol, distortion=distortion,
-        lateral_colour=lateral_colour, illumination=illumination, size=size,
+        lens, sensor, elements=elements, model=model, wavelengths=wavelengths, object_distances=distances, tol=tol,
+        distortion=distortion, lateral_colour=lateral_colour, illumination=illumination, size=size, sampling=sampling,
     )  # fmt: skip
-    image = ready.image_of(light, depth, softness=softness, boundary=boundary, progress=progress)
-    return Rendering(image, light, lens, ready)
+    how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
+    return Rendering(ready.image_of(light, depth, **how), binned(light, sampling), lens, ready)
 
 
 def element_in_stop(
@@ -632,7 +920,7 @@ class Rendering(Result):
     """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
 
     picture: the same of the ideal lens; optics: the lens and its sensor, for more pictures: `optics(picture)`.
-    `save` writes .png: the levels of sRGB of a single image, 8 bits.
+    `save` writes .png, .tif and .npy of a single image.
     """
 
     image: Tensor
@@ -644,69 +932,112 @@ class Rendering(Result):
         self,
         picture: Tensor,
         depth: Tensor | None = None,
-        *,
-        softness: float = 0.0,
-        boundary: str = "reflect",
-        progress: Callable[[int, int], object] | None = None,
+        **options,
     ) -> Self:
-        """The rendering of another picture of the same size by the same optics; arguments as for `render`."""
-        light = checked_picture(linearised(picture), self.optics.sensor)
-        image = self.optics(light, depth, softness=softness, boundary=boundary, progress=progress)
-        return dataclasses.replace(self, image=image, picture=light)
+        """The rendering of another picture of the same size by the same optics.
 
-    def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """With the noise, the quantisation and the Bayer mosaic of the sensor, whose missing colours are interpolated.
+        options: background, softness, boundary, progress, as for `render`.
+        """
+        ready = self.optics
+        light = checked_picture(linearised(picture), ready.sensor, ready.sampling)
+        image = ready(light, depth, **options)
+        return dataclasses.replace(self, image=image, picture=binned(light, ready.sampling))
+
+    def recorded(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """With the noise, the quantisation and the Bayer mosaic (..., 1, H, W) of the sensor: raw.
 
         index, seed: of the noise, see `Sensor.capture`.
         """
-        sensor = self.optics.sensor
-        recorded = sensor.capture(self.image, index, seed)
-        return dataclasses.replace(self, image=sensor.demosaic(recorded))
+        return dataclasses.replace(self, image=self.optics.sensor.capture(self.image, index, seed))
 
-    def save(self, path: str | PathLike) -> None:
-        """Write the image of one or three channels as .png of 8 bits, as sRGB levels; .json as other results."""
-        if Path(path).suffix.lower() != ".png":
+    def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """As `recorded`, the missing colours of the mosaic interpolated."""
+        recorded = self.recorded(index, seed)
+        return dataclasses.replace(recorded, image=self.optics.sensor.demosaic(recorded.image))
+
+    def save(self, path: str | PathLike, bits: int = 8) -> None:
+        """Write a single image of one or three channels.
+
+        .png: sRGB levels of 8 or 16 bits; .tif: light, 32-bit floating-point numbers; .npy: light (C, H, W), an array;
+        .json as other results.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix not in (".png", ".tif", ".npy"):
             return super().save(path)
         image = self.image.detach()
         if image[..., 0, 0].numel() not in (1, 3):
             raise ValueError(f"{path}: an image of shape {tuple(image.shape)}; expected one, of one or three channels")
-        write_picture(path, array(encoded(image.reshape(-1, *image.shape[-2:]))))
+        image = image.reshape(-1, *image.shape[-2:])
+        if suffix == ".png":
+            write_picture(path, array(encoded(image)), bits)
+        else:
+            write_light(path, array(image))
 
     def text(self) -> list[str]:
         ready = self.optics
         columns, rows = ready.sensor.pixels
         m, n, depths = ready.kernels.shape[:3]
+        names, count = ", ".join(ready.sensor.channels), len(ready.wavelengths)
+        if count == 1 and len(ready.sensor.channels) > 1:
+            names = f"all channels at the single wavelength of the lens, {float(ready.wavelengths[0]):.4g} µm"
         lines = [
-            f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, {', '.join(ready.sensor.channels)}",
+            f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, {names}",
             f"kernels of {ready.kernels.shape[-1]} × {ready.kernels.shape[-2]} pixels at {m} × {n} places"
-            + (f" and {depths} depths" if depths > 1 else ""),
+            + (f" and {depths} depths" if depths > 1 else "")
+            + (
+                f", {ready.sampling} × {ready.sampling} of these in a pixel of the sensor" if ready.sampling > 1 else ""
+            ),
+            f"PSF model {ready.model}, {count} wavelength{'s' * (count > 1)}; left out: {_NEGLECTED[ready.model]}"
+            + (f" ({ready.reason})" if ready.reason else ""),
         ]
         if math.isfinite(ready.error):
             lines.append(f"estimated error between the places {ready.error:.1e} of the light")
         if ready.haze is not None:
             lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.max()):.1f} %")
-        if ready.illumination is not None:
-            darkest = 100 * float(ready.illumination.min())
-            lines.append(f"illumination of the darkest pixel {darkest:.1f} % of that of the axis")
-        if ready.ideal is not None and max(rows, columns) > 1:
-            column, row = (array(part) for part in ready.ideal)
-            ideal = math.hypot(column[0, 0] - column[-1, -1], row[0, 0] - row[-1, -1])
-            longer = math.hypot(columns - 1, rows - 1) / ideal - 1
-            lines.append(f"distortion of the diagonal {100 * longer:+.2f} %")
+        if ready.lit is not None:
+            dark = 100 * (1 - float(ready.lit.double().mean()))
+            lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")
+        if (darkest := self._darkest()) is not None:
+            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of that of the axis")
+        if ready.ideal is not None and max(ready.ideal.shape[-2:]) > 1:
+            last, first = self._ends()
+            (column, row), ideal = last - first, ready.ideal[:, last[1], last[0]] - ready.ideal[:, first[1], first[0]]
+            longer = math.hypot(column, row) / math.hypot(*ideal.tolist()) - 1
+            lines.append(f"distortion of the diagonal{self._inside()} {100 * longer:+.2f} %")
         return lines
+
+    def _inside(self) -> str:
+        return "" if self.optics.lit is None else " inside the image circle"
+
+    def _darkest(self) -> float | None:
+        """Relative illumination of the darkest pixel in the image circle; None if it is left out or all is dark."""
+        ready = self.optics
+        if ready.illumination is None or (ready.lit is not None and not bool(ready.lit.any())):
+            return None
+        return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).min())
+
+    def _ends(self) -> np.ndarray:
+        """Column and row (2, 2) of the last and the first pixel on the diagonal that light reaches."""
+        rows, columns = self.optics.ideal.shape[-2:]
+        steps = np.linspace(0, 1, max(rows, columns))
+        places = np.stack([(columns - 1) * steps, (rows - 1) * steps], 1).round().astype(int)
+        lit = None if self.optics.lit is None else array(self.optics.lit)[places[:, 1], places[:, 0]]
+        places = places if lit is None or lit.sum() < 2 else places[lit]
+        return places[[-1, 0]]
 
     def __str__(self) -> str:
         return "\n".join(self.text())
 
     def document(self) -> dict:
         ready = self.optics
-        darkest = None if ready.illumination is None else float(ready.illumination.min())
         return {
             "lens": self.lens.name,
             "sensor": {"size": list(ready.sensor.size), "pixels": list(ready.sensor.pixels)},
             "kernels": list(ready.kernels.shape),
+            "model": ready.model,
+            "wavelengths": ready.wavelengths.tolist(),
             "error": plain(ready.error),
-            "darkest": darkest,
+            "darkest": self._darkest(),
         }
 
     @styled

@@ -30,6 +30,7 @@ from raytrace.words import named_value
 #: Colours of the pixels (0, 0), (1, 0), (0, 1), (1, 1), as (column, row), of Bayer patterns.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 _SQUARE = 1e-6  # relative difference of the pitches that rounded sizes leave
+_BLACK = 5.0  # standard deviations of the read noise
 _NOISE, _PATCH = 4, 5  # last numbers of keys; `pictures` has those below
 
 
@@ -46,6 +47,8 @@ class Sensor:
     full_well: electrons at level 1, where pixels saturate; None: no shot noise.
     read_noise: standard deviation in electrons; without a full well a fraction of level 1.
     bits: of the quantisation; None: continuous levels.
+    black_level: offset of the quantisation, in the unit of the read noise: the 2^bits levels reach from -black_level to
+        the full well, so that the noise of dark pixels keeps its mean and variance; None: five times the read noise.
 
     The centre of pixel (column c, row r), counted from 0, is at
 
@@ -63,6 +66,7 @@ class Sensor:
     read_noise: float = 0.0
     bits: int | None = None
     offset: tuple[float, float] = (0.0, 0.0)
+    black_level: float | None = None
 
     def __post_init__(self):
         for name, kind, expected in (
@@ -104,6 +108,8 @@ class Sensor:
                 f"read_noise {self.read_noise:g} without a full well is a fraction of level 1: expected less than 1; "
                 "for electrons give full_well=…"
             )
+        if self.black_level is not None and not 0 <= self.black_level < math.inf:
+            raise ValueError(f"black_level {self.black_level!r}: expected 0 or more, in the unit of the read noise")
         if self.bits is not None and (self.bits != int(self.bits) or not 1 <= self.bits <= 32):
             raise ValueError(f"bits {self.bits!r}: expected a whole number from 1 to 32; None for continuous levels")
 
@@ -270,8 +276,8 @@ class Sensor:
 
         In this order: mosaic; shot noise, Poisson (`count_electrons`), or, where a derivative by the irradiance may be
         requested, its Gaussian approximation with its derivative (`add_shot_noise`); read noise; saturation at 1;
-        quantisation (`digitise`), which the derivative ignores and which cuts levels below 0. Without bits levels below
-        0 remain, and the noise has a mean of 0. Raises ValueError.
+        quantisation (`digitise`) from -black_level on, which the derivative ignores. Dark pixels have a mean of 0:
+        levels below 0 remain, to -black_level with bits. Raises ValueError.
         """
         picture = as_picture(irradiance, "picture")
         self._check_channels(picture)
@@ -284,7 +290,16 @@ class Sensor:
             each = zip(picture.reshape(-1, *picture.shape[-3:]), index, strict=True)
             noisy = [self._noisy(one, _generator(seed, number, picture.device)) for one, number in each]
             picture = torch.stack(noisy).reshape(picture.shape)
-        return picture.clamp(max=1.0) if self.bits is None else digitise(picture, self.bits)
+        if self.bits is None:
+            return picture.clamp(max=1.0)
+        black = self.black
+        return (1 + black) * digitise((picture + black) / (1 + black), self.bits) - black
+
+    @property
+    def black(self) -> float:
+        """The black level relative to saturation."""
+        black = _BLACK * self.read_noise if self.black_level is None else self.black_level
+        return black / (self.full_well or 1.0)
 
     def _noisy(self, picture: Tensor, generator: torch.Generator) -> Tensor:
         """A picture (C, H, W) with shot and read noise."""

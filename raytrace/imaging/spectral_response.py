@@ -169,6 +169,12 @@ def channel_names(response: SpectralResponse | str | None) -> tuple[str, ...]:
     return _names(1) if response is None else _of(response).names
 
 
+def band(response: SpectralResponse | str) -> tuple[float, float]:
+    """The shortest and the longest wavelength, µm, at which a channel responds."""
+    low, high = zip(*_of(response).ranges(), strict=True)
+    return min(low), max(high)
+
+
 def channel_weights(response: SpectralResponse | str, wavelengths: Tensor) -> Tensor:
     """Sensitivities (C, W) at wavelengths (W,) µm, divided by their sum over the wavelengths.
 
