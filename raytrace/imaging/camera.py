@@ -34,7 +34,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
-from raytrace.imaging.field_kernels import check_model, is_sampled_in_common, order_of
+from raytrace.imaging.field_kernels import check_model, order_of
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.render import Rendering, element_in_stop, linearised, patch_kernels, render
 from raytrace.imaging.sensor import Sensor
@@ -44,6 +44,7 @@ from raytrace.maths.result import plain
 from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels
+from raytrace.psf_models.models import is_sampled_in_common
 from raytrace.psf_models.result import moments_of_rays
 from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points

@@ -26,6 +26,7 @@ from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import MODELS, NotConverged, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
+from raytrace.psf_models.models import is_sampled_in_common
 from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import field_of_object
@@ -489,11 +490,6 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
         sigma = (offset - mean).square().nanmean(-1).sqrt()
         reach = torch.maximum(reach, (mean[..., 0].abs() + _SIGMAS * sigma).nan_to_num(0.0).max())
     return float(reach)
-
-
-def is_sampled_in_common(lens: Lens, model: str) -> bool:
-    """Whether the sampling of a kernel depends on the others of a call: of DRT, and where apertures may clip one."""
-    return MODELS[model].in_common or any(surface.apertures for surface in lens.surfaces)
 
 
 def order_of(

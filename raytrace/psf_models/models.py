@@ -186,6 +186,11 @@ _ROWS = (
 MODELS = {row.name: row for row in _ROWS}
 
 
+def is_sampled_in_common(lens: Lens, model: str) -> bool:
+    """Whether the sampling of a kernel depends on the others of a call: of DRT, and where apertures may clip one."""
+    return MODELS[model].in_common or any(surface.apertures for surface in lens.surfaces)
+
+
 class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
