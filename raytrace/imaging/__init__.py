@@ -5,7 +5,7 @@
 | camera          | lens, sensor and network as one module                                                  |
 | variables       | of lenses and phase elements, thickness limits                                          |
 | image           | convolution with PSFs, layered scenes; noise and quantisation of the sensor             |
-| render          | pictures of a lens over its sensor; field_kernels, varying_blur, warp: its PSFs, blur and distortion |
+| render          | pictures over the sensor; field_kernels, varying_blur, warp: its PSFs, blur, distortion  |
 | sensor          | pixels and their field points, Bayer mosaic, capture; spectral_response: of its channels |
 | restoration     | linear filters (Wiener) and their errors in closed form                                 |
 | network         | RED-Net and a small U-Net                                                               |
