@@ -7,10 +7,11 @@ from pathlib import Path
 
 from raytrace.io import ImportReport, LensFileError, Substitute, read_lens_with_report
 from raytrace.io.source import Place
+from raytrace.io.zemax.tolerances import read_lines
 from raytrace.optimization.operands.operand import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
-from raytrace.system.lens import check_media
 from raytrace.tracing.geometry import defects
 
 
@@ -35,4 +36,13 @@ def check(
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
     check_media(lens, lens.wavelengths, where=str(path))
-    return dataclasses.replace(report, geometry=tuple(map(str, defects(lens))))
+    geometry = tuple(map(str, defects(lens)))
+    return dataclasses.replace(report, geometry=geometry, unread_tolerances=_unread_tolerances(lens))
+
+
+def _unread_tolerances(lens: Lens) -> tuple[str, ...]:
+    """The lines of tolerances that are not read, with the reason, or the first that the lens does not have."""
+    try:
+        return read_lines(lens, lens.optimization_data.tolerances).unread if lens.optimization_data else ()
+    except LensFileError as error:
+        return (str(error),)
