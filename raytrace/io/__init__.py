@@ -56,7 +56,6 @@ from raytrace.io.table import write as table_write
 from raytrace.io.zemax import archive as zemax_archive
 from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
-from raytrace.io.zemax.tolerances import read_lines
 from raytrace.materials.agf import write_agf
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
@@ -210,17 +209,8 @@ def read_lens_with_report(
         kept=tuple(map(str, data.kept)),
         operands=operand_uses(data.merit, evaluated),
         tolerances=len(data.tolerances),
-        unread_tolerances=_unread_tolerances(lens),
     )
     return lens, report
-
-
-def _unread_tolerances(lens: Lens) -> tuple[str, ...]:
-    """The lines of tolerances that are not read, with the reason, or the first that the lens does not have."""
-    try:
-        return read_lines(lens, lens.optimization_data.tolerances).unread if lens.optimization_data else ()
-    except LensFileError as error:
-        return (str(error),)
 
 
 def shipped_lens(name: str | os.PathLike) -> Path | None:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from raytrace.io import ImportReport, LensFileError, Substitute, read_lens_with_report
 from raytrace.io.source import Place
+from raytrace.io.zemax.tolerances import read_lines
 from raytrace.optimization.operands.operand import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
+from raytrace.system.lens import Lens, check_media, glass_on_image
 from raytrace.system.lens import check as check_lens
-from raytrace.system.lens import check_media, glass_on_image
 from raytrace.tracing.geometry import defects
 
 
@@ -37,8 +38,15 @@ def check(
     check_media(lens, lens.wavelengths, where=str(path))
     notes, image = report.notes, len(lens.surfaces) - 1
     if unused := glass_on_image(lens):
-        notes = (
-            *notes,
-            f"surface {image}: light does not enter {unused}, the glass of the image: results are in front of it",
-        )
-    return dataclasses.replace(report, notes=notes, geometry=tuple(map(str, defects(lens))))
+        note = f"surface {image}: light does not enter {unused}, the glass of the image: results are in front of it"
+        notes = (*notes, note)
+    geometry = tuple(map(str, defects(lens)))
+    return dataclasses.replace(report, notes=notes, geometry=geometry, unread_tolerances=_unread_tolerances(lens))
+
+
+def _unread_tolerances(lens: Lens) -> tuple[str, ...]:
+    """The lines of tolerances that are not read, with the reason, or the first that the lens does not have."""
+    try:
+        return read_lines(lens, lens.optimization_data.tolerances).unread if lens.optimization_data else ()
+    except LensFileError as error:
+        return (str(error),)
