@@ -376,6 +376,26 @@ def test_all_configurations_are_judged():
         assert float(found.nominal + found.maximum[k]) == pytest.approx((sum(squares) / 2) ** 0.5, rel=1e-4)
 
 
+def test_a_compensator_of_a_configuration_adjusts_it_alone():
+    """As CMCO: each configuration has its own sensor distance, so that each is at its best alone."""
+    lens = rt.read_lens("cooke_triplet").with_configurations(thickness={2: [12.93, 12.6], 7: [77.4, 77.0]})
+    place = next(k for k, operand in enumerate(lens.operands) if operand.number == 7)
+    rows = rt.Tolerance("thickness", (1,), -0.05, 0.05)
+    both = tuple(rt.Compensator(7, configuration=k + 1, operand=place) for k in range(2))
+    found = rt.tolerance(lens, rt.Tolerances((rows,), both), trials=4, rings=6)
+    alone = [
+        rt.tolerance(dataclasses.replace(each, operands=()), rt.Tolerances((rows,), (rt.Compensator(7),)), trials=4, rings=6)
+        for each in lens.configurations
+    ]  # fmt: skip
+    assert float(found.nominal) == pytest.approx(
+        math.hypot(*(float(each.nominal) for each in alone)) / 2**0.5, rel=1e-6
+    )
+    for k, each in enumerate(alone):
+        assert torch.allclose(found.changes[:, k], each.changes[:, 0], atol=1e-6)
+    with pytest.raises(rt.BadTolerance, match="2 operands in configurations 1 to 2"):
+        rt.tolerance(lens, rt.Tolerances((rows,), (rt.Compensator(7, configuration=3, operand=place),)), trials=0)
+
+
 def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
     """The same analysis by the lens, by its tolerances as read, and by the command."""
     lines = ["TOL TTHI 2 3 -0.05 0.05 0 0 0", "TOL TRAD 1 0 -0.1 0.1 0 0 0"]

@@ -29,7 +29,7 @@ from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, 
 from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
 from raytrace.system.sag_terms import with_powers
 from raytrace.system.surface import Surface, with_z_in_thicknesses
-from raytrace.system.tolerance_data import KINDS, MOST_TERM, Gauge, Tolerance
+from raytrace.system.tolerance_data import KINDS, MOST_TERM, Compensator, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
@@ -77,7 +77,7 @@ class Perturbation:
         values = [_per_lens(error) for error in errors.unbind(-1)]
         pairs = list(zip(rows, values, strict=True))
         gauges = _gauges(lens, pairs, self.wavelength, self.radii)
-        start = _with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
+        start = with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
         surfaces = list(start.surfaces)
         for row, value in pairs:
             _change(lens, surfaces, row, value, gauges)
@@ -318,8 +318,8 @@ def _pose(rows: Rows, k: int) -> Pose:
 # -- configurations ---------------------------------------------------------------------------------------------------
 
 
-def _with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]]) -> Lens:
-    """The lens with errors of operands of configurations."""
+def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Tensor]]) -> Lens:
+    """The lens with errors, or with changes of compensators, of operands of configurations."""
     for row, value in pairs:
         operand = lens.operands[row.operand]
         if value.dim() and any(isinstance(scaled.path[-1], tuple) for scaled in operand.paths):
@@ -333,7 +333,7 @@ def _with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]]) -> Len
     return lens
 
 
-def _raised(operand: configurations.Operand, row: Tolerance, value: Tensor) -> configurations.Operand:
+def _raised(operand: configurations.Operand, row: Tolerance | Compensator, value: Tensor) -> configurations.Operand:
     one = torch.zeros_like(operand.numbers)
     one[row.configuration - 1] = 1.0
     return dataclasses.replace(operand, numbers=_spread(operand.numbers, value) + _spread(one, value) * value)

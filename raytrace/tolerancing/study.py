@@ -16,12 +16,13 @@ from torch import Tensor
 
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
+from raytrace.system import configurations
 from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, light, size_of_image
-from raytrace.tolerancing.perturbation import Perturbation, path_of
+from raytrace.tolerancing.perturbation import Perturbation, path_of, with_operands
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
@@ -206,8 +207,11 @@ class Study:
 
     def scale_of_compensators(self) -> Tensor:
         """Steps (C,) of the differences by the compensators."""
-        steps = [1e-3 if one.parameter == "thickness" else 1e-6 for one in self.compensators]
-        return self.half.new_tensor(steps)
+        names = [
+            one.parameter if one.operand is None else self.lens.operands[one.operand].paths[0].path[-1]
+            for one in self.compensators
+        ]
+        return self.half.new_tensor([1e-3 if name == "thickness" else 1e-6 for name in names])
 
     def second_order(self) -> SecondOrder:
         """The second order of q, of the nominal lens with its best compensators."""
@@ -237,7 +241,8 @@ class Study:
 
 def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
     """Whether the distance of the sensor is all that is adjusted, and the beams do not depend on it."""
-    of_sensor = [(one.surface, one.parameter) for one in compensators] == [(sensor(lens), "thickness")]
+    adjusted = [(one.surface, one.parameter, one.operand) for one in compensators]
+    of_sensor = adjusted == [(sensor(lens), "thickness", None)]
     return of_sensor and lens.fields.kind != "real_image_height"
 
 
@@ -248,9 +253,13 @@ def is_plain_sensor(surface: Surface) -> bool:
 
 def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tensor) -> Lens:
     """The lens with compensators moved by (C,), or L lenses with those moved by (L, C)."""
+    pairs = [
+        (one, change.reshape(-1, 1, 1, 1) if change.dim() else change)
+        for one, change in zip(compensators, changes.unbind(-1), strict=True)
+    ]
+    lens = with_operands(lens, [pair for pair in pairs if pair[0].operand is not None])
     surfaces = list(lens.surfaces)
-    for one, change in zip(compensators, changes.unbind(-1), strict=True):
-        change = change.reshape(-1, 1, 1, 1) if change.dim() else change
+    for one, change in (pair for pair in pairs if pair[0].operand is None):
         surface = modelled(surfaces[one.surface], one.parameter)
         path = path_of(surface, one.parameter)
         surfaces[one.surface] = with_number(surface, path, number_at(surface, path) + change)
@@ -259,7 +268,13 @@ def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tenso
 
 def _check(lens: Lens, one: Compensator) -> None:
     if one.operand is not None:
-        raise BadTolerance(f"compensator {one}: operands of configurations are not adjusted; tolerance a configuration")
+        count = configurations.count(lens.operands)
+        if not 0 <= one.operand < len(lens.operands) or not 1 <= one.configuration <= count:
+            known = f"{len(lens.operands)} operands in configurations 1 to {count}"
+            raise BadTolerance(f"compensator {one}: this lens has {known}")
+        if lens.operands[one.operand].numbers is None:
+            raise BadTolerance(f"compensator {one}: {lens.operands[one.operand]} is no number")
+        return
     if not 0 <= one.surface < len(lens.surfaces) - 1:
         raise BadTolerance(f"compensator {one}: this lens has surfaces 0 to {len(lens.surfaces) - 2}")
     surface = lens.surfaces[one.surface]
