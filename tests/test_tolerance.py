@@ -383,13 +383,11 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
     rows = rt.Tolerance("thickness", (1,), -0.05, 0.05)
     both = tuple(rt.Compensator(7, configuration=k + 1, operand=place) for k in range(2))
     found = rt.tolerance(lens, rt.Tolerances((rows,), both), trials=4, rings=6)
-    alone = [
-        rt.tolerance(dataclasses.replace(each, operands=()), rt.Tolerances((rows,), (rt.Compensator(7),)), trials=4, rings=6)
-        for each in lens.configurations
-    ]  # fmt: skip
-    assert float(found.nominal) == pytest.approx(
-        math.hypot(*(float(each.nominal) for each in alone)) / 2**0.5, rel=1e-6
-    )
+    single = rt.Tolerances((rows,), (rt.Compensator(7),))
+    lenses = [dataclasses.replace(each, operands=()) for each in lens.configurations]
+    alone = [rt.tolerance(each, single, trials=4, rings=6) for each in lenses]
+    expected = math.hypot(*(float(each.nominal) for each in alone)) / 2**0.5
+    assert float(found.nominal) == pytest.approx(expected, rel=1e-6)
     for k, each in enumerate(alone):
         assert torch.allclose(found.changes[:, k], each.changes[:, 0], atol=1e-6)
     with pytest.raises(rt.BadTolerance, match="2 operands in configurations 1 to 2"):
