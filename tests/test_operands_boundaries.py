@@ -364,7 +364,7 @@ UNLIKE = {
 
 
 def test_semi_diameters_are_those_that_opticstudio_stored():
-    """136 of 143 automatic ones in 41 files to 1e-6."""
+    """137 of 144 automatic ones in 42 files to 1e-6."""
     if not (MERIT.exists() and CORPUS.exists()):
         pytest.skip("the files are in ../shared")
     paths = {
@@ -387,7 +387,7 @@ def test_semi_diameters_are_those_that_opticstudio_stored():
         close = [bool(abs(computed[k] - sizes[k][0]) <= max(1e-6 * sizes[k][0], 1e-9)) for k in follow]
         assert close.count(False) == UNLIKE.get(name, 0), name
         met, count, files = met + sum(close), count + len(close), files + 1
-    assert (met, count, files) == (136, 143, 41)
+    assert (met, count, files) == (137, 144, 42)
 
 
 # -- rows and the merit ------------------------------------------------------------------------------------------------

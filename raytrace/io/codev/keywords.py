@@ -68,7 +68,7 @@ POSE_TYPES = {"DAR": RETURNED, "BEN": BENT, "REV": REVERSED}
 
 
 SYSTEM_READ = {
-    *by_word({"": "RDM LEN TIT DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM"}),
+    *by_word({"": "RDM LEN TIT DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM AFI"}),
     *("PUX", "PUY", "PUI", *SYSTEM_APERTURES.values()),
     *(word for pair in FIELD_KINDS.values() for word in pair),
 }
@@ -117,7 +117,7 @@ REFUSED = by_word(
         "birefringent medium": "BIR OAX OAY OAZ",
         "numerical aperture in image space": "NA",
         "telecentric object space": "TEL",
-        "afocal image space": "AFC AFI",
+        "coefficients of an afocal lens": "AFC",
         "glass of one side of a surface": "GL1 GL2",
         "surface deformed by a file": "INT ISF",
         "command that puts in, takes out or turns round surfaces": "INS DEL FLY SCA COP MOV",

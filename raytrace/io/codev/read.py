@@ -132,6 +132,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
         notes=tuple(plain_text(record.text) for record in parts.comments if record.keyword == "NOTE"),
         catalogs=tuple(catalog_names),
         ray_aiming=_aiming(parts, report),
+        afocal=_afocal(system),
         sources={"stop": ("STO", stop), "aperture": aperture[2], "wavelengths": ("WL", source.place)},
     )
     for quantity, keyword in (("wavelength_weights", "WTW"), ("primary_wavelength", "REF")):
@@ -140,6 +141,15 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     lens = assemble(draft, file)
     _report_left_out(system, report)
     return lens
+
+
+def _afocal(system: Block) -> bool:
+    """AFI: whether image space is afocal; without a word, or with Y, it is."""
+    record = system.last("AFI")
+    answer = unquoted(record.words[0]).upper() if record and record.words else "Y"
+    if answer not in ("Y", "YES", "N", "NO"):
+        raise LensFileError(f"AFI {answer}: expected Y or N, whether image space is afocal", record.place)
+    return record is not None and answer.startswith("Y")
 
 
 def _unit(system: Block, report: Draft) -> float:

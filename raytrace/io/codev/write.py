@@ -81,6 +81,7 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         f"TITLE {_quoted(lens.name, 'the title', place)}" if lens.name else "",
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
+        "AFI Y" if lens.afocal else "",
         _wrapped(["WL", *waves]),
         f"REF {lens.primary_wavelength}",
         _wrapped(["WTW", *_weights(lens.wavelength_weights, "weight of a wavelength", place)]),

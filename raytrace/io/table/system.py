@@ -10,7 +10,8 @@
 # fields: angle 0 10 14          y of each point, or (x, y) (x, y) …; object height, paraxial image height,
                                  real image height
 # field weights: 1 1 1           vdx, vdy, vcx, vcy, van: vignetting factors, one per field
-# telecentric: yes
+# telecentric: yes                object space
+# afocal: yes                     image space
 # wavelengths: 0.4861 0.5876     µm, or with the unit: 587.6 nm
 # wavelength weights: 1 1
 # primary wavelength: 2          counted from 1
@@ -148,7 +149,7 @@ def fields(table: Table, unit: float) -> dict:
         "y": [length * y for _, y in points],
         "field_weights": _per_field(table, "field weights", len(points), 1.0),
         "vignetting": [_per_field(table, key, len(points), 0.0) for key in _VIGNETTING],
-        "telecentric": _choice(table, "telecentric", [*_NO, *_YES], "yes or no") in _YES,
+        **{key: _choice(table, key, [*_NO, *_YES], "yes or no") in _YES for key in ("telecentric", "afocal")},
     }
 
 
@@ -233,6 +234,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("field weights", listed(fields.weight, "weight of a field")),
         *((key, listed(row, "vignetting factor")) for key, row in vignetting),
         ("telecentric", "yes" if fields.telecentric else ""),
+        ("afocal", "yes" if lens.afocal else ""),
         ("wavelengths", listed(lens.wavelengths, "wavelength") + unit),
         ("wavelength weights", listed(lens.wavelength_weights, "weight")),
         ("primary wavelength", str(lens.primary_wavelength)),

@@ -24,7 +24,7 @@ from raytrace.io.table.columns import UNREAD, columns, is_header, order, squeeze
 #: Header keys, each with its further spellings; a note may occur more than once.
 _KEYS = (
     "title, name; note, notes; units, unit; ignore; object distance; stop, stop surface; aperture, system aperture"
-    "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; wavelengths, wavelength"
+    "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; afocal; wavelengths, wavelength"
     "; wavelength weights, weights; primary wavelength, primary; catalogs, catalog, glass catalogs; ray aiming"
     "; temperature; pressure"
 )
