@@ -11,9 +11,10 @@ name of a shipped lens (`raytrace.public`).
 """
 
 import importlib
+from threading import RLock
 from types import FunctionType
 
-#: Public names, and where each is defined: "room.file", or "room.file:name" if it has another name there.
+#: Public names, and where each is defined: "package.module", or "package.module:name" if it has another name there.
 PUBLIC = {
     # lenses and their files
     "Aperture": "system.apertures",
@@ -48,8 +49,10 @@ PUBLIC = {
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
+    "internal_transmittance": "materials.glass",
     "refractive_index": "materials.glass",
     # rays
+    "RaytraceWarning": "words",
     "BaseRay": "tracing.base_ray",
     "FirstOrder": "tracing.paraxial",
     "Rays": "system.rays",
@@ -180,17 +183,22 @@ PUBLIC = {
 
 __all__ = [*PUBLIC]
 
+#: One thread imports at a time. A folder imports its modules and a module imports its folder first: two threads that
+#: begin at either end would wait for each other, and Python then hands out modules that are partially initialized.
+_IMPORTING = RLock()
+
 
 def __getattr__(name: str):
     if name == "__version__":
         return importlib.import_module("importlib.metadata").version("raytrace")
     if name not in PUBLIC:
         raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
-    place, _, own = PUBLIC[name].partition(":")
-    found = getattr(importlib.import_module(f"raytrace.{place}"), own or name)
-    if not isinstance(found, FunctionType):
-        return found
-    return importlib.import_module("raytrace.public").public(found, name)
+    place, _, defined = PUBLIC[name].partition(":")
+    with _IMPORTING:
+        value = getattr(importlib.import_module(f"raytrace.{place}"), defined or name)
+        if not isinstance(value, FunctionType):
+            return value
+        return importlib.import_module("raytrace.public").public(value, name)
 
 
 def __dir__() -> list[str]:

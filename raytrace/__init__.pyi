@@ -63,6 +63,7 @@ from raytrace.materials.catalogs import nearest_glasses as nearest_glasses
 from raytrace.materials.glass import AIR as AIR
 from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import MIRROR as MIRROR
+from raytrace.materials.glass import internal_transmittance as internal_transmittance
 from raytrace.materials.glass import refractive_index as refractive_index
 from raytrace.materials.properties import glass as glass
 from raytrace.maths.numerics import to as to
@@ -154,5 +155,6 @@ from raytrace.wave_optics.fabrication import as_rings as as_rings
 from raytrace.wave_optics.fabrication import fabricated as fabricated
 from raytrace.wave_optics.hybrid import element_lens as element_lens
 from raytrace.wave_optics.hybrid import hybrid_psf as hybrid_psf
+from raytrace.words import RaytraceWarning as RaytraceWarning
 
 PUBLIC: dict[str, str]

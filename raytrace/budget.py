@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -31,7 +31,7 @@ class OverBudget(ValueError):
     """More memory is needed than available; the message has the cause and a remedy."""
 
 
-class TakesLong(UserWarning):
+class TakesLong(RaytraceWarning):
     """A computation is predicted to take more than half a minute; the message has its time and a remedy."""
 
 
@@ -65,7 +65,7 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     rays = math.prod((pupil_points, *counts.values()))
     factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     what = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
-    afford(RAY_BYTES * rays, what, helps="ask for fewer fields, wavelengths or pupil points")
+    afford(RAY_BYTES * rays, what, helps="ask for fewer `fields`, `wavelengths` or points of the pupil")
 
 
 def forewarn(seconds: float, what: str, *, helps: str) -> None:

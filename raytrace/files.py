@@ -14,10 +14,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from raytrace.words import RaytraceWarning
+
 _OPEN_FILES = "/proc/self/fd"  # the path by which an unnamed file is given a name
 
 
-class NotWritten(UserWarning):
+class NotWritten(RaytraceWarning):
     """An output could not be written; the computation continued without it."""
 
 

@@ -26,7 +26,7 @@ from types import MappingProxyType
 
 from raytrace.files import NotWritten, append_text, read_bytes, write_json, write_text
 from raytrace.shards import share
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
 Check = Callable[[object], object]
@@ -43,7 +43,7 @@ class Unfit(ValueError):
         self.line = line
 
 
-class DamagedLine(UserWarning):
+class DamagedLine(RaytraceWarning):
     """A line of a store that holds no record; the others are kept."""
 
 

@@ -1,15 +1,23 @@
-"""Texts of messages: the known name nearest to an unknown one, the kind of a value, the line that a warning names."""
+"""Texts of messages: the known name nearest to an unknown one, the kind of a value; warnings and the line they name."""
 
 import difflib
 import functools
 import inspect
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
+
+
+class RaytraceWarning(UserWarning):
+    """A warning of this package, given once in a process; a filter of Python's, as "always", gives it at every line."""
+
+
+warnings.filterwarnings("once", category=RaytraceWarning, append=True)
 
 #: Options with two spellings: one value on the command line, several in Python.
 SPELLINGS = (

@@ -22,6 +22,7 @@ from raytrace.materials.environment import Environment
 from raytrace.maths import zernike
 from raytrace.maths.sampling import gauss_rings, hexapolar
 from raytrace.psf_models import wave
+from raytrace.psf_models.strehl import strehl as strehl_of
 from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
@@ -428,7 +429,7 @@ def mtf_huygens(case):
 def strehl(case):
     """The peak of all wavelengths together, by weight."""
     if len(lens_of(case).wavelengths) == 1:
-        return flat(wave.strehl(scene_at(case, waves_of(case))))
+        return flat(strehl_of(scene_at(case, waves_of(case))))
     found, best = intensities(case, tensor([0.0]), tensor([0.0]))
     return flat((share_of(case) * found / best[:, None, None]).sum(0))
 

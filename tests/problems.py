@@ -57,6 +57,11 @@ def field(*y: float) -> torch.Tensor:
     return number([[0.0] * len(y), list(y)])
 
 
+def own_fields(lens: Lens) -> torch.Tensor:
+    """The field points (2, F) of a lens."""
+    return torch.stack([lens.fields.x, lens.fields.y])
+
+
 def rotation(axis: str, degrees: float) -> torch.Tensor:
     """The right-handed turn (3, 3) about an axis, as the vendor's help writes it."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))

@@ -46,6 +46,67 @@ def thin_lens(*angles: float, diameter: float = 0.5) -> Lens:
     return problems.lens(surfaces, field=field, aperture=("entrance_pupil_diameter", diameter))
 
 
+# the medium of the image
+
+
+def test_diffraction_at_the_sensor_has_the_index_of_the_last_gap():
+    """An ellipsoid in front of glass of index 1.5, NA 0.2574, without aberration, by the light of its pupil d(h²)."""
+    lens = rt.lens([dict(curvature=0.1, conic=-4 / 9, thickness=30.0, glass=1.5)], stop=1, entrance_pupil_diameter=10,
+                   wavelengths=[0.5])  # fmt: skip
+    # Of rings of equal light: sin θ, and the transfer ∫∫ over the shared pupil of √(w(s) w(s - λν/n)), w = d(h²)/d(s²).
+    h = torch.linspace(0, 5, 2001, dtype=torch.float64)
+    sag = 0.1 * h**2 / (1 + torch.sqrt(1 - 5 / 9 * 0.01 * h**2))
+    sine = h / torch.hypot(h, 30 - sag)
+    density = torch.gradient(h[1:] ** 2, spacing=(sine[1:] ** 2,))[0].sqrt()
+    side = (torch.arange(700, dtype=torch.float64) + 0.5) / 350 - 1
+
+    def amplitude(x, y):
+        s = torch.hypot(x, y)
+        place = torch.searchsorted(sine[1:-1], s).clamp_max(len(density) - 1)
+        return torch.where(s < sine[-1], density[place], 0.0)
+
+    x, y = sine[-1] * side[:, None], sine[-1] * side
+    whole = amplitude(x, y)
+    expected = [(whole * amplitude(x - f * 0.5e-3 / 1.5, y)).sum() / (whole**2).sum() for f in (500, 1000, 1500)]
+    found = rt.mtf(lens, [500, 1000, 1500])
+    assert torch.allclose(found.tangential[0], torch.stack(expected), atol=5e-4)  # 0.4085, 0.0055, 0
+    assert torch.allclose(found.sagittal, found.tangential, atol=1e-6)
+    assert float(rt.encircled_energy(lens, [0.5e-3]).share) == pytest.approx(0.4763, abs=1e-3)
+
+
+def test_a_glass_on_the_image_surface_changes_no_result(tmp_path):
+    rows = [dict(curvature=0.1, conic=-4 / 9, thickness=30.0, glass=1.5)]
+    bare = rt.lens(rows, stop=1, entrance_pupil_diameter=5, fields=[0.5], wavelengths=[0.5])
+    quantities = (
+        lambda lens: rt.spot(lens).rms_radius,
+        lambda lens: rt.wavefront(lens).rms,
+        lambda lens: rt.mtf(lens, [20, 50]).tangential,
+        lambda lens: rt.encircled_energy(lens, [5e-3]).share,
+        lambda lens: rt.relative_illumination(lens, fields=[0.5]).illumination,
+        lambda lens: rt.trace(lens).direction,
+        lambda lens: rt.evaluate(lens, merit="wavefront").merit,
+    )
+    coated = bare.replace(2, glass=1.9)
+    for quantity in quantities:
+        assert torch.allclose(
+            *(torch.as_tensor(quantity(lens)).double() for lens in (coated, bare)), rtol=1e-12, atol=0
+        )
+    assert "light does not enter n 1.9" in str(rt.info(coated))
+    rt.write_lens(coated, tmp_path / "coated.zmx")
+    assert any("surface 2: light does not enter" in note for note in rt.check(tmp_path / "coated.zmx").notes)
+
+
+def test_a_sensor_in_glass_loses_no_ray_by_total_reflection():
+    """Object and image in index 1.5, NA 1.2: the rim leaves at the sine 0.8, and lands 20 tan(asin 0.8) mm high."""
+    rows = [dict(radius=math.inf, thickness=10.0, glass=1.5)]
+    lens = rt.lens(rows, stop=1, object_distance=10.0, object_na=0.3, wavelengths=[0.55]).replace(0, glass=1.5)
+    lens = dataclasses.replace(lens, aperture=dataclasses.replace(lens.aperture, value=vector(1.2)[0]))
+    upper = rt.trace(lens).direction[1, ..., 1]
+    assert float(upper) == pytest.approx(0.8, abs=1e-12)
+    assert not rt.spot(lens).arrivals.status.any()
+    assert float(rt.spot(lens).geometric_radius) == pytest.approx(80 / 3, abs=1e-6)
+
+
 # fans and wavefronts
 
 
@@ -419,7 +480,7 @@ def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
     assert len(document["results"]) >= 2
     assert picture.stat().st_size > 10_000
     assert main(arguments[:-2]) == 0
-    assert capsys.readouterr().out.split()[0] == "field"
+    assert capsys.readouterr().out.split()[0] == "field_y"
 
 
 def test_through_focus_counts_its_sensor_distances():

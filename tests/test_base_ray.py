@@ -1,6 +1,8 @@
 """First-order data about the axial chief ray: what is known of them exactly, and by another tracer."""
 
 import math
+import re
+from pathlib import Path
 
 import bends
 import pytest
@@ -9,6 +11,7 @@ from bends import pose, real
 from differences import gradcheck
 
 import raytrace as rt
+from raytrace.cli import main
 from raytrace.tracing.paraxial import largest_field
 from raytrace.tracing.trace import Bent, at_stop, is_bent
 
@@ -160,6 +163,28 @@ def test_pupil_points_keep_their_side_behind_a_turned_stop():
     for lens in (turned, bends.folded(plain, 4, tilt_x=2.0)):
         expected, found = (rt.rays(one, pupil=points, fields=[0.0, 10.0]) for one in (plain, lens))
         assert float((found.position[:2] - expected.position[:2]).abs().max()) < 1e-6
+
+
+def test_a_telecentric_relay_has_the_pupils_and_the_magnification_of_first_order_data(capsys):
+    """Two ideal lenses of 50 mm, the stop 1.165 µm from their common focus, a tilted image."""
+    lens = rt.read_lens(Path(__file__).parent / "cases" / "telecentric.zmx")
+    base, straight = rt.base_ray(lens), rt.first_order(lens)
+    assert base.magnification.tolist() == pytest.approx([-1, -1], rel=1e-9)
+    assert float(straight.magnification) == pytest.approx(-1, rel=1e-9)
+    distance = 50 + 50**2 / 0.001165  # of the image of the stop by the second lens
+    slope = 0.1 / math.sqrt(1 - 0.1**2)
+    for data in (base, straight):
+        assert data.entrance_pupil_diameter.flatten().isinf().all()
+        assert data.entrance_pupil_position.flatten().isinf().all()
+        assert data.exit_pupil_position.flatten().tolist() == pytest.approx(
+            data.exit_pupil_position.numel() * [distance - 50], rel=1e-7
+        )
+        diameters = data.exit_pupil_diameter.flatten()
+        assert diameters.tolist() == pytest.approx(len(diameters) * [2 * slope * (distance - 50)], rel=1e-4)
+    assert main(["info", str(Path(__file__).parent / "cases" / "telecentric.zmx")]) == 0
+    assert re.search(r"telecentric +in object and image space", capsys.readouterr().out)
+    assert rt.info(lens).document()["telecentric"] == ["object", "image"]
+    assert rt.info(rt.read_lens("double_gauss")).document()["telecentric"] == []
 
 
 def test_it_is_differentiated_exactly():

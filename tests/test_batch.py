@@ -1,5 +1,6 @@
 """A batch of lenses gives what a loop over its lenses gives, values and derivatives, in one call."""
 
+import math
 import warnings
 
 import pytest
@@ -211,3 +212,19 @@ def test_a_value_with_axes_of_its_own_is_no_batch():
     heights = torch.zeros(5, 7, dtype=torch.float64)
     grid = rt.read_lens("singlet").replace(1, sag_terms=GridSag(heights, torch.tensor(5.0, dtype=torch.float64)))
     assert grid.count is None
+
+
+def test_orders_are_chosen_for_each_lens_and_distance_alone():
+    """A PSF is that of a call for it alone, whatever the others need."""
+    lens = rt.read_lens("tessar")
+    bent = lens.replace(1, curvature=0.98 * lens.surfaces[1].curvature)
+    together = rt.psf(rt.batch([lens, bent]), "gaussian", fields=[10.0])
+    alone = [rt.psf(each, "gaussian", fields=[10.0]) for each in (lens, bent)]
+    assert alone[0].order != alone[1].order
+    assert torch.equal(together.kernel, torch.cat([each.kernel for each in alone]))
+    distances = [1e4, math.inf, 500.0]
+    together = rt.psf(lens, "gaussian", fields=[0.0], object_distances=distances)
+    alone = [rt.psf(lens, "gaussian", fields=[0.0], object_distances=[distance]) for distance in distances]
+    assert len({each.order for each in alone}) > 1
+    assert torch.equal(together.kernel, torch.cat([each.kernel for each in alone]))
+    assert together.order == max(each.order for each in alone)

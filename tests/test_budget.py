@@ -142,6 +142,39 @@ def test_long_computations_are_reported_before_they_start(lens):
             psf(fast(lens, 0.1), "fourier", fields=torch.zeros(2, 1, dtype=torch.float64))
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("psf --size 100000", "--size"),
+        ("wavefront --terms 100000", "--terms"),
+        ("distortion-grid --points 100000", "--points"),
+        ("chromatic-focal-shift --samples 1000000000", "--samples"),
+        ("longitudinal-aberration --points 10000000000", "--points"),
+        ("ray-fan --points 10000000000", "--points"),
+        ("spot --rings 100000", "--rings"),
+        ("layout --rays 100000000", "--rays"),
+        ("tolerance --grade precision --trials 1000000000000", "--trials"),
+    ],
+)
+def test_a_refusal_names_its_option_before_any_work(words, option, capsys):
+    command, *rest = words.split()
+    began = time.process_time()
+    assert main([command, "cooke_triplet", *rest]) == 1
+    assert time.process_time() - began < 5
+    error = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(error) == 1
+    assert f"{option}" in error[0].replace("--max-bytes", "")
+
+
+def test_memory_that_runs_out_names_the_largest_option(capsys, monkeypatch):
+    def run(arguments):
+        raise MemoryError
+
+    monkeypatch.setattr("raytrace.cli.run.carry_out", run)
+    assert main(["psf", "cooke_triplet", "--size", "5000"]) == 1
+    assert "not enough memory; ask for less by --size, which is 5000" in capsys.readouterr().err
+
+
 def test_commands_refuse_in_one_line(capsys):
     assert main(["wavefront", "double_gauss", "--size", "20000", "--max-bytes", "1GB"]) == 1
     (line,) = capsys.readouterr().err.splitlines()

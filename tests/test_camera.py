@@ -40,7 +40,7 @@ from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.training import Run, Share
 from raytrace.imaging.variables import Variables
 from raytrace.io import read_lens
-from raytrace.maths.sampling import grid
+from raytrace.maths.sampling import gauss_rings, grid
 from raytrace.psf_models import psf
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
@@ -472,3 +472,31 @@ def test_models_without_distortion_are_centred_on_their_image():
     own = camera(read_lens(LENS), CodesignSettings(model="paraxial", fields=(0.0, 14.0)))
     distances = number([1.2e4, 2e4, 4e4])
     torch.testing.assert_close(own.kernels(distances, 1), own.kernels(distances, 0))
+
+
+@pytest.mark.parametrize("points", [None, gauss_rings(3, 6)[0]], ids=["rays of the tolerance", "pupil points"])
+def test_the_window_follows_the_chief_ray_of_a_tilted_lens(points):
+    """The tilt moves the image on the axis by 0.27 mm, out of a window of 0.1 mm about the axis."""
+    lens = read_lens(LENS).replace(4, tilt_x=0.13)
+    own = Camera(Variables(lens, "sensor tilt_x:4"), Same(), tol=1e-4, pupil_points=points)
+    distances = number([17e3])
+    kernels = own.kernels(distances)
+    wanted = psf(lens, "gaussian", object_distances=distances, fields=own.fields, tol=1e-4, normalise="window")
+    assert float((kernels - wanted.kernel[:, 0]).abs().sum()) < (2e-4 if points is None else 2e-2)
+    tilt = own.variables.get_parameter("tilt_x_4")
+    (slope,) = torch.autograd.grad(kernels[0, 10, 8], tilt)
+    with torch.no_grad():
+        ends = [(tilt.fill_(change), own.kernels(distances)[0, 10, 8])[1] for change in (1e-4, -1e-4)]
+    assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-5)
+
+
+@pytest.mark.parametrize("model", ["gaussian", "drt"])
+def test_a_kernel_does_not_depend_on_its_batch(model):
+    own = camera(read_lens(LENS), CodesignSettings(model=model, fields=(0.0, 7.0)))
+    distances = number([1.2e4, 4e4])
+    with torch.no_grad():
+        kernels, other = own.kernels(distances, 1), own.kernels(number([-1.2e4, 4e4]), 1)
+        alone = own.kernels(distances[1:], 1)
+    torch.testing.assert_close(other[1], kernels[1], rtol=0, atol=1e-11)
+    torch.testing.assert_close(alone[0], kernels[1], rtol=0, atol=1e-11)
+    torch.testing.assert_close(own.kernels(distances, 1).detach(), kernels, rtol=0, atol=1e-11)

@@ -1,6 +1,8 @@
 """`Camera` of a sensor: colours, places, noise by number, states that describe themselves, trainings that resume."""
 
 import dataclasses
+import inspect
+import io
 import json
 import os
 import signal
@@ -15,6 +17,7 @@ import torch
 from PIL import Image
 
 import raytrace as rt
+import raytrace.imaging.camera
 from raytrace.imaging.closed_form import camera_error, even_distances, field_filters, noise_deviation, patch_spectrum
 from raytrace.imaging.codesign import (
     Batches,
@@ -22,6 +25,7 @@ from raytrace.imaging.codesign import (
     batch,
     camera,
     held_out_error,
+    lens_at_start,
     light_of,
     optimise,
     outcome,
@@ -30,6 +34,7 @@ from raytrace.imaging.codesign import (
     steps_per_epoch,
     with_catalog_glasses,
 )
+from raytrace.imaging.field_kernels import DarkPlaces, order_of
 from raytrace.imaging.image import blur, transfer_functions
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.render import decoded, linearised, render_patches
@@ -39,6 +44,7 @@ from raytrace.imaging.variables import OtherLens
 from raytrace.optimization.variables import VariedGlass
 from raytrace.settings import CodesignSettings
 from raytrace.shards import Share
+from raytrace.tracing.scene import scene, symmetry
 
 SENSOR = rt.Sensor(size=(24.0, 16.0), pixels=(1200, 800), response="rgb", full_well=2e4, read_noise=5.0)
 RANGE = (8e3, 4e4)
@@ -167,6 +173,114 @@ def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
         differences.append((values[0] - values[1]) / (2 * step))
     slopes = torch.stack(slopes)
     assert slopes.tolist() == pytest.approx(differences, rel=1e-3, abs=2e-4 * float(slopes.abs().max()))
+
+
+def test_vignetting_factors_move_with_the_field_of_the_middle():
+    """Tilting a surface of a Tessar at 2 m moves the field at the middle of the sensor from the listed one, 0."""
+    one = made(rt.read_lens("tessar").at(object_distance=2000.0), "tilt_x:3", object_distances=(1.9e3, 2.1e3), tol=1e-3)
+    where = {"points": torch.zeros(2, 1, dtype=torch.float64)}
+    pattern = torch.cos(torch.arange(363.0, dtype=torch.float64)).reshape(3, 11, 11)
+    tilt = one.variables.get_parameter("tilt_x_3")
+    (slope,) = torch.autograd.grad((one.kernels(pattern.new_tensor([2e3]), **where) * pattern).sum(), tilt)
+    ends = []
+    with torch.no_grad():
+        for change in (1e-4, -1e-4):
+            tilt.fill_(change)
+            ends.append((one.kernels(pattern.new_tensor([2e3]), **where) * pattern).sum())
+    assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-4)
+
+
+@pytest.mark.parametrize("model", ["gaussian", "drt"])
+def test_a_place_without_a_chief_ray_has_a_kernel_of_0(triplet, model):
+    """It was a point, as of a perfect lens, and the place nan was the axis."""
+    one, points = made(triplet, model=model), torch.tensor([[0.0, 0.0], [5.0, 300.0]], dtype=torch.float64)
+    with pytest.warns(DarkPlaces, match=r"1 of 2 places .* \(0, 300\) mm"):
+        kernels = one.kernels(points.new_tensor([1e4, 2e4]), points=points)
+    torch.testing.assert_close(kernels.sum((-2, -1)).detach(), points.new_tensor([[1.0] * 3, [0.0] * 3]))
+    slopes = torch.autograd.grad((kernels * kernels).sum(), [*one.variables.parameters()])
+    assert all(slope.isfinite() and slope != 0 for slope in slopes)
+    with pytest.raises(ValueError, match="1 of 2 points are nan or infinite"):
+        one.kernels(points.new_tensor([1e4, 2e4]), points=torch.where(points == 300.0, torch.nan, points))
+
+
+def test_a_kernel_is_the_same_in_any_batch_with_and_without_derivatives(triplet):
+    """DRT: the sampling followed the widest kernel of a batch, and on the axis the symmetry that derivatives break."""
+    one, points = made(triplet, model="drt"), torch.tensor([[0.0, 0.0, 3.0], [0.0, 5.0, 4.0]], dtype=torch.float64)
+    distances = points.new_full((3,), 1e4)
+    with torch.no_grad():
+        kernels = one.kernels(distances, points=points)
+        other = one.kernels(points.new_tensor([-1e4, 1e4, 1e4]), points=points)
+    torch.testing.assert_close(other[1:], kernels[1:], rtol=0, atol=1e-12)
+    for k in range(3):
+        alone = one.kernels(distances[:1], points=points[:, k : k + 1])
+        torch.testing.assert_close(alone[0].detach(), kernels[k], rtol=0, atol=1e-12)
+
+
+def test_the_first_example_runs():
+    block = inspect.getdoc(raytrace.imaging.camera).split("\n\n")[2]
+    names = {"rt": rt, "torch": torch}
+    exec(inspect.cleandoc(block), names)
+    assert names["loss"].isfinite()
+
+
+def test_pictures_of_half_precision_are_blurred_in_float32(triplet):
+    one = made(triplet)
+    picture, distances, points, _ = samples(2)
+    image = one.image(picture.half(), distances, points=points)
+    assert image.dtype == torch.float32
+    torch.testing.assert_close(image, one.image(picture.half().float(), distances, points=points))
+    for convert in (torch.nn.Module.half, torch.nn.Module.bfloat16):
+        with pytest.raises(ValueError, match=r"dtype torch\.b?float16: expected torch\.float32 or torch\.float64"):
+            convert(one)
+
+
+def test_distances_are_numbers_of_any_kind_and_one_at_least(triplet):
+    one, points = made(triplet), torch.zeros(2, 1)
+    torch.testing.assert_close(one.kernels(1e4, points=points), one.kernels(torch.tensor([1e4]), points=points))
+    for distances in ([], torch.zeros(0), torch.full((2, 2), 1e4)):
+        with pytest.raises(ValueError, match=r"object_distances of shape .*: expected \(B,\) mm"):
+            one.kernels(distances, points=torch.zeros(2, 0))
+
+
+def test_a_camera_is_copied_after_a_projection(triplet):
+    one = made(triplet, "sensor curvature:1 thickness:2", pixels=5)
+    one.variables.project()
+    copy = torch.load(saved(one), weights_only=False)
+    copy.variables.project()
+    where = {"points": torch.zeros(2, 1)}
+    assert torch.equal(copy.kernels(1e4, **where), one.kernels(1e4, **where))
+
+
+def saved(module):
+    file = io.BytesIO()
+    torch.save(module, file)
+    file.seek(0)
+    return file
+
+
+def test_the_default_device_is_not_that_of_a_camera(triplet):
+    """Numbers made without a device would be on "meta", where they have no values."""
+    variables = rt.Variables(triplet, "thickness:2", hold="buildable")
+    light = scene(triplet, triplet.wavelengths.new_zeros(2, 1), triplet.wavelengths.new_ones(1), triplet.wavelengths)
+    with torch.no_grad():
+        variables.thickness_2.fill_(-20.0)
+    with torch.device("meta"):
+        assert symmetry(light) == "round"
+        variables.project()
+    assert variables.numbers()["thickness_2"] > 0
+
+
+@pytest.mark.slow
+def test_the_order_of_a_clipped_lens_is_that_of_its_whole_beams_too(triplet):
+    """On the axis no ray is clipped, and of order 3, enough for the rays of clipped beams, the error was 9 %."""
+    green = dataclasses.replace(SETTINGS, wavelengths=(0.5876,), wavelength_weights=(1.0,), vignetting="semi-diameters")
+    lens, sensor = lens_at_start(triplet, green), dataclasses.replace(SENSOR, response=None)
+    points = torch.tensor([[0.0, 9.0], [0.0, 6.0]], dtype=torch.float64)
+    orders = [
+        order_of(lens, sensor, "gaussian", at, points.new_tensor([1e4]), 11, 1e-2)
+        for at in (points, points[:, :1], points[:, 1:])
+    ]
+    assert orders[0] == orders[1] > orders[2]
 
 
 def test_what_does_not_fit_is_refused(triplet):

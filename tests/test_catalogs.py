@@ -33,17 +33,28 @@ from raytrace.materials.catalogs import (
     shipped_folder,
     write_agf,
 )
-from raytrace.materials.glass import BY_NUMBER, MIRROR, constant, index, listing_error, refractive_index
+from raytrace.materials.glass import (
+    BY_NUMBER,
+    MIRROR,
+    constant,
+    index,
+    internal_transmittance,
+    listing_error,
+    refractive_index,
+)
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.
 UNLISTED = {
     "INFRARED": "AGCL AMTIR1 AMTIR3 CDSE CDTE GAAS GERMANIUM GE_LONG GE_OLD IRG100 KRS5 NACL SILICON TI_1173 ZBLA "
-    "ZBLAN ZNSE ZNS_IR",
-    "MISC": "CDS CR39",
+    "ZBLAN ZNSE ZNS_IR IG3",
+    "MISC": "CDS CR39 5MG448 MG452* MG463& MG523",
+    "CDGM": "HWS1 HWS2 HWS27 HWS3 HWS4 HWS5 HWS6 HWS7 HWS9",
+    "CORNING": "CAF2_P CAF2_P2 FS_P FS_P2",
+    "NHG": "D-LAF774 H-BIF207 H-BIF210",
     "BIREFRINGENT": "AGASS3-E AGASS3 AGGAS2-E AGGAS2 AGGASE2-E AGGASE2 CDGEAS2-E CDGEAS2 CDS CDS-E CDSE CDSE-E CUGAS2 "
     "CUGAS2-E LIO3-E LIO3 TAS TAS-E TE TE-E YVO4 YVO4-E ZNGEP2-E ZNGEP2",
-    "LIGHTPATH": "BD1 BD2",
+    "LIGHTPATH": "BD1 BD2 BD2_L",
     "RPO": "IG2 IG4 IG5 IG6",
     "UMICORE": "GASIR2 GASIR1",
     "ISUZU": "IIR-SF1",
@@ -55,12 +66,22 @@ RANGE_TOO_WIDE = {
     "TOPAS": "5013LS-01 5013X16 6015S-04",
     "ARTON": "DX4900 F5023 F4520 D4532 D4531F D4540",
     "RPO": "EKPC IG2 IG4 IG6",
+    "PLASTIC": "EP9000",
+    "NHG": "H-ZLAF54 H-ZLAF72 H-ZLAF80",
 }
 COUNTS = {
-    "SCHOTT": 357, "OHARA": 417, "HOYA": 404, "CDGM": 326, "HIKARI": 371, "SUMITA": 160, "LZOS": 54, "CORNING": 95,
-    "INFRARED": 47, "MISC": 23, "HERAEUS": 5, "TOPAS": 3, "ZEON": 1, "ARTON": 6, "LIGHTPATH": 11, "RPO": 43,
-    "UMICORE": 2, "ISUZU": 1, "ARCHER": 15, "RAD_HARD": 7, "BIREFRINGENT": 62,
+    "SCHOTT": 366, "OHARA": 432, "HOYA": 432, "CDGM": 371, "HIKARI": 383, "SUMITA": 317, "LZOS": 54, "CORNING": 103,
+    "INFRARED": 51, "MISC": 33, "HERAEUS": 5, "TOPAS": 3, "NHG": 52, "PLASTIC": 33, "ZEON": 23, "ARTON": 6,
+    "LIGHTPATH": 13, "RPO": 43, "UMICORE": 2, "ISUZU": 1, "ARCHER": 15, "RAD_HARD": 7, "PILKINGTON": 33,
+    "BIREFRINGENT": 62,
 }  # fmt: skip
+#: Glasses of no listed range.
+UNRANGED = "D-LAF774", "H-BIF207", "H-BIF210"
+#: Glasses whose listing is rounded by more.
+COARSE = (
+    "330R 480R CAFK95 EDMUND_REPLICA_POLYMER_152V52 K-CAFK95 K-CAFK95(M) K-CSK120 K-FIR100UV K-FIR100UV(M) K-LAKN5 "
+    "K-LASFN21 K-PFK80 K-PFK80(M) K-PSFN1 K-PSFN1(M) K-PSFN214(M) K-VC89 K-VC91 PFK80 ZEONEX_K22R&K26R_2017 ZEONEX_K26R"
+)
 
 SMALL = """CC A catalog for tests: Prüfgläser
 ! a note on statuses
@@ -110,20 +131,24 @@ def test_every_shipped_glass_has_its_listed_figures(name):
             assert glass.coefficients.tolist()[1:] == [0.0, 0.0]
             assert error == (0.0, 0.0)
         else:
-            assert abs(error[0]) <= 2e-5, (listed, error)
-            assert abs(error[1]) <= 0.1, (listed, error)
+            coarse = listed in COARSE.split()  # by their makers, of fewer digits
+            assert abs(error[0]) <= (4e-5 if coarse else 2e-5), (listed, error)
+            assert abs(error[1]) <= (0.25 if coarse else 0.1), (listed, error)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_glass_disperses_normally_in_all_of_its_range(name):
     """A transparent medium has n ≥ 1 that falls with wavelength, from one end of its range to the other."""
     for listed, glass in shipped_catalog(name).glasses.items():
+        if glass.wavelength_range is None:
+            assert listed in UNRANGED
+            continue
         wavelengths = torch.linspace(*glass.wavelength_range, 400, dtype=torch.float64)
         n = refractive_index(glass, wavelengths)
         assert (n > 0.5).all()
         assert (n < 7.0).all()  # tellurium, the highest, reaches 6.4
         assert glass.catalog == name
-        assert "sources agree" in glass.comment
+        assert re.search(r"sources agree|1 source alone", glass.comment)
         if listed == "VACUUM":  # relative to air: just below 1, and rising to it
             assert ((n > 0.9997) & (n < 0.99974)).all()
             continue
@@ -332,7 +357,7 @@ def test_shipped_files_are_plain_agf():
     for path in shipped_folder().glob("*.AGF"):
         lines = path.read_bytes().decode("ascii").split("\n")
         assert lines[0].startswith("CC ")
-        assert {line.split(" ")[0] for line in lines[:-1]} <= {"CC", "NM", "GC", "ED", "CD", "TD", "OD", "LD"}
+        assert {line.split(" ")[0] for line in lines[:-1]} <= {"CC", "NM", "GC", "ED", "CD", "TD", "OD", "LD", "IT"}
         for line in lines:
             if line.startswith("NM"):
                 assert re.fullmatch(r"NM \S+ \d+ \d{6} \S+ \S+ 0 (-1|[0-4]) -1", line)
@@ -476,7 +501,7 @@ def test_the_figures_of_a_glass_are_text_document_and_table():
     indices = refractive_index(find_glass("SK16"), torch.tensor([0.53, 0.6], dtype=torch.float64))
     assert found.document()["indices"] == indices.tolist()
     assert found.to_frame()["index"].tolist() == indices.tolist()
-    assert re.search(rf"^ +0.53 +{float(indices[0]):.10f}$", str(found), re.M)
+    assert re.search(rf"^ +0.53 +{float(indices[0]):.10f} +0.9956$", str(found), re.M)
     assert rt.glass("517642").document()["catalog"] is None
     assert str(rt.glass("517642")).startswith("517642  (MIL code)")
     with pytest.raises(ValueError, match=r"did you mean 0\.53"):
@@ -504,3 +529,116 @@ def test_what_has_no_nd_and_vd_has_no_nearest_glass():
         nearest_glasses(MIRROR)
     with pytest.raises(CatalogError, match="no catalog 'OHARRA' is shipped; there are SCHOTT, OHARA"):
         nearest_glasses("N-BK7", catalogs=["OHARRA"])
+
+
+# -- figures beside the dispersion ------------------------------------------------------------------------------------
+
+#: Of public sources, by catalog and glass: expansion from -30 to 70 °C and from 20 to 300 °C, 1e-6/K (that of FL6 is
+#: stated in 1e-7/K), density, relative price, and two rows of wavelength and internal transmittance of 10 mm.
+FIGURES = {
+    ("SCHOTT", "N-BK7"): (7.1, 8.3, 2.51, 1.0, [(0.37, 0.99074), (2.5, 0.66454)]),
+    ("SCHOTT", "SF6"): (8.1, 9.0, 5.18, 2.5, [(0.405, 0.93264), (2.5, 0.88653)]),
+    ("SCHOTT", "N-FK56"): (None, 16.2, 3.54, 25.42, [(0.35, 0.967), (1.97, 0.992)]),
+    ("OHARA", "S-BAH54"): (6.6, 8.1, 3.3, None, [(0.37, 0.87), (0.7, 0.998)]),
+    ("OHARA", "S-NPH5"): (7.6, None, 3.71, 3.3, [(0.44, 0.949), (2.4, 0.915)]),
+    ("HOYA", "E-FD2"): (8.8, 10.9, 2.77, None, [(0.46, 0.986), (1.55, 0.995)]),
+    ("HOYA", "FL6"): (7.9, 9.0, 3.12, None, [(0.36, 0.975), (0.7, 0.999)]),
+    ("CDGM", "D-LAF50"): (7.3, 8.9, 4.93, 15.6, [(0.38, 0.955), (2.4, 0.792)]),
+    ("CDGM", "F6"): (9.8, 11.6, 3.6, 2.5, [(0.39, 0.977), (2.4, 0.76)]),
+    ("HIKARI", "E-SK4"): (7.2, None, 3.54, None, [(0.36, 0.94), (2.4, 0.848)]),
+    ("HIKARI", "SK18"): (8.1, None, 3.69, None, [(0.37, 0.8), (0.7, 1.0)]),
+    ("SUMITA", "K-VC179(M)"): (6.1, 8.0, 4.65, None, [(0.37, 0.60487), (2.0, 0.91593)]),
+    ("LZOS", "LZ_LK3"): (9.2, None, 2.46, None, [(0.44, 0.993), (1.5, 0.994)]),
+    ("CORNING", "C79-80"): (0.52, 0.57, 2.201, None, []),
+    ("INFRARED", "CSBR"): (47.2, None, 4.488, None, []),
+    ("LIGHTPATH", "PBH71"): (8.9, 10.1, 6.05, 2.0, [(0.44, 0.962), (2.4, 0.918)]),
+    ("RPO", "N-LAK22_MOLD"): (6.6, 7.4, 3.768, 3.5, [(0.38, 0.9672), (2.5, 0.67186)]),
+    ("ARTON", "DX4900"): (75.0, None, 1.08, None, []),
+    ("ZEON", "E48R"): (60.0, None, 1.01, None, [(0.5, 1.0), (1.6, 0.83694)]),
+    ("MISC", "PMMA"): (None, None, 1.16, None, []),
+}
+#: Fields that are None where the catalog lists nothing.
+NOT_LISTED = "expansion", "expansion_20_300", "density", "relative_price"
+
+
+@pytest.mark.parametrize(("catalog", "name"), FIGURES)
+def test_figures_are_those_of_the_sources(catalog, name):
+    *figures, rows = FIGURES[catalog, name]
+    glass = find_glass(name, catalogs=[catalog])
+    assert [glass.expansion, glass.expansion_20_300, glass.density, glass.relative_price] == figures
+    assert {(wavelength, τ, 10.0) for wavelength, τ in rows} <= {*glass.transmittance}
+    assert bool(glass.transmittance) == bool(rows)
+    for wavelength, τ in rows:
+        assert float(internal_transmittance(glass, wavelength)) == pytest.approx(τ, rel=1e-12)
+        assert float(internal_transmittance(glass, wavelength, 25.0)) == pytest.approx(τ**2.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_figures_are_possible(name):
+    """Expansion in 1e-6/K, not 1e-7; no figure that states nothing: a density of 1, a transmittance of 1 everywhere."""
+    for listed, glass in shipped_catalog(name).glasses.items():
+        assert 0.3 < (glass.expansion or 1) < 100, listed
+        assert 0.3 < (glass.expansion_20_300 or 1) <= max(25, 3 * (glass.expansion or 0)), listed
+        assert 0.9 < (glass.density or 2) < 8, listed
+        assert glass.density != 1
+        assert 0 < (glass.relative_price or 1) <= 100, listed
+        wavelengths, *others = zip(*glass.transmittance, strict=True) if glass.transmittance else ((), (), ())
+        assert list(wavelengths) == sorted({*wavelengths}), listed
+        assert all(0 <= τ <= 1 for τ in others[0]), listed
+        assert {*others[0]} != {1.0}, listed
+        assert {*others[1]} <= {10.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "nd", "vd", "source"),
+    [
+        ("EP5000", 1.636164, 23.916758, "1 source alone"),
+        ("OKP4", 1.607283, 26.645105, "1 source alone"),
+        ("APL5014CL", 1.544489, 56.344933, "1 source alone"),
+        ("D-ZLAF814", 1.814741, 37.027807, "1 source alone"),
+        ("K-CD35", 1.58050, 34.8, "1 source alone"),
+        ("H-LAK67", 1.670000, 51.70, "2 sources agree"),
+        ("NIFS-S", 1.458477, 67.826411, "3 sources agree"),
+        ("N-LASF55", 1.9538, 30.56, "2 sources agree"),
+        ("BSC517642B", 1.516803, 64.133327, "1 source alone"),
+        ("HPFS_7980", 1.458461, 67.80, "1 source alone"),
+    ],
+)
+def test_glasses_of_phones_and_of_new_catalogs_are_shipped(name, nd, vd, source):
+    """With the number of their sources; one alone is stated."""
+    glass = find_glass(name)
+    assert listing_error(glass) == pytest.approx((0, 0), abs=0.06)
+    assert float(refractive_index(glass, 0.5875618)) == pytest.approx(nd, abs=2e-5)
+    assert glass.abbe_listed == pytest.approx(vd, abs=0.1)
+    assert source in " ".join(catalogs.edition(glass))
+
+
+def test_a_figure_that_is_not_listed_is_none_and_said(small):
+    """AGF writes 0 and -1 for it."""
+    one, two = (find_glass(name, user=[small]) for name in ("ONE", "Two"))
+    assert (one.expansion, one.expansion_20_300, one.density, one.relative_price) == (7.1, 8.3, 2.51, 1.0)
+    assert one.transmittance == ((0.3, 0.05, 25.0), (0.5, 0.998, 25.0))
+    assert float(internal_transmittance(one, 0.5)) == pytest.approx(0.998**0.4, rel=1e-12)
+    assert all(getattr(two, name) is None for name in NOT_LISTED)
+    assert two.transmittance == ()
+    assert math.isnan(float(internal_transmittance(two, 0.5)))
+    shown = rt.glass("OKP4")
+    for title in ("expansion", "density", "price", "transmittance"):
+        assert re.search(rf"^  {title} +not listed$", str(shown), re.M)
+    document = shown.document()
+    assert [document[name] for name in (*NOT_LISTED, "transmittance")] == [None] * 4 + [[None] * 3]
+    listed = rt.glass("N-BK7", wavelengths=[0.334, 0.5876])
+    assert "expansion      7.1·10⁻⁶/K from −30 to 70 °C, 8.3·10⁻⁶/K from 20 to 300 °C" in str(listed)
+    assert listed.document()["transmittance"][0] == pytest.approx(0.90539, rel=1e-12)
+
+
+def test_internal_transmittance_between_listed_wavelengths_is_differentiable():
+    """The absorption is linear there: at the mean wavelength τ is the geometric mean; nan beyond the table."""
+    bk7 = find_glass("N-BK7")
+    (first, τ_first, _), (second, τ_second, _) = bk7.transmittance[:2]
+    middle = internal_transmittance(bk7, 0.5 * (first + second))
+    assert float(middle) == pytest.approx(math.sqrt(τ_first * τ_second), rel=1e-12)
+    assert torch.isnan(internal_transmittance(bk7, torch.tensor([0.29, 2.6], dtype=torch.float64))).all()
+    at = [torch.tensor(numbers, dtype=torch.float64, requires_grad=True) for numbers in ([0.352, 0.61], [3.0, 7.0])]
+    assert torch.autograd.gradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)
+    assert torch.autograd.gradgradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)

@@ -45,10 +45,23 @@ def area(result: Scene, count: int = 256) -> torch.Tensor:
             1 - 2 * 0.01,
             3e-4,
         ),
+        # A vane that reaches beyond the pupil, so that some arms are blocked as a whole.
+        ([Aperture("rectangular", (0.4, 5.5), True)], 1 - 2 / math.pi * (0.08 * 0.9936**0.5 + math.asin(0.08)), 1e-6),
     ],
 )
 def test_area_of_the_clear_pupil(apertures, expected, allowed):
     assert float(area(window(*apertures))) == pytest.approx(expected, abs=allowed)
+
+
+def test_the_area_moves_with_the_corners_to_second_order():
+    """A slit of half width b: A = 2/π (b √(1 - b²) + asin b), the angles of whose corners move."""
+    b = scalar(0.6).requires_grad_()
+    found = area(window(Aperture("rectangular", (9.0, RADIUS * b))), 32)
+    first = torch.autograd.grad(found, b, create_graph=True)[0]
+    second = torch.autograd.grad(first, b)[0]
+    assert found.item() == pytest.approx(2 / math.pi * (0.6 * 0.8 + math.asin(0.6)), abs=1e-9)
+    assert first.item() == pytest.approx(4 / math.pi * 0.8, rel=1e-6)
+    assert second.item() == pytest.approx(-4 / math.pi * 0.6 / 0.8, rel=2e-3)  # the slope is good to 1/2048
 
 
 def test_a_clear_pupil_is_whole_and_a_blocked_one_dark():

@@ -1184,3 +1184,11 @@ def test_every_command_writes_strict_json(run, command, lens):
     done = run(command, lens, "--json")
     assert done.code == 0, done.err
     assert done.document
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes a descriptor of the shell")
+def test_a_closed_standard_output_is_an_error():
+    command = f"{sys.executable} -m raytrace --version >&-"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr == ("raytrace: error: output: standard output is closed; send it to a file, or to /dev/null\n")

@@ -119,6 +119,16 @@ def test_a_run_reports_its_results(run, pictures, finished, one):
     assert f"sensor at {kept['sensor_mm']:.4f} mm" in text
 
 
+def test_a_finished_run_is_reported_without_its_pictures(run, one, monkeypatch):
+    """A hundred pictures of dead leaves took a minute."""
+    monkeypatch.setattr(codesign_run, "pictures_of", None)
+    code, text, err = run("double_gauss", *PARAXIAL, "-o", "one", "--resume")
+    assert (code, "finished before, nothing to train" in err) == (0, True)
+    assert f"sensor at {read('one/outcome.json')['sensor_mm']:.4f} mm" in text
+    code, _, err = run("double_gauss", *PARAXIAL, "-o", "one", "--resume", "--noise", "0.2")
+    assert (code, "one/joint holds another run: noise was 0.1, now 0.2" in err) == (1, True)
+
+
 def test_a_stopped_run_resumes_to_the_same_end(run, pictures, monkeypatch):
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "thickness:5")
     assert run(*command, "-o", "whole")[0] == 0

@@ -1,12 +1,15 @@
-"""Names in docstrings: every dotted one in backticks is a module, or something of a module, a class or a lens."""
+"""Docstrings: every dotted name in backticks is a module, or something of a module, a class or a lens; examples run."""
 
 import ast
+import doctest
 import functools
 import importlib
 import re
+import textwrap
 from pathlib import Path
 from types import ModuleType
 
+import torch
 from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 import raytrace
@@ -28,11 +31,15 @@ def classes() -> list[tuple[str, str]]:
     ]
 
 
+def texts(name: str) -> list[str]:
+    """The docstrings of a module, its classes and functions."""
+    nodes = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    return [ast.get_docstring(node) or "" for node in ast.walk(parsed(MODULES[name])) if isinstance(node, nodes)]
+
+
 def named(name: str) -> set[str]:
     """The dotted names in the docstrings of a module."""
-    nodes = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    texts = (ast.get_docstring(node) or "" for node in ast.walk(parsed(MODULES[name])) if isinstance(node, nodes))
-    return {found for text in texts for found in DOTTED.findall(text)}
+    return {found for text in texts(name) for found in DOTTED.findall(text)}
 
 
 def module(name: str) -> ModuleType:
@@ -82,3 +89,54 @@ def test_dotted_names_in_docstrings_are_there():
 def test_a_name_of_the_past_is_not_there():
     assert not is_there("psf.dft.Aliased", "wave_optics.plan")
     assert is_there("psf_models.dft.Aliased", "wave_optics.plan")
+
+
+#: An indented block of a docstring.
+BLOCK = re.compile(r"(?:^ {4}.*\n?)+", re.MULTILINE)
+
+
+def is_code(block: str) -> bool:
+    """Whether a block is a session, or Python that calls something: formulas with calls do not parse."""
+    try:
+        return ">>> " in block or any(isinstance(node, ast.Call) for node in ast.walk(ast.parse(block)))
+    except SyntaxError:
+        return False
+
+
+def examples(name: str) -> list[str]:
+    """The examples in the docstrings of a module, the blocks of each docstring joined."""
+    blocks = [[block for block in map(textwrap.dedent, BLOCK.findall(text)) if is_code(block)] for text in texts(name)]
+    return ["\n".join(of_one) for of_one in blocks if of_one]
+
+
+def given() -> dict:
+    """The names that examples take as given, small."""
+    torch.manual_seed(1)
+    return {
+        "rt": raytrace,
+        "torch": torch,
+        "lens": raytrace.read_lens("cooke_triplet"),
+        "element": raytrace.elements("ideal", aperture=1.0)[0],
+        "network": raytrace.UNet(channels=3),
+        "picture": torch.rand(3, 160, 240),
+        "pictures": torch.rand(1, 3, 128, 128),
+        "index": [0],
+        "planes": range(3),
+        "total": 10,
+        "many": 5,
+    }
+
+
+def test_examples_in_docstrings_run():
+    """Sessions print what they show; other examples run on the names of their module and on those of `given`."""
+    run = set()
+    for name in MODULES:
+        for code in examples(name):
+            run.add(name)
+            names = vars(module(name)) | given()
+            if ">>> " in code:
+                session = doctest.DocTestParser().get_doctest(code, names, name, None, 0)
+                assert not doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(session).failed
+            else:
+                exec(compile(code, f"an example of {name}", "exec"), names)
+    assert {"__init__", "imaging.camera", "imaging.render"} <= run

@@ -81,7 +81,7 @@ def test_pressure_alone_leaves_the_index_relative_to_vacuum():
 )
 def test_every_shipped_glass_has_an_index_at_every_temperature(catalog):
     for glass in shipped_catalog(catalog).glasses.values():
-        line = float64(sum(glass.wavelength_range) / 2)
+        line = float64(sum(glass.wavelength_range or (0.4, 0.7)) / 2)
         before, figures = refractive_index(glass, line), thermal(glass)
         for celsius, pressure in ((-40.0, 1.0), (80.0, 0.0)):
             after = index_in(glass, line, place(celsius, pressure))
@@ -327,9 +327,9 @@ def test_the_command_prints_a_glass_at_a_temperature(command):
     code, out, err = command("glass", "N-BK7", "--temperature", 30, "--wavelength", *LINES)
     assert code == 0, err
     headings, units, *rows = out.splitlines()[-2 - len(LINES) :]
-    assert headings.split() == ["wavelength", "index", "dn/dT,", "air", "dn/dT,", "vacuum"]
-    assert units.split() == ["µm", "1/K", "1/K"]
-    slopes = [line.split()[2:] for line in rows]
+    assert headings.split() == ["wavelength", "index", "dn/dT,", "air", "dn/dT,", "vacuum", "internal"]
+    assert units.split() == ["µm", "1/K", "1/K", "transmittance,", "10", "mm"]
+    slopes = [line.split()[2:4] for line in rows]
     assert [tuple(round(1e6 * float(number), 1) for number in column) for column in zip(*slopes, strict=True)] == [
         *DATA_SHEET[20, 40]
     ]
@@ -337,7 +337,8 @@ def test_the_command_prints_a_glass_at_a_temperature(command):
     assert found["dn_dt"] == pytest.approx(found["dn_dt_absolute"])
     assert [*json.loads(command("glass", "N-BK7", "--json")[1])][-1] == "indices"
     code, out, err = command("glass", "LZ_K8", "--temperature", -300)
-    assert (code, err.strip()) == (1, "raytrace: error: LZ_K8: --temperature -300: expected degrees Celsius above -272")
+    message = "raytrace: error: LZ_K8: --temperature -300: expected degrees Celsius above -272; thermal coefficients"
+    assert (code, err.strip()) == (1, f"{message} of catalogs hold from -100 to 140")
     assert "no thermal coefficients" in command("glass", "LZ_K8", "--temperature", 30)[2]
 
 
@@ -523,3 +524,15 @@ def test_configurations_have_their_temperatures_and_pressures(tmp_path):
     again = rt.read_lens(tmp_path / "copy.zmx")
     for one, other in zip(lens.configurations, again.configurations, strict=True):
         same_environments(one, other)
+
+
+def test_temperatures_at_which_no_glass_is_one_are_refused_and_extrapolated_ones_reported():
+    """The polynomials of third order in T make a focal length of 10⁻²³ mm at 10⁶ °C."""
+    lens = rt.read_lens("cooke_triplet")
+    with pytest.raises(ValueError, match=r"temperature=1e\+06.*up to 1000; thermal coefficients .* from -100 to 140"):
+        lens.at(temperature=1e6)
+    with pytest.warns(NoThermalCoefficients, match="extrapolated to 200 °C; those of catalogs hold from -100 to 140"):
+        lens.at(temperature=200)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lens.at(temperature=140)

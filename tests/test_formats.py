@@ -498,3 +498,11 @@ def test_page_of_formats_states_what_is_written(row, tmp_path):
                 again = read_lens(path)
                 assert leaves(again.surfaces) == leaves(lens.surfaces), (suffix, cell)
                 assert leaves(again.environment) == leaves(lens.environment), (suffix, cell)
+
+
+def test_a_tilted_object_is_not_written(tmp_path):
+    rows = [dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=90)]
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=200).replace(0, tilt_x=1)
+    for suffix in WRITTEN:
+        with pytest.raises(LensFileError, match="surface 0: a tilt or decentre of the object"):
+            write_lens(lens, tmp_path / f"lens{suffix}")

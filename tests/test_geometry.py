@@ -3,16 +3,22 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
+import torch
 from problems import fields, lens, scalar, surface
 
 import raytrace as rt
 from raytrace.cli import main
+from raytrace.imaging.variables import limits_of, violation
 from raytrace.materials.glass import MIRROR, model_glass
-from raytrace.system.optimization_data import OptimizationData
+from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.operands.boundaries import AT_RIM
+from raytrace.optimization.variables import Model
+from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import Unbuildable, defects
+from raytrace.tracing.geometry import Unbuildable, defects, rims, semi_diameters
 from raytrace.tracing.lens_report import Info
 
 GLASS = model_glass(1.6, 50.0)
@@ -94,6 +100,78 @@ GOOD = {
 @pytest.mark.parametrize("case", GOOD)
 def test_buildable_geometry_is_not_warned_of(case):
     assert defects(GOOD[case]()) == ()
+
+
+def sphere(c, h):
+    return c * h * h / (1 + math.sqrt(1 - c * c * h * h))
+
+
+def test_edges_are_at_the_common_rim_for_checks_boundaries_and_training():
+    """Two elements of clear heights 10 and 8, 6 and 7 mm: glass is edged at 10 and 7 mm, the air between at 7 mm."""
+    made = lens(
+        [surface(0.02, 3.0, GLASS), surface(-0.03, 1.5), surface(0.04, 2.0, GLASS), surface(-0.01, 40.0)],
+        aperture=("entrance_pupil_diameter", 4.0),
+        field=fields("angle", (0.0,), (0.0,)),
+    )
+    sizes = (None, 10.0, 8.0, 6.0, 7.0, None)
+    pairs = zip(made.surfaces, sizes, strict=True)
+    parts = tuple(dataclasses.replace(one, semi_diameter=size) for one, size in pairs)
+    made = dataclasses.replace(made, surfaces=parts)
+    first = 3.0 + sphere(-0.03, 10.0) - sphere(0.02, 10.0)
+    air = 1.5 + sphere(0.04, 7.0) - sphere(-0.03, 7.0)
+    second = 2.0 + sphere(-0.01, 7.0) - sphere(0.04, 7.0)
+    heights = np.array([0.0 if size is None else size for size in sizes])
+    ends = np.array([1, 2, 3, 4, 5, 5])
+    assert rims(heights, ends, np.array([False, True, False, True, False, False]))[1:4].tolist() == [10.0, 7.0, 7.0]
+    # Boundaries of a default merit function, of one surface each.
+    rows = [Row(name, (k, k), AT_RIM, target=1.0, weight=1.0) for name, k in (("MNEG", 1), ("MNEA", 2), ("MNEG", 3))]
+    values = Evaluation(Model(made), rows)(np.zeros(0)).values
+    assert values == pytest.approx([min(1.0, edge) for edge in (first, air, second)], rel=1e-12)
+    own = Evaluation(Model(made), [Row("ETVA", (1, 0)), Row("ETVA", (1, 0), AT_RIM)])(np.zeros(0)).values
+    assert own == pytest.approx([3.0 + sphere(-0.03, 8.0) - sphere(0.02, 10.0), first], rel=1e-12)
+    # The check: glass that is thick where light passes, and crosses at its rim.
+    assert 3.0 + sphere(-0.03, 8.0) - sphere(0.02, 10.0) > 1 > 0.5 > first
+    thin = made.replace(1, thickness=3.0 - first - 0.01)
+    (defect,) = defects(thin)
+    assert (defect.surface, defect.kind) == (1, "edge")
+    assert defect.amount == pytest.approx(-0.01, abs=1e-9)
+    # Training: the square of the shortfall, and its derivatives.
+    limits = limits_of(made, glass=(0.0, math.inf), air=(0.0, math.inf), edge=first + 0.1)
+    short = [max(first + 0.1 - edge, 0.0) for edge in (first, second)]
+    assert float(violation(made, limits)) == pytest.approx(sum(one**2 for one in short) + min(air, 0.0) ** 2, rel=1e-9)
+
+
+def test_training_has_the_derivatives_of_an_edge():
+    def shortfall(curvature, thickness):
+        made = lens(
+            [surface(0.02, 3.0, GLASS), surface(-0.03, 40.0)],
+            aperture=("entrance_pupil_diameter", 4.0),
+            field=fields("angle", (0.0,), (0.0,)),
+        )
+        front = dataclasses.replace(made.surfaces[1], curvature=curvature, thickness=thickness, semi_diameter=10.0)
+        back = dataclasses.replace(made.surfaces[2], semi_diameter=8.0)
+        made = dataclasses.replace(made, surfaces=(made.surfaces[0], front, back, made.surfaces[3]))
+        return violation(made, limits_of(made, glass=(0.0, 9.0), edge=2.0))
+
+    numbers = tuple(scalar(n).requires_grad_() for n in (0.02, 3.0))
+    assert torch.autograd.gradcheck(shortfall, numbers)
+    assert torch.autograd.gradgradcheck(shortfall, numbers)
+
+
+def test_an_edge_that_is_asked_for_is_that_of_the_rim():
+    """The edge of the result is measured on the lens, at the larger height of both faces that its light reaches."""
+    triplet = rt.read_lens("cooke_triplet")
+    merit = rt.DefaultMerit("spot", edge=1.0)
+    found = rt.optimize(triplet, merit=merit, vary="curvature thickness:1,3,6 sensor", hold="efl=100", cycles=25)
+    (edge,) = (one for one in found.conditions if one.name.startswith("MNEG"))
+    sizes = semi_diameters(found.lens)
+    edges = []
+    for k in (1, 3, 6):
+        c, d = (float(found.lens.surfaces[j].curvature) for j in (k, k + 1))
+        height = max(sizes[k], sizes[k + 1])
+        edges.append(float(found.lens.surfaces[k].thickness) + sphere(d, height) - sphere(c, height))
+    assert edge.reached == pytest.approx(min(edges), rel=1e-6)
+    assert min(edges) >= 0.999
 
 
 def test_semi_diameters_that_follow_the_light_are_those_of_the_light():

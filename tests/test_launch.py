@@ -5,11 +5,13 @@ import math
 
 import pytest
 import torch
-from problems import double_gauss, fields, lens, scalar, surface, vector
+from problems import PICOMETRE, double_gauss, fields, lens, scalar, surface, vector
 
+import raytrace as rt
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import media, with_object_distance
+from raytrace.system.phases import IdealLens
 from raytrace.tracing.launch import (
     MarginalRayLost,
     launch,
@@ -363,3 +365,63 @@ def test_float32():
         rays = launch(system, POINTS.float(), ray_aiming=aiming)
         assert rays.position.dtype == torch.float32
         assert rays.valid.all()
+
+
+def test_a_tilted_object_is_that_of_its_points():
+    """Ideal lens, f = 50 mm, m = -1/2: a point of the object at height y, tilted by θ, lies at y cos θ and y sin θ.
+
+    Its image is at 1/s' = 1/f - 1/s; a uniform pupil of radius a has the blur a |1 - d/s'|/√2. The images of all points
+    lie on a plane that is tilted by atan(m tan θ) (Scheimpflug).
+    """
+    ideal = IdealLens(scalar(1 / 50), scalar(1 / 50))
+    rows = [dict(phase=ideal, thickness=75)]
+    system = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=150, fields=[-10, 0, 10])
+    tilted = system.replace(0, tilt_x=30)
+    spots = rt.spot(tilted)
+    for k, y in enumerate((-10, 0, 10)):
+        s = 150 - y * math.sin(math.radians(30))
+        image = 1 / (1 / 50 - 1 / s)
+        assert spots.rms_radius[k, 0].item() == pytest.approx(
+            5 * abs(1 - 75 / image) / math.sqrt(2), rel=1e-12, abs=1e-15
+        )
+        centroid = -y * math.cos(math.radians(30)) * 75 / s
+        assert spots.centroid[1, k, 0].item() == pytest.approx(centroid, rel=1e-12, abs=1e-15)
+    beta = math.degrees(math.atan(-0.5 * math.tan(math.radians(30))))
+    assert rt.spot(tilted.replace(2, tilt_x=beta)).rms_radius.max() < 1 * PICOMETRE
+
+
+@pytest.mark.parametrize("ray_aiming", ["off", "real"])
+def test_every_field_of_a_tilted_object_is_a_point_of_an_untilted_one(ray_aiming):
+    """Also in the optimiser, and of a batch of tilts."""
+    rows = [dict(radius=60, thickness=5, glass="N-BK7"), dict(radius=-60, thickness=90)]
+    system = rt.lens(rows, stop=1, object_distance=150, fields=[10], ray_aiming=ray_aiming, float_by_stop=5)
+    tilted = system.replace(0, tilt_x=30)
+    y, z = 10 * math.cos(math.radians(30)), 10 * math.sin(math.radians(30))
+    spots, shape = rt.spot(tilted), rt.spot(system.at(object_distance=150 - z, fields=[y]))
+    assert spots.rms_radius.item() == pytest.approx(shape.rms_radius.item(), rel=1e-9)
+    assert spots.centroid[1].item() == pytest.approx(shape.centroid[1].item(), rel=1e-9)
+    merit = rt.Merit([rt.Row("RSCE", (8, 1), (0, 1.0), weight=1)])
+    assert rt.evaluate(tilted, merit=merit).values.item() == pytest.approx(spots.rms_radius.item(), rel=1e-5)
+    batch = rt.spot(system.replace(0, tilt_x=vector(0.0, 30.0))).rms_radius.flatten().tolist()
+    assert batch == pytest.approx([rt.spot(lens).rms_radius.item() for lens in (system, tilted)], rel=1e-12)
+
+
+def test_chief_rays_of_a_tilted_object_in_telecentric_object_space_are_parallel_to_the_axis():
+    """Equal cones of every point, also where the object is nearer."""
+    system = relay(10.0, 30.0, aperture=("object_na", 0.1), field=fields("object_height", [0.0, 2.0], telecentric=True))
+    tilted = system.replace(0, tilt_x=40)
+    rays = launch(tilted, torch.tensor([[0.0, 0.0], [0.0, 1.0]], dtype=torch.float64))
+    assert torch.equal(rays.direction[:2, ..., 0], torch.zeros_like(rays.direction[:2, ..., 0]))
+    assert rays.direction[1, ..., 1].flatten().tolist() == pytest.approx([0.1, 0.1], rel=1e-12)
+    assert rays.position[1, 1, 0, 0].item() == pytest.approx(2 * math.cos(math.radians(40)), rel=1e-15)
+
+
+def test_spots_by_the_tilt_of_the_object_have_both_derivatives():
+    rows = [dict(radius=60, thickness=5, glass="N-BK7"), dict(radius=-60, thickness=90)]
+    system = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=150, fields=[-10, 7])
+
+    def size(tilt):
+        return rt.spot(system.replace(0, tilt_x=tilt)).rms_radius.sum()
+
+    assert torch.autograd.gradcheck(size, scalar(30.0).requires_grad_())
+    assert torch.autograd.gradgradcheck(size, scalar(30.0).requires_grad_())

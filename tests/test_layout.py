@@ -1,5 +1,6 @@
 """Frames of surfaces in space, and layouts of folded systems."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.analysis import cross_section
+from raytrace.analysis import cross_section, layout_3d
 from raytrace.maths.sampling import fan
 from raytrace.system.surface import sag_at
 from raytrace.tracing.geometry import frames
@@ -96,6 +97,34 @@ def test_views_and_colours_by_wavelength(tmp_path):
     assert "0.45 µm" in "".join(text.get_text() for text in figure.legends[0].get_texts())
 
 
+def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
+    lens = rt.read_lens("cooke_triplet")
+    for aperture in (
+        rt.Aperture("circular", (0.0, 1e6), False, (0.0, 1.0)),
+        rt.Aperture("circular", (12.0, 1e6), True),
+    ):
+        first = dataclasses.replace(lens.surfaces[1], apertures=(aperture,))
+        wide = dataclasses.replace(lens, surfaces=(lens.surfaces[0], first, *lens.surfaces[2:]))
+        figure = rt.layout(wide).plot()
+        assert all(np.abs(line.get_ydata()).max() < 50 for line in figure.axes[0].lines)
+        space, plain = (rt.layout(one, view="3d").plot().axes[0] for one in (wide, lens))
+        assert space.get_zlim() == pytest.approx(plain.get_zlim(), abs=5)
+
+
+def test_obscurations_are_seen_in_space(monkeypatch):
+    lens = rt.read_lens("cooke_triplet")
+    vane = rt.Aperture("rectangular", (2.0, 6.0), True)
+    surface = dataclasses.replace(lens.surfaces[1], apertures=(vane,))
+    lens, drawn = dataclasses.replace(lens, surfaces=(lens.surfaces[0], surface, *lens.surfaces[2:])), []
+    monkeypatch.setattr(layout_3d, "_add_tiles", lambda axes, tiles, **look: drawn.append((look["facecolor"], tiles)))
+    rt.layout(lens, view="3d").plot()
+    (tiles,) = [tiles for colour, tiles in drawn if colour == "#8c8c8c"]
+    corners = np.concatenate(tiles)  # z, x and y
+    size = float(lens.surfaces[1].semi_diameter) / 40  # of a tile
+    assert np.abs(corners[:, 1]).max() == pytest.approx(2.0, abs=size)
+    assert np.abs(corners[:, 2]).max() == pytest.approx(6.0, abs=size)
+
+
 def test_a_decentred_aperture_shows_that_part_of_a_mirror():
     part = rt.Aperture("circular", (0.0, 54.0), False, (0.0, 100.0))
     mirror = dict(radius=-1000.0, conic=-1.0, thickness=-500.0, glass="MIRROR", apertures=(part,))
@@ -114,3 +143,13 @@ def test_rays_by_wavelength_show_the_spectrum_on_the_image():
     traced = rt.spot(lens, wavelengths=[0.45, 0.55, 0.65]).centroid[1, 0]
     drawn = [float(np.mean(line.get_ydata())) for line in lines]
     assert drawn == pytest.approx(traced.tolist(), abs=0.01)
+
+
+def test_two_planes_in_one_place_are_drawn(tmp_path):
+    """The length of the figure is then that of the beam's width."""
+    rows = [dict(thickness=0)]
+    flat = rt.lens(rows, stop=1, entrance_pupil_diameter=1, object_distance=3, wavelengths=[0.55])
+    for view in ("section", "3d"):
+        path = tmp_path / f"{view}.png"
+        rt.layout(flat, **({} if view == "section" else {"view": view})).plot(path)
+        assert path.stat().st_size > 1000

@@ -160,7 +160,13 @@ def rows_of(name):
     if len(lens.wavelengths) > 1:
         found += [Row("AXCL"), Row("AXCL", (1, 2), (0.7, 0, 0, 0)), Row("LACL"), Row("SPHA", (0, 2))]
     if float(lens.fields.y.abs().max()) > 0:
-        found += [Row("DIST"), Row("DIMX"), Row("DISC"), Row("DIST", (0, 0), (1.0, 0, 0, 0))]
+        found += [
+            Row("DIST"),
+            Row("DIMX"),
+            Row("DIMX", (0, 0), (0.0, 5.0, 0.0, 0.0)),
+            Row("DISC"),
+            Row("DIST", (0, 0), (1.0, 0, 0, 0)),
+        ]
     return found + [Row(o, (0, 0), (0.0, 0.6, 0.0, 0.0)) for o in ("FCGS", "FCGT")]
 
 

@@ -257,6 +257,41 @@ def test_derivatives_of_every_row_are_those_of_finite_differences(case):
     assert np.abs(found.jacobian).max() > 0
 
 
+@pytest.mark.parametrize("name", ["mirrors", "aspheres", "unusual"])
+def test_edges_at_the_rim_are_those_of_the_sags_there(name):
+    """Of every gap, by its definition, and the derivatives by differences, those of the heights included."""
+    found, sizes = LENSES[name](), semi_diameters(LENSES[name]())
+    model, last = Model(found, VARY[name]), len(found.surfaces) - 1
+    kept, glassy = found.surfaces[0].glass, []
+    for one in found.surfaces:
+        kept = kept if one.is_mirror or one.is_break else one.glass
+        glassy.append(abs(float(nd(kept)) - 1) > 1e-3)
+    gaps = [k for k in range(1, last) if not found.surfaces[k].is_break]
+    ends = {k: next((j for j in range(k + 1, last) if not found.surfaces[j].is_break), last) for k in gaps}
+    of_element = dict(enumerate(sizes))
+    for k in gaps:
+        if glassy[k]:
+            for j in (k, ends[k]):
+                of_element[j] = max(of_element[j], sizes[k], sizes[ends[k]])
+    rows, expected = [], []
+    for k in gaps:
+        pair = k, ends[k]
+        rim = max(sizes[j] for j in pair) if glassy[k] else min(of_element[j] for j in pair)
+        parts = [found.surfaces[j] for j in pair]
+        front, back = (float(sag_at(one, scalar(0.0), scalar(rim))) + past_edge(one, rim) for one in parts)
+        rows.append(Row("ETVA", (k, 0), (0, 0, 0, 1), target=0.0, weight=1.0))
+        expected.append(sum(float(one.thickness) for one in found.surfaces[k : ends[k]]) + back - front)
+    evaluation = Evaluation(model, rows)
+    computed = evaluation(model.start, derivatives=True)
+    assert computed.values == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    for number, at in enumerate(model.start):
+        step = np.zeros(len(model.start))
+        step[number] = 1e-6 * (abs(at) or 1e-2)
+        ahead, back = evaluation(model.start + step), evaluation(model.start - step)
+        by = (ahead.residuals - back.residuals) / (2 * step[number])
+        assert computed.jacobian[:, number] == pytest.approx(by, rel=2e-5, abs=1e-6 * np.abs(by).max() + 1e-7)
+
+
 @pytest.mark.parametrize(
     ("name", "engine"),
     [

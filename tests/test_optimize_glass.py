@@ -165,6 +165,24 @@ def test_the_lens_is_written_with_its_glasses_and_reads_the_same(found, tmp_path
 
 
 @pytest.mark.slow
+def test_the_figure_has_the_merit_of_every_step_of_the_choice(found):
+    figure = found.draw()
+    (axes,) = (
+        one
+        for each in figure.subfigs
+        for sub in [each, *each.subfigs]
+        for one in sub.axes
+        if "Merit" in one.get_title()
+    )
+    merits = axes.lines[0].get_ydata()
+    assert merits[: 1 + len(found.glasses)] == pytest.approx(
+        [found.merit_before, *(one.reached for one in found.glasses)]
+    )
+    assert len(merits) == 1 + len(found.glasses) + len(found.history) > 3
+    assert axes.get_xlabel().startswith("step of the choice of glasses")
+
+
+@pytest.mark.slow
 def test_it_is_reproducible(triplet, found):
     again = rt.optimize(triplet, merit=MERIT, vary="curvature thickness glass", hold="efl=100", cycles=40)
     assert again.merit_after == found.merit_after

@@ -646,3 +646,19 @@ def test_a_lens_file_of_oslo_is_converted_and_gone_on_with(tmp_path, capsys):
     assert "(len)" in capsys.readouterr().out
     with pytest.raises(LensFileError, match=r"a \.len file is read, but not written"):
         convert(path, tmp_path / "again.len")
+
+
+def test_a_binary_file_is_named_as_one_of_code_v(tmp_path):
+    """CODE V saves lenses under the same suffix; a damaged text is none."""
+    path = tmp_path / "lens.len"
+    path.write_bytes(b"CODEV\0\0\1" + bytes(range(256)) * 8)
+    with pytest.raises(LensFileError, match=r"lens\.len: is binary: a \.len file of CODE V.*sequence file \(\.seq\)"):
+        read_lens(path)
+    path.write_text("RDM;LEN\nSO 0 1e13\nS 50 4 NBK7\nSI 0 0\n")
+    with pytest.raises(LensFileError, match=r"the commands are those of CODE V: rename the file to \.seq"):
+        read_lens(path)
+    path.write_bytes(text(SINGLET).encode() + b"\x07\n")
+    with pytest.raises(LensFileError, match=r"holds the character U\+0007"):
+        read_lens(path)
+    path.write_bytes(text(SINGLET, "EBR 5", "ANG 10").encode("utf-16"))
+    assert len(read_lens(path).surfaces) == 4

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from page import outside
-from problems import number
+from problems import number, own_fields
 
 from raytrace import analysis, read_lens
 from raytrace.cli import main
@@ -19,10 +19,6 @@ from raytrace.psf_models import close_up_of, psf
 from raytrace.psf_models.figures import DECADES, psf_grid
 
 LENSES = Path(__file__).parents[1] / "lenses"
-
-
-def own_fields(lens) -> torch.Tensor:
-    return torch.stack([lens.fields.x, lens.fields.y])
 
 
 def seen(name: str, model: str, **options):

@@ -107,3 +107,30 @@ def test_impossible_poses_of_a_typed_row_are_refused():
         rt.lens([row | dict(tiltx=2)], stop=1, f_number=9)
     with pytest.raises(rt.BadPrescription, match="'steep' is not a number"):
         rt.lens([row | dict(tilt_x="steep")], stop=1, f_number=9)
+
+
+def test_a_catalog_that_is_not_there_is_refused_by_its_name():
+    """A list of catalogs that are not searched would take the glass from another one in silence."""
+    rows = [dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=90)]
+    with pytest.raises(ValueError, match=r"catalogs: 'no such file' is no shipped catalog.*SCHOTT, OHARA"):
+        rt.lens(rows, stop=1, entrance_pupil_diameter=10, catalogs=["SCHOTT", "no such file"])
+    assert rt.lens(rows, stop=1, entrance_pupil_diameter=10, catalogs=["nikon"]).catalogs == ("nikon",)
+
+
+def test_poses_of_the_object_other_than_tilts_are_refused():
+    """A tilt of the object is traced (test_launch); its place is stated by the fields and the distance."""
+    rows = [dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=90)]
+    near = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=200, fields=[5])
+    for numbers, message in (
+        (dict(y=1), r"surface 0: the object is decentred \(y\)"),
+        (dict(tilt_x_after=1), "surface 0: a pose behind the object"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            near.replace(0, **numbers)
+    with pytest.raises(ValueError, match="surface 0: a tilted object at infinity"):
+        rt.lens(rows, stop=1, entrance_pupil_diameter=10).replace(0, tilt_x=1)
+    by_angle = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=200, field_kind="angle", fields=[5])
+    with pytest.raises(ValueError, match=r"fields of the kind angle.*expected object heights"):
+        by_angle.replace(0, tilt_x=1)
+    with pytest.raises(ValueError, match="surface 0 is tilted"):
+        rt.seidel(near.replace(0, tilt_x=1))

@@ -13,6 +13,7 @@ from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid, gauss_rings, grid
 from raytrace.psf_models import NotConverged, fourier, psf, wave
 from raytrace.psf_models.dft import huygens
+from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
 from raytrace.tracing.paraxial import first_order
@@ -160,7 +161,7 @@ def test_single_precision_keeps_the_kernel(model, distance):
 def test_single_precision_keeps_the_strehl_ratio():
     s = scene_of(slow(sensor=57.6), 5.0, 25e3)
     rounded = to(s, dtype=torch.float32)
-    narrow, wide = wave.strehl(rounded), wave.strehl(to(rounded, dtype=torch.float64))
+    narrow, wide = strehl(rounded), strehl(to(rounded, dtype=torch.float64))
     assert narrow.dtype == torch.float32
     assert 0.1 < float(narrow) < 0.9
     assert abs(float(narrow) - float(wide)) < 1e-6
@@ -177,7 +178,7 @@ def test_a_parabolic_mirror_is_perfect(obstruction):
     hole = (Aperture("circular", (obstruction * radius, 5.0)),) if obstruction else ()
     mirror = problems.surface(-0.5 / focus, -focus, problems.MIRROR, conic=-1.0, apertures=hole)
     s = scene_of(problems.lens([mirror], aperture=("entrance_pupil_diameter", 2 * radius)), 0.0, math.inf)
-    assert float(wave.strehl(s)) == pytest.approx(1.0, abs=1e-6)
+    assert float(strehl(s)) == pytest.approx(1.0, abs=1e-6)
     pixel = 1e-4
     peak = float(wave.kernels(s, grid(pixel, 1)).kernel.sum()) / pixel**2
     a = radius / (0.55e-3 * focus)

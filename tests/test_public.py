@@ -8,6 +8,7 @@ import inspect
 import json
 import pkgutil
 import re
+import subprocess
 import sys
 
 import pandas as pd
@@ -45,6 +46,40 @@ def test_every_public_name_matches_the_table_after_importing_all_modules():
         defined = getattr(importlib.import_module(f"raytrace.{module}"), own or name)
         assert (found.__wrapped__ if inspect.isfunction(found) else found) is defined, name
         assert not isinstance(found, type(sys)), name
+
+
+@pytest.mark.slow
+def test_eight_threads_call_functions_first_in_a_fresh_process():
+    code = """if True:
+        import threading
+        import raytrace as rt
+        values, gate = [], threading.Barrier(8)
+        def call(function):
+            gate.wait()
+            values.append(getattr(rt, function)("cooke_triplet"))
+        threads = [threading.Thread(target=call, args=(name,)) for name in 2 * ["spot", "psf", "wavefront", "mtf"]]
+        for thread in threads: thread.start()
+        for thread in threads: thread.join()
+        print(len(values))
+    """
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stdout == "8\n", done.stderr
+
+
+def test_a_warning_is_given_once_for_all_lines_that_call():
+    for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
+        if not found.name.startswith(("raytrace.bench.peers", "raytrace.__main__")):
+            importlib.import_module(found.name)
+
+    def below(kind: type) -> set[type]:
+        return {kind}.union(*map(below, kind.__subclasses__()))
+
+    categories = {kind for kind in below(Warning) if kind.__module__.startswith("raytrace.")}
+    assert len(categories) > 15
+    assert all(issubclass(kind, rt.RaytraceWarning) for kind in categories)
+    code = "import raytrace as rt\nlens = rt.read_lens('double_gauss')\n" + 3 * "rt.spot(lens)\n" + "rt.ray_fan(lens)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stderr.count("rays miss the stop") == 1, done.stderr
 
 
 def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):

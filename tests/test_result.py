@@ -1,6 +1,8 @@
 """A number has one unit: the text of a result prints the numbers of its table, its CSV and its JSON."""
 
+import dataclasses
 import functools
+import html
 import math
 import re
 
@@ -76,6 +78,7 @@ def results() -> dict[str, tuple]:
             lambda: rt.search(single, merit="spot", vary=["sensor"], starts=1, seconds=5),
             "merit efl rms_1_um rms_2_um rms_3_um",
         ),
+        "first_order": (lambda: rt.first_order(double), "power effective_focal_length optical_invariant"),
         "info": (lambda: rt.info(double), "radius thickness semi_diameter index"),
         "trace": (lambda: rt.trace(double), "x y z opl"),
         "glass": (lambda: rt.glass("N-BK7", temperature=40), "wavelength index dn_dt dn_dt_absolute"),
@@ -131,6 +134,51 @@ def test_text_table_and_document_have_the_same_units(name):
             for power in _POWERS:
                 scaled = [other * 10.0**power for other in every if other]
                 assert not is_listed(number, error, scaled), f"text: {number:g}, table: this times 1e{-power}"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", [n for n in results() if n not in DEAR and n != "trace"])  # whose text is CSV
+def test_a_notebook_shows_the_words_and_numbers_of_the_text(name):
+    page = computed(name)._repr_html_()
+    shown = html.unescape(re.sub(r"<br>|<[^>]*>", " ", page)).split()
+    written = str(computed(name)).split()
+    assert sorted(shown) == sorted(written)
+    assert page.count("<table>") == len([table for table in computed(name).tables() if table.columns])
+
+
+def test_a_long_table_is_cut_in_a_notebook():
+    rays = rt.trace("double_gauss", rt.rays("double_gauss"))
+    assert rays._repr_html_().count("<tr>") == 1 + 100
+    assert f"and {len(rays.to_frame()) - 100:,} rows" in rays._repr_html_()
+
+
+def test_x_of_fields_is_printed_where_it_is_not_0_under_the_names_of_the_frame():
+    lens = rt.read_lens("double_gauss")
+    axis, beside = (rt.distortion(lens, fields=fields) for fields in ([0, 5], [(0, 0), (3, 5)]))
+    assert str(axis).split()[0] == "field_y"
+    assert str(beside).split()[:2] == ["field_x", "field_y"]
+    assert {"field_x", "field_y"} <= {*beside.to_frame()}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_values_and_batches_print_large_tensors_by_shape_and_range():
+    lens = rt.read_lens("double_gauss")
+    batch = rt.batch([lens.replace(1, radius=60.0 + k) for k in range(50)])
+    values = [lens, batch, *lens.surfaces, *batch.surfaces, lens.fields, lens.aperture]
+    values += [rt.rays(lens), rt.spot(lens).whole, rt.base_ray(lens), rt.trace(lens), rt.first_order(batch)]
+    values += [rt.render("singlet", torch.rand(1, 16, 16), sensor=rt.Sensor(size=(1, 1), pixels=(16, 16)))]
+    for value in values:
+        assert "tensor(" not in repr(value), type(value)
+        assert len(repr(value)) < 2500, type(value)
+    assert repr(batch).startswith("<Lens: ")
+    assert "50 lenses of 13 surfaces" in repr(batch)
+    number, radii = batch.surfaces[2].thickness, batch.surfaces[1].curvature
+    assert f"thickness={float(number):.6g}, " in repr(batch.surfaces[2])
+    assert f"curvature=<(50,) float64, {float(radii.min()):.6g} … {float(radii.max()):.6g}>" in repr(batch.surfaces[1])
+    assert "first-order data of 50 lenses" in repr(rt.first_order(batch))
+    shown = []
+    torch.func.vmap(lambda k: shown.append(repr(dataclasses.replace(lens.surfaces[1], curvature=k))) or k)(radii)
+    assert shown[0].startswith("Surface(")
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -1,5 +1,6 @@
 """Global search: starts, the journal, distinct minima, the function and its command."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -335,14 +336,18 @@ def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
 
         set_postfix_str = close = lambda self, *arguments: None
 
-    with pytest.raises(NoProblem, match="from 0 starts"):
+    with pytest.raises(NoProblem, match=r"from 0 starts; the nearest of 4 descents, in .*nearest.zmx: ") as error:
         rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, progress=Bar, **HOW)
+    assert "it is not at its minimum yet" in str(error.value) or "efl=50 at " in str(error.value)
+    nearest = rt.read_lens(tmp_path / "nearest.zmx")
+    assert float(rt.first_order(nearest).effective_focal_length) == pytest.approx(50, rel=1e-3)
     kept = (tmp_path / "search.jsonl").read_text().splitlines()
     assert 1 + 4 <= len(kept) < 1 + 8
     whole = rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, **HOW)
     assert torch.equal(whole.variables, found.variables)
     assert torch.equal(whole.found, found.found)
     assert whole.tasks == found.tasks
+    assert not (tmp_path / "nearest.zmx").exists()
 
 
 @pytest.mark.slow
@@ -440,3 +445,30 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
         assert not found.jacobian.any()
     found = rt.search(plate, merit="spot", vary="curvature sensor", hold="efl=100", starts=1, seed=0)
     assert float(rt.first_order(found.lenses[0]).effective_focal_length) == pytest.approx(100, rel=1e-9)
+
+
+def test_a_search_without_a_lens_names_what_its_nearest_one_misses(plate):
+    """F/5 is not F/3, which no linear model of one point excludes."""
+    with pytest.raises(
+        NoProblem, match=r"from 2 starts; the nearest of \d+ descents: .*working_f_number=3 at"
+    ) as error:
+        rt.search(plate, hold="efl=50 working_f_number=3", starts=2, **HOW)
+    assert "hold less" in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_triplet_from_plates_with_two_limits_and_real_aiming():
+    """50 mm, F/4, 20°: limits of back focal distance and distortion are met together, as the analyses say."""
+    rows = [(4, "N-LAK9"), (4,), (4, "N-SF5"), (4,), (4,), (4, "N-LAK9"), (40,)]
+    rows = [dict(zip(("thickness", "glass"), row, strict=False)) for row in rows]
+    colours = {"wavelengths": [0.4861327, 0.5875618, 0.6562725], "primary_wavelength": 2, "catalogs": ["schott"]}
+    plates = rt.lens(rows, stop=5, entrance_pupil_diameter=12.5, fields=[0, 14, 20], **colours)
+    plates = dataclasses.replace(plates, ray_aiming="real")
+    merit = rt.DefaultMerit("spot", glass_thickness=(1.5, 8), air_thickness=(0.5, 12), edge=1)
+    hold = "efl=50 bfd>=35 distortion<=2%"
+    found = rt.search(plates, merit=merit, vary="curvature thickness", hold=hold, starts=1)
+    for lens in found.lenses:
+        assert float(rt.first_order(lens).effective_focal_length) == pytest.approx(50, rel=1e-6)
+        assert float(lens.surfaces[-2].thickness) >= 35 - 1e-4
+        assert float(rt.distortion(lens).f_tan[:, 1].abs().max()) <= 0.02 + 1e-6
+    assert float(found.merit[0]) < 0.02

@@ -10,6 +10,7 @@ from differences import gradcheck, gradgradcheck
 from problems import floats, number
 from test_hardcases import of_kind
 
+import raytrace as rt
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
@@ -213,3 +214,26 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     assert found[0]["reference"] == "centroid"
     assert all(a["rms_radius_um"] != b["rms_radius_um"] for a, b in zip(*(d["results"] for d in found), strict=True))
     assert main([*arguments, "--rays", "1000", "--reference", "chief"]) == 1
+
+
+@pytest.mark.filterwarnings("ignore::raytrace.UnfilledStop")
+def test_spots_of_a_batch_are_those_of_its_lenses():
+    """Irregular surfaces, some lenses clipped; and a batch of none."""
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0], wavelengths=[0.5876])
+    radius = 0.5 * float(rt.first_order(lens).entrance_pupil_diameter) + 0.3
+    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, radius)),))
+    rows = rt.tolerances(lens, "irregularity:3=0.5 element_decenter:1=1", compensators=[])
+    errors = rt.draw_errors(rows, 3, seed=1)
+    errors[0, -2:] = 0
+    lenses = rt.perturbed(lens, rows, errors)
+    for reference in ("centroid", "chief"):
+        several = rt.spot(lenses, rings=4, reference=reference)
+        clipped = (several.rays < several.launched).flatten(1).any(-1)
+        for k in range(3):
+            alone = rt.spot(rt.perturbed(lens, rows, errors[k]), rings=4, reference=reference)
+            for name in ("rms_radius", "geometric_radius", "rays"):
+                torch.testing.assert_close(getattr(several, name)[k], getattr(alone, name), rtol=1e-10, atol=0)
+            torch.testing.assert_close(several.whole.rms_radius[k], alone.whole.rms_radius, rtol=1e-10, atol=0)
+    assert bool(clipped.any())
+    assert not bool(clipped.all())
+    assert rt.spot(rt.perturbed(lens, rows, torch.zeros(0, len(rows)))).rms_radius.shape == (0, 1, 1)

@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
+from raytrace.tracing.spot import image_rays
 
 LIMITS = "radius=0.1% thickness=0.03 element_decenter=0.03 element_tilt=0.05"
 
@@ -43,8 +44,7 @@ def focused(lens):
 
 def check_changes(lens, rows, judge, accuracy):
     """The changes at both limits of every row are those of single lenses, judged one by one."""
-    arms = rt.gauss_rings(4)[0].shape[1] // 4
-    found = rt.tolerance(lens, rows, trials=0, arms=arms)
+    found = rt.tolerance(lens, rows, trials=0, rings=4)
     nominal = judge(lens)
     assert float(found.nominal) == pytest.approx(nominal, abs=accuracy)
     for n in range(len(rows)):
@@ -242,9 +242,7 @@ def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
     lens = rt.read_lens("cooke_triplet")  # auto: off, whose elements are tilted then
     rows = rt.tolerances(lens, grade="precision", compensators=[])
     assert rt.perturbed(lens, rows, [0.0] * len(rows)).ray_aiming == "off"
-    nominal = rt.tolerance(
-        lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, arms=rt.gauss_rings(4)[0].shape[1] // 4
-    ).nominal
+    nominal = rt.tolerance(lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, rings=4).nominal
     assert float(nominal) == pytest.approx(rms(lens.at(fields=[0, 8.4, -8.4])), abs=1e-9)
 
 
@@ -299,3 +297,147 @@ def test_trials_without_light_are_counted_by_every_criterion():
     assert bool(dark[0].any())
     assert not bool(dark[0].all())
     assert torch.equal(*dark)
+
+
+# -- one sampling rule, all configurations, lost light ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss", "cemented_achromat"])
+def test_the_nominal_criterion_is_that_of_spot(name):
+    lens = rt.read_lens(name)
+    rows = rt.tolerances(lens, "thickness=0.01", compensators=[])
+    whole, weight = rt.spot(lens).whole, lens.fields.weight
+    root = float(((weight * whole.mean_square_radius).sum() / weight.sum()).sqrt())
+    assert float(rt.tolerance(lens, rows, trials=0).nominal) == pytest.approx(1e3 * root, rel=1e-4)
+
+
+def clipped_triplet():
+    rims = {k: (rt.Aperture("circular", (0.0, 10.0)),) for k in (1, 6)}
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="off")
+    for k, apertures in rims.items():
+        lens = lens.replace(k, apertures=apertures)
+    return lens
+
+
+def test_the_nominal_criterion_of_a_clipped_lens_is_that_of_its_clear_pupil():
+    lens = clipped_triplet()
+    rows = rt.tolerances(lens, "thickness=0.01", compensators=[])
+    spots = rt.spot(lens)
+    assert bool((spots.rays < spots.launched).any())
+    root = float((lens.fields.weight * spots.whole.mean_square_radius / lens.fields.weight.sum()).sum().sqrt())
+    found = rt.tolerance(lens, rows, trials=0, fields=None)
+    assert float(found.nominal) == pytest.approx(1e3 * root, rel=1e-4)
+
+
+def test_light_that_a_lens_loses_is_counted_and_bounded():
+    """A rim that moves across the beam by 4 mm: its share of the pupil of the axial field is that of two discs."""
+    lens = rt.lens(
+        [{"thickness": 1.0}, {"radius": 50.0, "thickness": 5.0, "glass": "N-BK7"}, {"radius": -50.0, "thickness": 45}],
+        stop=1, entrance_pupil_diameter=10.0, fields=(0.0,), wavelengths=(0.5876,),
+    )  # fmt: skip
+    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, 6.0)),))
+    rows = rt.Tolerances((rt.Tolerance("surface_decenter_x", (1,), -4.0, 4.0), rt.Tolerance("thickness", (2,), -1, 1)))
+    d, R, r = 4.0, 6.0, 5.0
+    a, b = (math.acos((d * d + s * s - t * t) / (2 * d * s)) for s, t in ((r, R), (R, r)))
+    both = r * r * (a - math.sin(2 * a) / 2) + R * R * (b - math.sin(2 * b) / 2)
+    found = rt.tolerance(lens, rows, trials=40, seed=2)
+    assert float(found.lost_maximum[0]) == pytest.approx(1 - both / (math.pi * r * r), abs=0.02)
+    assert float(found.lost_maximum[1]) == 0
+    assert bool(found.maximum[0].isnan())
+    failed = found.trials.isnan()
+    assert torch.equal(failed, found.lost > found.loss)
+    assert 0 < int(failed.sum()) < 40
+    text = str(found)
+    assert f"{int(failed.sum())} failed, by more than 5 %, and count as worse than all others" in text
+    assert "1 tolerances lose more than 5 % of the light at a limit: not in RSS" in text
+    assert "no compensator" in text
+    assert bool(found.estimated.isfinite())
+    free = rt.tolerance(lens, rows, trials=40, seed=2, loss=1.0)
+    assert not bool(free.trials.isnan().any())
+    torch.testing.assert_close(free.trials[~failed], found.trials[~failed])
+
+
+def test_all_configurations_are_judged():
+    lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
+    rows = [rt.Tolerance("operand", (), -0.1, 0.1, configuration=k + 1, operand=0) for k in range(2)]
+    rows = rt.Tolerances((*rows, rt.Tolerance("thickness", (1,), -0.05, 0.05)))
+    found = rt.tolerance(lens, rows, trials=0)
+    assert found.configurations == 2
+    assert float(found.maximum.abs().min()) > 1e-4
+    for errors in torch.eye(3, dtype=torch.float64) * rows.maximum:
+        squares = []
+        for each in lens.configurations:
+            alone = rt.tolerance(
+                dataclasses.replace(rt.perturbed(each, rows, errors), operands=()),
+                rt.Tolerances((rt.Tolerance("thickness", (1,), -1e-9, 1e-9),)), trials=0,
+            )  # fmt: skip
+            squares.append(float(alone.nominal) ** 2)
+        k = int(errors.argmax())
+        assert float(found.nominal + found.maximum[k]) == pytest.approx((sum(squares) / 2) ** 0.5, rel=1e-4)
+
+
+def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
+    """The same analysis by the lens, by its tolerances as read, and by the command."""
+    lines = ["TOL TTHI 2 3 -0.05 0.05 0 0 0", "TOL TRAD 1 0 -0.1 0.1 0 0 0"]
+    for extra, count in (([], 0), (["TOL COMP 7 0 -0.1 0.1 0 0 0"], 1)):
+        file = tmp_path / f"tolerances{count}.zmx"
+        rt.write_lens(rt.read_lens("cooke_triplet"), file)
+        text = file.read_text(encoding="utf-16" if file.read_bytes()[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
+        file.write_text(text + "\n".join([*extra, *lines]) + "\n", encoding="utf-8")
+        lens = rt.read_lens(file)
+        by_lens, by_file = rt.tolerance(lens, trials=8), rt.tolerance(lens, rt.read_tolerances(file), trials=8)
+        assert len(by_lens.tolerances.compensators) == count
+        assert torch.equal(by_lens.trials, by_file.trials)
+        assert torch.equal(by_lens.maximum, by_file.maximum)
+
+
+# -- studies that fail in part -----------------------------------------------------------------------------------------
+
+
+def test_a_compensator_listed_twice_is_refused(triplet):
+    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(7), rt.Compensator(7)])
+    with pytest.raises(rt.BadTolerance, match="two of them do the same to the criterion; leave one out"):
+        rt.tolerance(triplet, rows, trials=0)
+
+
+@pytest.mark.parametrize("decentre", [30.0, 60.0])
+def test_trials_without_light_leave_the_figures_of_the_others(triplet, decentre, tmp_path):
+    lens = triplet.at(fields=[0, 8.4])
+    rows = rt.Tolerances(
+        (rt.Tolerance("element_decenter_y", (3, 4), -decentre, decentre, distribution="end_points"),
+         rt.Tolerance("element_decenter_y", (1, 2), -0.1, 0.1)),
+        (rt.Compensator(7),),
+    )  # fmt: skip
+    if decentre == 30:
+        rows = dataclasses.replace(rows, rows=(dataclasses.replace(rows[0], distribution="normal"), rows[1]))
+    found = rt.tolerance(lens, rows, trials=24, seed=3)
+    text, summary = str(found), found.summary()
+    assert bool(found.estimated.isfinite())
+    assert "nan" not in text.split("tolerance ")[0].replace("mean nan, σ nan, best nan, worst nan", "")
+    assert summary["failed"] == (24 if decentre == 60 else int(found.trials.isnan().sum())) > 0
+    assert math.isfinite(summary["mean"]) == (decentre == 30)
+    found.draw().savefig(tmp_path / "figure.png")
+
+
+def rms_angle(lens):
+    """RMS angle, mrad, of the directions of rays at the sensor about their mean, of all fields."""
+    points, weights = rt.gauss_rings(12)
+    directions = image_rays(lens, points).direction.flatten(-2)
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    weights = (shares[:, None] * weights).flatten()
+    offset = directions - (weights * directions).sum(-1, keepdim=True)
+    return 1e3 * float((weights * offset.square().sum(0)).sum(-1).mean().sqrt())
+
+
+def test_an_afocal_lens_is_judged_in_angle(tmp_path):
+    """Against the directions of the rays; a file keeps the kind of image space."""
+    lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0, 8.4, -8.4])
+    lens = dataclasses.replace(lens, afocal=True)
+    rt.write_lens(lens, tmp_path / "afocal.zmx")
+    with pytest.warns(UserWarning, match="afocal image space"):
+        assert rt.read_lens(tmp_path / "afocal.zmx").afocal
+    found = rt.tolerance(lens, rt.tolerances(lens, "element_decenter:3=0.05"), trials=4)
+    assert (found.criterion, found.unit) == ("RMS angle", "mrad")
+    assert not bool(found.changes.any())  # the sensor distance has no effect
+    for judged, each in ((found.nominal, lens), (found.trials[2], found.trial(2))):
+        assert float(judged) == pytest.approx(rms_angle(each), rel=1e-4)

@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from problems import number
@@ -17,6 +18,7 @@ from raytrace.system.sag_terms import FringeSag, GridSag, PolynomialSag, TiltSag
 from raytrace.system.surface import sag_at
 from raytrace.system.tolerance_data import KINDS
 from raytrace.tolerancing.grades import GRADES
+from raytrace.tolerancing.study import moments
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import trace_lens
 
@@ -225,6 +227,7 @@ ROWS = [
     (T("irregularity", (3,), -9, 9), 2.0),
     (T("irregularity_angle", (3,), -90, 90), 35.0),
     (T("zernike", (3,), -1, 1, term=7), 1e-4),
+    (T("fringe", (3,), -1, 1, term=8), 0.5),
     (T("element_decenter_x", (4, 5), -1, 1), 0.1),
     (T("element_decenter_y", (1, 3), -1, 1), -0.1),
     (T("element_decenter_z", (4, 5), -1, 1), 0.2),
@@ -327,6 +330,61 @@ def test_a_fringe_of_power_is_half_a_wave_of_sag_at_the_semi_diameter(nominal):
     assert float(sag_at(plane.surfaces[1], h, 0 * h)) == pytest.approx(0.6328e-3, rel=1e-12)
 
 
+#: Errors of a face, and the angles θx and θy that it is tilted by: a sphere about (sin θy cos θx, -sin θx, …)/c.
+TILTS = {
+    "surface_tilt_x": ("surface_tilt_x", 0.4, (0.4, 0.0)),
+    "surface_tilt_y": ("surface_tilt_y", -0.3, (0.0, -0.3)),
+    "surface_runout_x": ("surface_runout_x", 0.05, (0.0, -math.degrees(math.atan(0.05 / 16)))),
+    "surface_runout_y": ("surface_runout_y", 0.05, (math.degrees(math.atan(0.05 / 16)), 0.0)),
+    "element_tilt_x": ("element_tilt_x", 0.4, (0.4, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", TILTS)
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_a_tilted_sphere_is_the_sphere_about_a_moved_centre(name, k, nominal):
+    kind, value, tilts = TILTS[name]
+    found = rt.perturbed(nominal, [T(kind, (k, k) if kind.startswith("element") else (k,), -1, 1)], [value])
+    tilt_x, tilt_y = map(math.radians, tilts)
+    axis = np.array([math.sin(tilt_y), -math.sin(tilt_x) * math.cos(tilt_y), math.cos(tilt_x) * math.cos(tilt_y)])
+    start = launch(
+        nominal, torch.tensor([[0.0, 0.3], [0.5, -0.8]]).double(), fields=torch.tensor([[0.0], [5.0]]).double()
+    )
+    position, direction = (part.flatten(1).numpy() for part in (start.position, start.direction))
+    vertex, before = np.zeros(3), 1.0
+    for j, (curvature, thickness, *_) in enumerate(SURFACES, 1):
+        centre = vertex + (axis if j == k else np.array([0, 0, 1])) / curvature
+        offset = position - centre[:, None]
+        along, power = (offset * direction).sum(0), (offset**2).sum(0) - 1 / curvature**2
+        root = np.sign(curvature) * np.sqrt(along**2 - power)
+        position = position + (-along - root) * direction
+        normal = (centre[:, None] - position) * curvature
+        after = float(index(nominal.surfaces[j].glass, nominal.wavelengths))
+        cosine = (direction * normal).sum(0)
+        kept = np.sqrt(1 - (before / after) ** 2 * (1 - cosine**2))
+        direction = before / after * direction + (kept - before / after * cosine) * normal
+        vertex, before = vertex + np.array([0, 0, thickness]), after
+    position = position + (vertex[2] - position[2]) / direction[2] * direction
+    end = trace_lens(found, start, nominal.wavelengths[:, None]).position.flatten(1)
+    close(end[:2], torch.from_numpy(position[:2]), 1e-12)
+
+
+def test_the_change_by_a_wedge_is_that_of_a_decentred_sphere():
+    lens = rt.read_lens("double_gauss")
+    radius = float(lens.surfaces[1].radius)
+    rows = [T("surface_tilt_x", (1,), -0.1, 0.1), T("element_tilt_x", (1, 1), -0.1, 0.1)]
+    step = radius * math.sin(math.radians(0.1))
+    rows.append(T("element_decenter_y", (1, 1), -step, step))
+    rows, rays = (
+        rt.Tolerances(tuple(rows), (rt.Compensator(11),)),
+        {"fields": [0, 10, 14, -10, -14], "rings": 4, "arms": 6},
+    )
+    tilt, element, decentre = rt.tolerance(lens, rows, trials=0, **rays).maximum
+    assert float(tilt) == pytest.approx(float(element), rel=1e-12)
+    assert float(tilt) == pytest.approx(float(decentre), rel=3e-4)  # a sphere, shifted along z by R (1 - cos θ)
+    assert float(tilt) == pytest.approx(0.6031, abs=1e-4)  # a plane added to the sag had 6.627
+
+
 @pytest.mark.parametrize("angle", [0.0, 30.0])
 def test_irregularity_is_half_spherical_half_astigmatism(angle, nominal):
     rows = [T("irregularity", (2,), -9, 9), T("irregularity_angle", (2,), -90, 90)]
@@ -362,10 +420,10 @@ SAGS = {
 @pytest.mark.parametrize("name", SAGS)
 def test_sag_terms_stay_under_an_error(name, nominal):
     lens = nominal.replace(2, sag_terms=SAGS[name])
-    rows = [T("irregularity", (2,), -9, 9), T("surface_tilt_x", (2,), -1, 1)]
+    rows = [T("irregularity", (2,), -9, 9), T("zernike", (2,), -1, 1, term=3)]
     found = rt.perturbed(lens, rows, [3.0, 0.1])
     x, y = torch.tensor([[0.0, 3.0, -5.0], [1.0, -2.0, 4.0]], dtype=torch.float64)
-    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + y * math.tan(math.radians(0.1))
+    added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + 0.1 * 2 * y / 8
     close(sag_at(found.surfaces[2], x, y), sag_at(lens.surfaces[2], x, y) + added, 1e-15)
 
 
@@ -476,9 +534,42 @@ def test_errors_have_their_distribution(distribution, variance):
 
 
 def test_rows_of_a_group_share_an_rms():
-    rows = [T("zernike", (1,), -2e-4, 2e-4, term=j, group="a", distribution="uniform") for j in (4, 5, 6, 7)]
+    rows = [T("zernike", (1,), -2e-4, 2e-4, term=j, group="a", distribution="end_points") for j in (4, 5, 6, 7)]
     errors = rt.draw_errors([*rows, T("thickness", (1,), -1, 1)], 50)
     torch.testing.assert_close((errors[:, :4] ** 2).sum(1).sqrt(), torch.full((50,), 4e-4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("distribution", ["normal", "uniform", "parabolic"])
+def test_the_errors_of_a_group_have_a_random_direction_and_the_size_of_a_row(distribution):
+    rows = [T(f"surface_decenter_{axis}", (1,), -0.1, 0.1, group="a", distribution=distribution) for axis in "xy"]
+    errors = rt.draw_errors(rows, 20_000)
+    size = errors.square().sum(1).sqrt() / math.sqrt(2)
+    alone = rt.draw_errors([dataclasses.replace(rows[0], group="")], 20_000).abs().flatten()
+    quantiles = torch.linspace(0.1, 1, 9, dtype=torch.float64)
+    assert torch.allclose(torch.quantile(size, quantiles), torch.quantile(alone, quantiles), atol=2.5e-3)
+    angle = torch.atan2(errors[:, 1], errors[:, 0])
+    assert float(torch.stack([(n * angle).cos().mean() for n in (1, 2, 3)]).abs().max()) < 0.02
+    mean, variance = moments(rows[0])
+    assert mean == 0
+    assert float(errors.square().mean()) == pytest.approx(variance, rel=0.02)
+    assert float((errors[:, 0] * errors[:, 1]).mean()) == pytest.approx(0, abs=0.03 * variance)
+
+
+def test_errors_of_a_table_have_its_density():
+    density = ((0.0, 0.0), (0.2, 3.0), (0.5, 0.0), (0.9, 1.0), (1.0, 1.0))
+    row = T("thickness", (1,), -1.0, 3.0, distribution="table", density=density)
+    errors = rt.draw_errors([row], 50_000)[:, 0]
+    x, p = np.array(density).T
+    fine = np.linspace(0, 1, 4001)
+    share = np.interp(fine, x, p)
+    share = np.cumsum(share) / share.sum()
+    for cut in (0.1, 0.3, 0.6, 0.95):
+        assert float((errors < -1 + 4 * cut).double().mean()) == pytest.approx(np.interp(cut, fine, share), abs=6e-3)
+    mean, variance = moments(row)
+    assert float(errors.mean()) == pytest.approx(mean, abs=0.02)
+    assert float(errors.var()) == pytest.approx(variance, rel=0.02)
+    with pytest.raises(rt.BadTolerance, match="rising fractions"):
+        rt.draw_errors([dataclasses.replace(row, density=((0.5, 1.0), (0.2, 1.0)))], 1)
 
 
 # -- what a lens does not have ----------------------------------------------------------------------------------------
@@ -556,7 +647,7 @@ TOL TEZI 5 6 -3e-4 3e-4 4 0 0
 TOL TIND 1 0 -1e-3 1e-3 0 0 0
 TOL TPAR 4 2 -1e-6 1e-6 0 0 0
 TOL CPAR 4 3 -1e-8 1e-8 0 0 0
-TOL TEXI 4 9 -1 1 0 0 0
+TOL ISOB 4 9 -1 1 0 0 0
 TOL TQQQ 4 9 -1 1 0 0 0
 TOL TOFF 0 0 0 0 0 0 0
 """
@@ -599,9 +690,112 @@ def test_every_line_is_read_or_named(tmp_path):
         (5, "thickness", -2.0),
         (4, "a6", -1e-8),
     ]
-    assert [text.split(": ")[1] for text in found.unread] == ["TEXI", "TQQQ", "TOFF"]
+    assert [text.split(": ")[1] for text in found.unread] == ["ISOB", "TQQQ", "TOFF"]
+    checked = rt.check(path)
+    assert [text.split(": ")[1] for text in checked.unread_tolerances] == ["ISOB", "TQQQ", "TOFF"]
+    assert "    not read: tolerance line:20: TQQQ: an operand that is not known" in str(checked).splitlines()
     draws = rt.draw_errors(found, 4)
     assert rt.perturbed(rt.read_lens(path), found, draws).surfaces[4].coefficients.shape == (2, 4, 1, 1, 1)
+
+
+def lines_of(tmp_path, *lines):
+    return rt.read_tolerances(with_lines(tmp_path, "".join(f"TOL {line}\n" for line in lines)))
+
+
+def test_radial_decentres_are_groups_of_both_components(tmp_path):
+    found = lines_of(tmp_path, "STAT 1 0", "TSDR 4 0 -0.2 0.2", "TEDR 1 3 -0.1 0.1")
+    kinds = [(row.kind, row.surfaces, row.maximum, row.distribution) for row in found]
+    assert kinds == [
+        ("surface_decenter_x", (4,), pytest.approx(0.2 / math.sqrt(2)), "uniform"),
+        ("surface_decenter_y", (4,), pytest.approx(0.2 / math.sqrt(2)), "uniform"),
+        ("element_decenter_x", (1, 3), pytest.approx(0.1 / math.sqrt(2)), "uniform"),
+        ("element_decenter_y", (1, 3), pytest.approx(0.1 / math.sqrt(2)), "uniform"),
+    ]
+    sizes = rt.draw_errors(found, 500)[:, :2].square().sum(1).sqrt()
+    assert 0.19 < float(sizes.max()) <= 0.2
+    assert float(sizes.mean()) == pytest.approx(0.1, rel=0.1)
+    assert found.leaders.tolist() == [0, 0, 2, 2]
+
+
+def test_a_roll_turns_an_element_about_the_centre_of_its_seat(nominal, tmp_path):
+    lines = ("TARX 4 5 -2 1", "TARY 4 5 -1 2 5", "TRLX 4 5 -0.1 0.2", "TRLY 4 5 -0.1 0.2", "TRLR 4 5 -0.1 0.1 5")
+    angle_x, angle_y, along_x, along_y, *radial = lines_of(tmp_path, *lines)
+    assert (angle_x.kind, angle_x.minimum, angle_x.pivot) == ("element_tilt_x", -2, pytest.approx(1 / 0.03))
+    assert (angle_y.kind, angle_y.maximum, angle_y.pivot) == ("element_tilt_y", 2, pytest.approx(2.5 + 1 / 0.01))
+    # the seat is the same sphere, with its vertex elsewhere
+    for row, limit, axis in ((along_x, along_x.minimum, 0), (along_y, along_y.maximum, 1)):
+        rolled = rt.perturbed(nominal, [row], [limit])
+        pose = pose_of(rows_along([rolled.surfaces[4].before]))
+        assert float((pose.x, pose.y)[axis]) == pytest.approx(0.2, rel=1e-12)
+        rear = rt.perturbed(nominal, [T(row.kind, (5, 5), -9, 9, pivot=row.pivot - 2.5)], [limit])
+        close(hits(rolled, nominal), hits(rear, nominal), 1e-10)
+    assert [row.kind for row in radial] == ["element_tilt_y", "element_tilt_x"]
+    assert {row.group for row in radial} == {radial[0].source}
+
+
+def test_a_roll_on_a_plane_is_a_decentre_and_by_an_angle_nothing(tmp_path):
+    path = with_lines(tmp_path, "TOL TRLX 4 5 -0.1 0.2\nTOL TARX 4 5 -0.1 0.2\n")
+    path.write_text(path.read_text("utf-8").replace("CURV 0.03 0 0 0 0", "CURV 0 0 0 0 0"), encoding="utf-8")
+    found = rt.read_tolerances(path)
+    assert [(row.kind, row.minimum, row.maximum) for row in found] == [("element_decenter_x", -0.1, 0.2)]
+    assert "plane surface 4" in found.unread[0]
+
+
+def test_pivots_of_tilts_of_elements(tmp_path):
+    edge = 0.03 * 49 / (1 + math.sqrt(1 - (0.03 * 7) ** 2))
+    rear = 2.5 + 0.01 * 49 / (1 + math.sqrt(1 - (0.01 * 7) ** 2))
+    lines = [line for code in range(5) for line in (f"MPVT {code}", "TETX 4 5 -1 1")]
+    found = lines_of(tmp_path, "TETY 4 5 -1 1", *lines)
+    assert [row.pivot for row in found] == pytest.approx([0, 0, 2.5, edge, rear, 1.25], rel=1e-12)
+
+
+def test_fringe_terms_of_a_file_have_their_sum_of_squares_at_the_rim(nominal, tmp_path):
+    found = lines_of(tmp_path, "TWAV 0 0 0.5", "TEXI 2 8 -3 3 5")
+    assert [(row.kind, row.term, row.group != "") for row in found] == [("fringe", j, True) for j in range(5, 9)]
+    draws = rt.draw_errors(found, 20)
+    torch.testing.assert_close(draws.square().sum(1).sqrt(), torch.full((20,), 3.0).double())
+    lens = rt.perturbed(nominal, dataclasses.replace(found, rows=found.rows[:1]), [3.0])
+    x, y = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0]], dtype=torch.float64)
+    added = sag_at(lens.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
+    close(added, 3 * 0.25e-3 * torch.tensor([1.0, -1.0, 0.0]).double(), 1e-15)  # ρ² cos 2φ, half a wave a fringe
+
+
+def test_a_table_of_a_distribution_lies_beside_the_file(tmp_path):
+    tail = "TOL STAT 3 0 0 0 0 0 0\nTCMM lot.dat\nTOL TTHI 1 3 -0.1 0.1 0 0 0\n"
+    path = with_lines(tmp_path, tail)
+    without = rt.read_tolerances(path)
+    assert without[0].distribution == "normal"
+    assert "lot.dat is not beside the file" in without.unread[0]
+    (tmp_path / "lot.dat").write_text("0 1\n0.5 0\n1 3\n")
+    found = rt.read_tolerances(path)
+    assert (found[0].distribution, found[0].density) == ("table", ((0.0, 1.0), (0.5, 0.0), (1.0, 3.0)))
+    assert rt.tolerances(rt.read_lens(path))[0].density == found[0].density  # the lens holds the table
+    (tmp_path / "lot.dat").write_text("0 1\n0.5 x\n")
+    with pytest.raises(rt.LensFileError, match=r"lot.dat: expected two numbers a line"):
+        rt.read_lens(path)
+
+
+def test_a_group_is_at_its_limits_at_once_and_a_line_of_the_table(tmp_path):
+    found = lines_of(tmp_path, "COMP 5 0", "TEZI 5 6 -3e-4 3e-4 4", "TSDR 4 0 -0.2 0.2", "ISOB 1 0 -1 1")
+    lens = rt.read_lens(tmp_path / "made.zmx").at(fields=[0.0])
+    lens = rt.focus(lens).lens
+    built = rt.tolerance(lens, found, trials=0)
+    nominal, least, most = (
+        rt.focus(rt.perturbed(lens, found, errors), rings=8).lens
+        for errors in (torch.zeros(5), *(found.alone(limits)[0] for limits in (found.minimum, found.maximum)))
+    )
+    sizes = [1e3 * float(rt.spot(one, rings=8).rms_radius) for one in (nominal, least, most)]
+    assert float(built.minimum[0]) == pytest.approx(sizes[1] - sizes[0], abs=2e-3)
+    assert float(built.maximum[0]) == pytest.approx(sizes[2] - sizes[0], abs=2e-3)
+    assert built.minimum[[1, 2, 4]].tolist() == [0, 0, 0]
+    assert sorted(built.worst.tolist()) == [0, 3]
+    text = str(built)
+    assert "zernike 4 … zernike 6 of surface 5" in text
+    assert "surface_decenter_x … surface_decenter_y of surface 4" in text
+    assert "made.zmx:48: ISOB: figure by ISO 10110-5" in text.splitlines()[-1]
+    tight = rt.tolerance(lens, found, trials=0, increment=1e-3)
+    assert max(tight.minimum.max(), tight.maximum.max()) < 1.001e-3
+    assert len({round(row.maximum, 12) for row in tight.tolerances[:3]}) == 1
 
 
 def test_lengths_of_a_file_in_inches_become_millimetres(tmp_path):
@@ -624,6 +818,11 @@ def test_lengths_of_a_file_in_inches_become_millimetres(tmp_path):
         ("TOL TWAV 0 0 0", r"TWAV: test wavelength in µm is 0, expected more than 0"),
         ("TOL TEZI 4 300 -1 1", r"TEZI: terms 2 to 300"),
         ("TOL STAT 0 -1", r"STAT: -1 standard deviations"),
+        ("TOL STAT 4 0", r"STAT: distribution 4, expected 0 to 3"),
+        ("TOL TEXI 4 38 -1 1", r"TEXI: terms 2 to 38"),
+        ("TOL MPVT 5", r"MPVT: pivot 5, expected 0 to 4"),
+        ("TOL TARX 1 3 -1 1 4", r"TARX: the seat, surface 4, is not one of the element 1 to 3"),
+        ("TOL TRLX 1 3 -99 99", r"TRLX: a decentre beyond the radius 50 mm of surface 1"),
     ],
 )
 def test_a_line_that_the_lens_does_not_have_is_refused(line, message, tmp_path):

@@ -199,6 +199,53 @@ def test_numbers_are_typed_undone_and_redone_by_keys(page):
     assert cell(page, "thickness:4") > 2
 
 
+def test_keys_act_after_a_click_beside_the_controls(page):
+    changed(page, lambda: typed(page, "thickness:2", "13.5"))
+    page.mouse.click(640, 715)
+    page.locator("h1").click()
+    changed(page, lambda: page.keyboard.press("Control+z"))
+    assert cell(page, "thickness:2") == pytest.approx(12.93)
+    changed(page, lambda: page.keyboard.press("Control+Shift+z"))
+    assert cell(page, "thickness:2") == 13.5
+
+
+def test_an_arrow_key_moves_the_sensor_by_a_depth_of_focus_and_a_slider_ends_at_its_ends(page):
+    lens = rt.read_lens("cooke_triplet")
+    depth = 2e-3 * float(lens.primary) * float(rt.first_order(lens).f_number) ** 2
+    last = len(lens.surfaces) - 2
+    before = float(lens.surfaces[last].thickness)
+    page.focus(f'[data-cell="thickness:{last}"]')
+    changed(page, lambda: page.keyboard.press("ArrowUp"))
+    assert cell(page, f"thickness:{last}") == pytest.approx(before + depth, rel=1e-7)
+    changed(page, lambda: page.keyboard.press("Shift+ArrowDown"))
+    assert cell(page, f"thickness:{last}") == pytest.approx(before + 0.9 * depth, rel=1e-7)
+    slider = page.locator(f'[data-slider="thickness:{last}"]')
+    changed(page, lambda: slider.press("End"))
+    slider.press("ArrowRight")
+    assert cell(page, f"thickness:{last}") == pytest.approx(before + 50 * depth, rel=1e-7)
+    assert "thickness from" in slider.get_attribute("title")
+
+
+def test_numbers_under_the_pointer_are_those_of_the_figures(page):
+    settled(page)
+    lens = rt.read_lens("cooke_triplet")
+    box = page.locator('svg[data-figure="mtf"]').bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    lines = page.inner_text(".readout").splitlines()
+    frequency = float(lines[0].removesuffix("/mm"))
+    mtf = rt.mtf(lens, frequency)
+    for line, tangential, sagittal in zip(lines[1:], mtf.tangential, mtf.sagittal, strict=True):
+        read = re.search(r"T ([\d.]+), S ([\d.]+)", line)
+        assert float(read[1]) == pytest.approx(float(tangential), abs=0.02)  # of a frequency of three digits
+        assert float(read[2]) == pytest.approx(float(sagittal), abs=0.02)
+    for figure, unit in (("layout", "mm"), ("spot-0", "µm"), ("fan-1", "µm"), ("curvature", "mm")):
+        box = page.locator(f'svg[data-figure="{figure}"]').bounding_box()
+        page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + box["height"] / 2)
+        assert unit in page.inner_text(".readout"), figure
+    page.mouse.move(2, 2)
+    assert page.is_hidden(".readout")
+
+
 def test_every_control_is_reached_by_tab_and_has_a_name(page):
     page.focus("header button:enabled")
     for _ in range(400):
@@ -231,7 +278,7 @@ def test_a_number_that_is_no_number_is_one_message_and_changes_nothing(page):
 
 
 def test_a_lens_that_loses_all_rays_says_where_and_comes_back(page):
-    changed(page, lambda: typed(page, "radius:1", "1"))
+    changed(page, lambda: typed(page, "radius:1", "0.01"))
     settled(page)
     assert page.inner_text('[data-number="rms-0"]').strip() == "no ray arrives"
     assert page.locator('p[data-figure="mtf"]').inner_text() == "no MTF"
@@ -383,6 +430,31 @@ def test_no_request_without_the_token_of_another_origin_or_host_is_served(served
     policy = served.request("GET", f"/{with_token}").getheader("Content-Security-Policy")
     assert "default-src 'none'" in policy
     assert served.request("GET", f"/{with_token}").getheader("Referrer-Policy") == "no-referrer"
+
+
+def test_malformed_events_are_refused_and_the_server_goes_on(served):
+    def posted(text):
+        response = served.request(
+            "POST", f"/event?token={served.token}", text, Origin=f"http://127.0.0.1:{served.port}"
+        )
+        return response.status, response.read().decode()
+
+    def event(text):
+        return posted(f'{{"session": "malformed", "event": {text}}}')
+
+    for text in ("[" * 100_000, "[]", '{"session": [], "event": {}}', '{"session": "a", "event": [["type", "open"]]}'):
+        assert posted(text)[0] == 400
+    for text in (
+        '{"type": "settle", "field": Infinity}',
+        '{"type": "edit", "surface": 1, "quantity": "radius", "value": [1]}',
+        '{"type": "fields", "values": "0 1 2", "axis": "kind"}',
+        '{"type": "save", "path": "~nosuchuser/x.zmx"}',
+        f'{{"type": "wavelengths", "values": {[0.5 + 1e-5 * k for k in range(5000)]}}}',
+    ):
+        status, reply = event(text)
+        assert status == 200, text
+        assert json.loads(reply)["message"], text
+    assert json.loads(event('{"type": "open"}')[1])["analyses"]["spots"]["rms"]
 
 
 def test_a_page_without_the_token_shows_nothing(browser, served):

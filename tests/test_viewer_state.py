@@ -10,9 +10,10 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.system.optimization_data import OptimizationData, Vary
 from raytrace.viewer import compute
 from raytrace.viewer.session import Optimisation, Session
-from raytrace.viewer.state import initial, merit_of, reduce, shown_fields, variables
+from raytrace.viewer.state import initial, limits, merit_of, reduce, shown_fields, variables
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +75,20 @@ def test_a_drag_is_one_step(state):
         ({"quantity": "thicknes", "surface": 2, "value": 1}, "no 'thicknes'; it has thickness"),
         ({"quantity": "glass", "surface": 1, "value": "NO-GLASS"}, "NO-GLASS"),
         ({"quantity": "thickness", "surface": 2}, "'value' is missing"),
-        ({"quantity": "thickness", "surface": None, "value": 1}, "NoneType"),
+        ({"quantity": "thickness", "surface": None, "value": 1}, "surface is None; expected a whole number"),
+        ({"quantity": "thickness", "surface": 1.5, "value": 1}, "surface is 1.5; expected a whole number"),
+        ({"quantity": "thickness", "surface": 2, "value": [1]}, "value is a list; expected a number"),
+        ({"quantity": "thickness", "surface": 2, "value": -20}, "found -20 mm; expected 0 to 1e+06 mm"),
+        ({"quantity": "thickness", "surface": 3, "value": -0.1}, "found -0.1 mm; expected 0 to 1e+06 mm"),
+        ({"quantity": "thickness", "surface": 7, "value": 1e9}, "found 1e+09 mm; expected -1e+06 to 1e+06 mm"),
         ({"type": "fields", "values": "0, x"}, "fields: 'x' is not a number"),
-        ({"type": "fields", "values": ""}, "at least one number"),
+        ({"type": "fields", "values": ""}, "found 0 numbers; expected 1 to 200"),
+        ({"type": "fields", "values": [0.1] * 201}, "found 201 numbers; expected 1 to 200"),
+        ({"type": "fields", "values": "0 1 2", "axis": "kind"}, "axis is 'kind'; expected x or y"),
+        ({"type": "wavelengths", "values": [0.5] * 25}, "found 25 numbers; expected 1 to 24"),
+        ({"type": "wavelengths", "values": 0.5}, "values is 0.5; expected numbers"),
+        ({"type": "compare", "on": 1}, "on is 1; expected true or false"),
+        ({"type": "undo", "steps": 2}, "undo has no part 'steps'; it has none"),
         ({"type": "fields", "values": "95"}, "90 degrees"),
         ({"type": "wavelengths", "values": "550"}, "did you mean 0.55?"),
         ({"type": "aperture", "value": "-3"}, "expected a number above 0"),
@@ -84,9 +96,11 @@ def test_a_drag_is_one_step(state):
         ({"type": "configuration", "number": 2}, "has one configuration"),
         ({"type": "vary", "quantity": "glas", "surface": 1, "on": True}, "no 'glas'"),
         ({"type": "frequency", "value": 0}, "more than 0"),
+        ({"type": "frequency", "value": 1e9}, "at most 100000"),
         ({"type": "merit", "kind": "beauty"}, "expected one of spot"),
         ({"type": "shake"}, "unknown event 'shake'"),
         ({}, "unknown event"),
+        ({"type": ["undo"]}, "unknown event a list"),
     ],
 )
 def test_what_cannot_be_carried_out_changes_nothing_but_the_message(state, event, said):
@@ -96,6 +110,39 @@ def test_what_cannot_be_carried_out_changes_nothing_but_the_message(state, event
     assert said in found.message
     assert dataclasses.replace(found, message="") == state
     assert reduce(found, {"type": "compare", "on": True}).message == ""
+
+
+def test_a_gap_behind_a_mirror_is_negative_and_one_beside_a_dummy_surface_has_either_sign():
+    rows = [
+        {"radius": -100, "thickness": -30, "glass": "mirror"},
+        {"radius": -60, "thickness": 50, "glass": "mirror"},
+        {"radius": math.inf, "thickness": 5},
+        {"radius": 50, "thickness": 4, "glass": "N-BK7"},
+        {"radius": -50, "thickness": 80},
+    ]
+    folded = initial(rt.lens(rows, stop=1, entrance_pupil_diameter=10))
+    assert limits(folded.lens, 1, "thickness") == (-1e6, 0)
+    assert limits(folded.lens, 2, "thickness") == (-5, 1e6)  # up to the glass, over the dummy surface 3
+    assert limits(folded.lens, 4, "thickness") == (0, 1e6)
+    assert limits(folded.lens, 5, "thickness") == (-1e6, 1e6)  # the sensor, also of a virtual image
+    assert limits(folded.lens, 0, "thickness") == (-math.inf, math.inf)
+    assert "expected -1e+06 to 0 mm" in edit(folded, "thickness", 1, 3).message
+    assert not edit(folded, "thickness", 3, -2).message
+
+
+def test_sliders_have_ends_and_that_of_the_sensor_has_steps_of_the_depth_of_focus(triplet):
+    rows = compute.prescription(initial(triplet))["rows"]
+    for row in rows[1:]:
+        assert row["sliders"].keys() == row["cells"].keys()
+        for name, (low, high) in row["sliders"].items():
+            assert low <= row["cells"][name] <= high, name
+    assert "thickness" not in rows[0]["sliders"]  # the object is at infinity
+    assert rows[3]["sliders"]["thickness"][0] >= 0
+    low, high = rows[-2]["sliders"]["thickness"]
+    depth = 2e-3 * float(triplet.primary) * float(rt.first_order(triplet).f_number) ** 2
+    assert (high - low) / 100 == pytest.approx(depth, rel=1e-9)  # of an arrow key in the number: 27 µm at F/5
+    half = rows[1]["semi_diameter"]
+    assert max(map(abs, rows[1]["sliders"]["curvature"])) <= 1 / half
 
 
 def test_numbers_may_be_typed_with_a_real_minus_and_infinity(state):
@@ -123,6 +170,18 @@ def test_conditions(state):
     waves = reduce(state, {"type": "wavelengths", "values": [0.45, float(state.lens.primary)]})
     assert waves.lens.wavelengths.tolist() == [0.45, float(state.lens.primary)]
     assert waves.lens.primary_wavelength == 2
+    weighted = initial(
+        state.lens.at(wavelengths=[0.48, 0.55, 0.65], wavelength_weights=[1, 2, 3], primary_wavelength=2)
+    )
+    for values, weights, primary in (
+        ("0.48 0.56 0.65", [1, 2, 3], 2),  # typed anew: in the place of the old one
+        ("0.8 0.9 1.0", [1, 2, 3], 2),
+        ("0.65 0.55 0.48", [3, 2, 1], 2),
+        ("0.55 0.48 0.65", [2, 1, 3], 1),  # in another order
+        ("0.45 0.52 0.6 0.65", [1, 1, 1, 3], 2),  # of another number: nearest to the old one
+    ):
+        typed = reduce(weighted, {"type": "wavelengths", "values": values}).lens
+        assert (typed.wavelength_weights.tolist(), typed.primary_wavelength) == (weights, primary), values
     assert reduce(waves, {"type": "primary", "number": 1}).lens.primary_wavelength == 1
     same = reduce(state, {"type": "aperture", "kind": "image_f_number"})
     assert float(same.lens.aperture.value) == pytest.approx(float(rt.first_order(state.lens).f_number), rel=1e-12)
@@ -209,7 +268,7 @@ def test_every_kind_of_lens_has_a_document(name):
 
 
 def test_a_lens_that_loses_all_rays_says_where(state):
-    lost = edit(state, "radius", 1, 1)
+    lost = edit(state, "radius", 1, 0.01)  # at 1 mm rays near the axis pass, and `rt.spot` has their spots
     found = compute.refresh(lost)
     assert not lost.message
     assert found["analyses"]["spots"]["rms"] == [None] * 3
@@ -244,6 +303,8 @@ def test_a_session_saves_where_it_is_told_and_nowhere_else(triplet, tmp_path):
     assert "exists" in session.answer({"type": "save", "path": str(file)})["message"]
     assert "give the name" in session.answer({"type": "save", "path": ""})["message"]
     assert "suffix" in session.answer({"type": "save", "path": str(tmp_path / "lens.doc")})["message"]
+    assert "cannot be written" in session.answer({"type": "save", "path": "~nosuchuser/lens.zmx"})["message"]
+    assert session.answer({"type": "save", "path": "a\0b.zmx"})["message"].startswith("save: ")
     assert "cannot be written" in session.answer({"type": "save", "path": str(tmp_path / "no" / "lens.zmx")})["message"]
     assert file.read_bytes() == before
     assert [*tmp_path.iterdir()] == [file]
@@ -251,6 +312,46 @@ def test_a_session_saves_where_it_is_told_and_nowhere_else(triplet, tmp_path):
     assert float(rt.read_lens(tmp_path / "other.csv").surfaces[3].thickness) == 3
     assert session.answer({"type": "save", "path": str(file), "overwrite": True})["message"].startswith("written")
     assert float(rt.read_lens(file).surfaces[3].thickness) == 3
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        {"type": "settle", "field": math.inf},
+        {"type": "settle", "field": [0]},
+        {"type": "progress", "cycles": 1.5},
+        {"type": "save", "path": ["lens.zmx"]},
+        {"type": "save", "path": "x" * 5000},
+        {"type": "fields", "values": "0 14 20", "axis": "vignetting"},
+        {"type": ["open"]},
+        {},
+    ],
+)
+def test_a_malformed_event_is_one_message_and_the_session_goes_on(triplet, event):
+    session = Session(triplet)
+    before = session.state
+    message = session.answer(event)["message"]
+    assert "expected" in message
+    assert session.state.lens is before.lens
+    assert "analyses" in session.answer({"type": "open"})
+
+
+def test_a_session_answers_while_another_computes(triplet, monkeypatch):
+    started, gate = threading.Event(), threading.Event()
+
+    def slow(state):
+        started.set()
+        assert gate.wait(60)
+        return []
+
+    monkeypatch.setattr("raytrace.viewer.session.remarks", slow)
+    slow_one, other = Session(triplet), Session(triplet)
+    thread = threading.Thread(target=slow_one.answer, args=({"type": "settle"},))
+    thread.start()
+    assert started.wait(60)
+    assert "analyses" in other.answer({"type": "open"})
+    gate.set()
+    thread.join(60)
 
 
 @pytest.fixture
@@ -345,6 +446,33 @@ def test_variables_of_an_optimised_lens_and_new_ones_vary_together(triplet):
     assert reply["message"] == ""
     assert float(session.state.lens.surfaces[3].curvature) != float(found.lens.surfaces[3].curvature)
     assert 10 <= float(session.state.lens.surfaces[2].thickness) <= 15
+
+
+@pytest.mark.parametrize("weight", [-1.0, 1.0])
+def test_an_optimisation_keeps_what_the_file_requires(triplet, weight, tmp_path):
+    """A chosen merit function replaces the image's rows of the file; a focal length that the file asks for remains."""
+    rows = (rt.Row("EFFL", (0, 2), target=100.0, weight=weight * 10), *rt.Merit.default(triplet, rings=2).rows)
+    data = OptimizationData(tuple(Vary(k, "curvature") for k in (1, 2, 3, 4, 6, 7)), merit=rows)
+    rt.write_lens(dataclasses.replace(triplet, optimization_data=data), tmp_path / "held.zmx")
+    session = Session(rt.read_lens(tmp_path / "held.zmx"))
+    session.answer({"type": "merit", "kind": "wavefront"})
+    first = session.answer({"type": "optimise"})["optimisation"]
+    assert "with EFFL wavelength 2 = 100 of the file" in first["words"]
+    last = progress(session, ended=True)
+    assert "with EFFL wavelength 2 = 100 of the file" in last["optimisation"]["words"]
+    length = float(rt.first_order(session.state.lens).effective_focal_length)
+    assert length == pytest.approx(100, rel=1e-6 if weight < 0 else 1e-2)
+
+
+def test_a_file_of_conditions_alone_is_optimised_for_its_spots(triplet):
+    data = OptimizationData(
+        (Vary(1, "curvature"), Vary(4, "curvature")), merit=(rt.Row("EFFL", target=100, weight=-1),)
+    )
+    session = Session(dataclasses.replace(triplet, optimization_data=data))
+    assert session.state.merit == "spot"
+    session.answer({"type": "optimise"})
+    assert progress(session, ended=True)["message"] == ""
+    assert float(rt.first_order(session.state.lens).effective_focal_length) == pytest.approx(100, rel=1e-6)
 
 
 def test_a_failure_of_an_optimisation_is_one_message(triplet):

@@ -12,10 +12,19 @@ import raytrace as rt
 from raytrace.maths.numerics import dot
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import with_sensor_distance
+from raytrace.system.phases import IdealLens
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import scene, trace_scene
 from raytrace.tracing.spot import EmptySpot
-from raytrace.tracing.wavefront import mean_opd, peak_to_valley, rms, wavefront_of, without, zernike_coefficients
+from raytrace.tracing.wavefront import (
+    clear_wavefront,
+    mean_opd,
+    peak_to_valley,
+    rms,
+    wavefront_of,
+    without,
+    zernike_coefficients,
+)
 
 WAVE = 0.53e-3  # mm
 POINTS, WEIGHTS = gauss_rings(8, 32)
@@ -45,6 +54,45 @@ def test_the_sphere_reaches_from_the_pupil_s_plane_along_the_chief_ray(angle):
     front = wavefront_of(s, POINTS, WEIGHTS)
     centre_ray = trace_scene(s, torch.zeros(2, 1, dtype=torch.float64))
     assert front.radius.item() == pytest.approx(50.0 / centre_ray.direction[2].item(), rel=1e-12)
+
+
+def plate(*apertures: Aperture) -> rt.Lens:
+    """A plate that adds a r⁴, about two waves at the rim, in front of an ideal lens of 1 m; pupil of radius 10 mm."""
+    rows = [
+        dict(radius=math.inf, coefficients=[0.0, 2e-7], thickness=0.0, glass=1.5, apertures=apertures),
+        dict(radius=math.inf, thickness=0.0),
+        dict(radius=math.inf, thickness=1000.0, phase=IdealLens(0.001, 0.001)),
+    ]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=20, wavelengths=[0.5])
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.33, 0.5])
+def test_the_rms_of_an_obscured_pupil_is_that_of_the_annulus(ratio):
+    """ρ⁴ over ε < ρ < 1 by the moments of u = ρ²: <u²> and <u⁴>."""
+    lens = plate(Aperture("circular", (0.0, 10 * ratio), True)) if ratio else plate()
+    mean, square = ((1 - ratio ** (2 * k)) / k / (1 - ratio**2) for k in (3, 5))
+    expected = 2 * math.sqrt(square - mean**2)
+    assert rt.wavefront(lens, size=9).rms.item() == pytest.approx(expected, rel=3e-4)
+    assert rt.rms_over_field(lens, fields=[0.0]).rms.item() == pytest.approx(expected, rel=3e-4)
+
+
+def test_the_rms_of_a_rectangular_pupil_moves_with_its_edges():
+    """2 ρ⁴ over |x| < 0.7, |y| < b of the pupil, against midpoints of a dense grid and differences."""
+
+    def rms_of(height):
+        system = problems.scene_of(plate(Aperture("rectangular", (7.0, height))))
+        return rms(clear_wavefront(system, 8, 32)).sum() / 0.5e-3
+
+    x, y = (torch.arange(400, dtype=torch.float64) + 0.5) / 400 * torch.tensor([[0.7], [0.4]])
+    expected = 2 * ((x[:, None] ** 2 + y**2) ** 2).std(correction=0)
+    height, step = torch.tensor(4.0, dtype=torch.float64, requires_grad=True), 1e-3
+    found = rms_of(height)
+    first = torch.autograd.grad(found, height, create_graph=True)[0]
+    second = torch.autograd.grad(first, height)[0]
+    low, high = rms_of(4.0 - step).item(), rms_of(4.0 + step).item()
+    assert found.item() == pytest.approx(expected.item(), rel=5e-4)
+    assert first.item() == pytest.approx((high - low) / (2 * step), rel=1e-6)
+    assert second.item() == pytest.approx((high - 2 * found.item() + low) / step**2, rel=1e-3)
 
 
 def test_defocus_of_a_perfect_lens():

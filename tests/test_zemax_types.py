@@ -324,3 +324,12 @@ def test_unused_data_are_reported(second, where, said):
     report = read(file(second))[1]
     assert [one for one in getattr(report, where) if re.search(said, one)]
     assert all(keyword.status != "unknown" for keyword in report.keywords)
+
+
+def test_terms_of_an_extended_asphere_in_parm_are_those_of_an_even_asphere():
+    """Some programs write them so; of a surface with XDAT they are left out, as in OpticStudio."""
+    lines = f"TYPE XASPHERE\nCURV 0.02\n{parm(1, 0.0, 1e-6, -1e-9)}\n{GLASS}"
+    system, report = read(file(lines))
+    assert any("XASPHERE without XDAT: PARM 1 to 8 are taken as its terms" in text for text in report.warnings)
+    assert system.surfaces[2].coefficients.tolist() == [0.0, 1e-6, -1e-9]
+    assert read(file(f"{lines}\n{xdat(2, 0.4)}"))[0].surfaces[2].coefficients.tolist() == [0.1]

@@ -28,6 +28,7 @@ from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, u
 from raytrace.tracing.trace import is_bent
 
 NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
+SAMPLES = 11  # fields of a curve, from the axis to the largest
 NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration
 
 
@@ -58,7 +59,7 @@ class Distortion(OverField):
         return {**self.heads(wavelength=self.wavelengths), **found}
 
     def at(self, fields: Tensor) -> "Distortion":
-        return _distortion(self.lens, fields)
+        return distortion_of(self.lens, fields)
 
     @styled
     def draw(self):
@@ -128,7 +129,7 @@ class LateralColour(OverField):
         return {**self.heads(wavelength=self.wavelengths), "shift": masked(self.shift, self.valid)}
 
     def at(self, fields: Tensor) -> "LateralColour":
-        return _lateral_colour(self.lens, fields)
+        return lateral_colour_of(self.lens, fields)
 
     @styled
     def draw(self):
@@ -143,7 +144,7 @@ class LateralColour(OverField):
         return finished(panel, curves, "lateral colour", 4)
 
 
-def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11) -> Distortion:
+def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = SAMPLES) -> Distortion:
     """Distortion of the chief ray; fields: y or (x, y), by default `samples` from the axis to the largest.
 
     Relative, in per cent in the table. The scale of the ideal image is that of each wavelength's own chief ray close to
@@ -152,10 +153,11 @@ def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None
     """
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     refuse_axis(fields)
-    return shown(_distortion(lens, fields))
+    return shown(distortion_of(lens, fields))
 
 
-def _distortion(lens: Lens, fields: Tensor) -> Distortion:
+def distortion_of(lens: Lens, fields: Tensor) -> Distortion:
+    """The distortion of fields (2, F), which need not be in reach."""
     bare = unvignetted(lens)
     described, angles, extent, found = in_object_space(bare, fields)
     close = _close_fields(lens, fields)
@@ -232,10 +234,11 @@ def lateral_colour(
             f"{float(lens.wavelengths[0]):g} µm; give several by `wavelengths`"
         )
     refuse_axis(fields)
-    return shown(_lateral_colour(lens, fields))
+    return shown(lateral_colour_of(lens, fields))
 
 
-def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
+def lateral_colour_of(lens: Lens, fields: Tensor) -> LateralColour:
+    """The lateral colour of fields (2, F), which need not be in reach."""
     height, valid = _height(unvignetted(lens), fields, fields)
     primary = slice(lens.primary_wavelength - 1, lens.primary_wavelength)
     valid = valid & valid[:, primary]

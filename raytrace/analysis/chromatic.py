@@ -6,6 +6,7 @@ from torch import Tensor
 from raytrace.analysis.panels import chart, drawn_at_least, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
@@ -63,6 +64,7 @@ def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: i
     low, high = lens.wavelengths.min(), lens.wavelengths.max()
     if not bool(high > low):
         raise NothingToShow("nothing to show over wavelength: the lens has a single one; give a range by `wavelengths`")
+    afford(RAY_BYTES * samples, f"{samples:,} wavelengths", helps="ask for fewer `samples`")
     places = low + (high - low) * torch.linspace(0.0, 1.0, samples, **like(lens))
     check_media(lens, places)
     primary = primary_wavelength(lens)

@@ -107,10 +107,11 @@ def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] =
 
 
 def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
-    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone."""
+    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone, where
+    it is smaller than the surface."""
     for aperture in surface.apertures:
         rim = reach(aperture)[1]
-        if not aperture.obscures and math.isfinite(rim) and any(aperture.centre):
+        if not aperture.obscures and rim < radius and any(aperture.centre):
             return *aperture.centre, rim
     return 0.0, 0.0, radius
 
@@ -306,8 +307,9 @@ def _start(lens: Lens, rays, z_start: float) -> np.ndarray:
     distance = float(lens.surfaces[0].thickness)
     position, direction = rays.position, rays.direction
     if math.isfinite(distance) and -distance >= z_start:
-        shift = position.new_tensor([0.0, 0.0, -distance]).reshape(3, 1, 1, 1)
-        points = intersect(lens.surfaces[0], position - shift, direction)[0] + shift
+        frame = frames(lens)[0]
+        along = torch.tensordot(frame.axes.T, direction, dims=1)
+        points = frame.outside(intersect(lens.surfaces[0], frame.inside(position), along)[0])
     else:
         points = position + direction * ((z_start - position[2]) / direction[2])
     return array(points)[:, :, 0, :]

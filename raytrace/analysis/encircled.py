@@ -107,7 +107,7 @@ def _encircled(lens: Lens, fields: Tensor, radii: Tensor | None, geometric: bool
 def _rays(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (F, W·P) from the centroid (2, F) of all wavelengths, and shares (F, W·P) of the light."""
     F, W = fields.shape[1], len(lens.wavelengths)
-    afford(64 * F * W * _RAYS, f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)", helps="ask for fewer fields")
+    afford(64 * F * W * _RAYS, f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)", helps="ask for fewer `fields`")
     parts = [_rays_of(lens, some) for some in fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
     distance, energy, centroid = zip(*parts, strict=True)
     return torch.cat(distance), torch.cat(energy), torch.cat(centroid, 1)

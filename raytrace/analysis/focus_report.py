@@ -52,7 +52,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.tracing.ray_failures import LostRays, warn_of_failures
 from raytrace.tracing.spot import image_rays
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _SAMPLES = 401  # of a curve through focus
 _MOST_SPOTS = 5  # columns of spots that stay legible
@@ -63,7 +63,7 @@ class NoFocus(ValueError):
     """The light of an object has no focus; the message says why and what helps."""
 
 
-class VirtualImage(UserWarning):
+class VirtualImage(RaytraceWarning):
     """The best sensor distance is on the side that light comes from."""
 
 

@@ -14,6 +14,7 @@ from raytrace.analysis.setting import (
     refuse_axis,
     unvignetted,
 )
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Table, axis, masked
 from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
@@ -113,6 +114,8 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     largest = field_range(lens, 2)[:, 1:]
     refuse_axis(largest)
     warn_of_filling(lens, largest)
+    rays = points**2 * len(lens.wavelengths)
+    afford(RAY_BYTES * rays, f"{rays:,} chief rays of {points:,} × {points:,} objects", helps="ask for fewer `points`")
     described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)

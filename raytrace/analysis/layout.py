@@ -12,6 +12,7 @@ from torch import Tensor
 
 from raytrace.analysis import cross_section, layout_3d
 from raytrace.analysis.panels import first_order_text
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Result, numbers
 from raytrace.maths.sampling import fan, hexapolar
@@ -128,6 +129,9 @@ def layout(
         warn_of_defects(one)
     every = ALL if configuration == ALL else None
     points = field_points(fields, like=lens)
+    count = rays * points.shape[1] * (1 if chosen is None else len(chosen))
+    surfaces = len(lens.surfaces)
+    afford(RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps="ask for fewer `rays`")
     warn_of_filling(lens, points)
     return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
@@ -239,7 +243,7 @@ def _drawn(
         first, last = right
         distance = float(lens.surfaces[0].thickness)
         bent = cross_section.is_bent(lens)
-        size = max(last - first, up[1] - up[0]) if bent else last - first
+        size = max(last - first, up[1] - up[0]) if bent or first == last else last - first
         near = math.isfinite(distance) and 0 < distance <= _NEAR * size
         front = _front(places, radii, lens) if bent else first
         start = -distance if near else front - _LEAD * size
@@ -360,7 +364,8 @@ def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii
                 bars = [(-rim - outward, -rim), (rim, rim + outward)]
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
-                height = centre + np.linspace(low, high, 41)
+                most = radii[k] + outward
+                height = np.linspace(*np.clip((centre + low, centre + high), -most, most), 41)
                 edge = 0.9999 * edge_radius(surface)
                 depth = cross_section.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
@@ -407,7 +412,7 @@ def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[flo
 
 
 def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
-    heights = [abs(path.y[0]) for field in paths for path in field]
+    heights = [abs(float(place.height(path.z[0], path.y[0]))) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
         y = np.linspace(-half, half, 81)

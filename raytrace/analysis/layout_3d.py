@@ -9,12 +9,12 @@ from torch import Tensor
 from raytrace.analysis import cross_section
 from raytrace.maths.sampling import fan
 from raytrace.plotting import style
-from raytrace.system.apertures import reach
+from raytrace.system.apertures import inside, reach
 from raytrace.system.lens import Lens, media
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, frames
 
-_RINGS, _ARMS = 6, 48  # of the mesh of a surface
+_RINGS, _ARMS, _TILES = 6, 48, 80  # of the mesh of a surface; of obscurations across it
 _LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start
 _MIRROR = "#b9c2ca"
 
@@ -60,7 +60,8 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
         if surface.is_break:
             continue
         glass = max(indices[k - 1], indices[k]) > cross_section.GLASSY
-        if surface.is_mirror or glass or surface.phase is not None or k == lens.stop:
+        obscured = any(aperture.obscures for aperture in surface.apertures)
+        if surface.is_mirror or glass or surface.phase is not None or obscured or k == lens.stop:
             meshes[k] = _mesh(surface, places[k], radii[k])
     for k, mesh in meshes.items():
         surface = lens.surfaces[k]
@@ -70,11 +71,24 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
             _shade(axes, mesh, style.tint(max(indices[k - 1], indices[k])), 0.35)
         elif surface.phase is not None:
             _shade(axes, mesh, "#d9d2e9", 0.45)
+        _draw_obscurations(axes, surface, places[k], radii[k])
         _rim(axes, mesh, style.INK if k == lens.stop else style.GREY, 1.4 if k == lens.stop else 0.7)
         back = cross_section.partner(lens, k)
         if indices[k] > cross_section.GLASSY and not surface.is_mirror and back in meshes:
             _edge(axes, mesh, meshes[back], style.tint(indices[k]))
     return np.concatenate([mesh.reshape(3, -1) for mesh in meshes.values()], axis=1)
+
+
+def _draw_obscurations(axes, surface: Surface, frame: Frame, radius: float) -> None:
+    """The parts of the drawn surface that obscurations block, in small tiles."""
+    obscurations = [aperture for aperture in surface.apertures if aperture.obscures]
+    line = torch.linspace(-radius, radius, _TILES + 1, dtype=frame.origin.dtype, device=frame.origin.device)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    middle = torch.stack([x, y])[:, :-1, :-1] + 0.5 * (line[1] - line[0])
+    clear = inside(obscurations, middle)
+    if clear is not None:
+        tiles = style.array(~clear & (middle.norm(dim=0) <= radius))
+        _shade(axes, style.array(frame.outside(torch.stack([x, y, sag_at(surface, x, y)]))), "#8c8c8c", 0.9, tiles)
 
 
 def _add_tiles(axes, tiles, **look) -> None:
@@ -89,12 +103,14 @@ def _add_lines(axes, lines, **look) -> None:
     axes.add_collection3d(Line3DCollection(lines, **look))
 
 
-def _shade(axes, mesh: np.ndarray, colour, alpha: float) -> None:
+def _shade(axes, mesh: np.ndarray, colour, alpha: float, shown: np.ndarray | None = None) -> None:
+    """The tiles of a mesh, all or those that are shown."""
     p = _seen(mesh)
     tiles = [
         np.stack([p[:, i, j], p[:, i + 1, j], p[:, i + 1, j + 1], p[:, i, j + 1]])
         for i in range(p.shape[1] - 1)
         for j in range(p.shape[2] - 1)
+        if shown is None or shown[i, j]
     ]
     _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=alpha, shade=False)
 

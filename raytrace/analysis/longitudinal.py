@@ -6,6 +6,7 @@ from torch import Tensor
 from raytrace.analysis.panels import by_wavelength, chart, drawn_at_least, finished, seen
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Numbers, like
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import axis, masked
 from raytrace.plotting.style import GREY, array, styled
@@ -58,6 +59,8 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     """
     need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    rays = points * len(lens.wavelengths)
+    afford(RAY_BYTES * rays, f"{rays:,} rays", helps="ask for fewer `points`")
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
     on_axis = torch.stack([torch.zeros_like(heights), heights])

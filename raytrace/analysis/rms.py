@@ -1,6 +1,7 @@
 """RMS over the field: of the wavefront, of each wavelength and of all together, or of the spot."""
 
 import math
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -10,14 +11,14 @@ from torch import Tensor
 from raytrace.analysis.fans import REFERENCES
 from raytrace.analysis.panels import by_wavelength, chart, field_axis, field_name, finished
 from raytrace.analysis.result import OverField
-from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength, scene_of, setting, wavelength_shares
+from raytrace.analysis.setting import Numbers, Points, primary_wavelength, scene_of, setting, wavelength_shares
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Table
-from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, array, styled
 from raytrace.system.lens import Lens
+from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
-from raytrace.tracing.wavefront import rms, wavefront_of
+from raytrace.tracing.wavefront import clear_wavefront, rms, wavefront_of
 
 _RINGS = 10, 40
 
@@ -28,8 +29,8 @@ class RmsOverField(OverField):
 
     Of the wavefront: waves about the mean; of the spot: mm about the centroid. nan where no light arrives.
     strehl: (F,) Σ w exp(-(2π σ)²) of the wavefronts that make `polychromatic` (Mahajan 1983); None of spots.
-    fields: (2, F); reference: that of the polychromatic wavefront; points, weights: (2, P), (P,) of the
-    rays.
+    fields: (2, F); reference: that of the polychromatic wavefront; pupil: points (2, P) and weights (P,) of the rays,
+    None of the clear pupil.
     """
 
     lens: Lens
@@ -37,9 +38,8 @@ class RmsOverField(OverField):
     rms: Tensor
     polychromatic: Tensor
     strehl: Tensor | None
-    points: Tensor
-    weights: Tensor
     reference: str
+    pupil: tuple[Tensor, Tensor] | None
 
     COMMAND = "rms-over-field"
     COLUMNS = (
@@ -74,7 +74,7 @@ class RmsOverField(OverField):
         return [Table({**summary, **self.by_wavelength(rms, self.column(name).unit), **strehl})]
 
     def at(self, fields: Tensor) -> "RmsOverField":
-        return _rms(self.lens, fields, self.quantity == "spot", self.reference, (self.points, self.weights))
+        return _rms(self.lens, fields, self.quantity == "spot", self.reference, self.pupil)
 
     @styled
     def draw(self):
@@ -114,28 +114,31 @@ def rms_over_field(
     field) or each on its own ("own"). Spots together are one spot about its own centroid. fields: y or (x, y), by
     default `samples` from the axis to the lens's largest; wavelengths: µm; spot: RMS spot radius about the centroid
     instead; reference: centres of the reference spheres of the wavelengths together, the "primary" one's chief ray, so
-    that lateral colour counts, or each one's "own"; pupil: points (2, P) and weights (P,), Gauss rings by default.
-    Raises ValueError for another reference.
+    that lateral colour counts, or each one's "own"; pupil: points (2, P) and weights (P,) of rays, of
+    which those that arrive count; by default light is integrated over the clear pupil, up to its edges. Raises
+    ValueError for another reference.
     """
     if reference not in REFERENCES:
         raise ValueError(f"reference {reference!r}: expected one of {', '.join(REFERENCES)}")
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
-    return _rms(lens, fields, spot, reference, gauss_rings(*_RINGS, **like(lens)) if pupil is None else pupil)
+    return _rms(lens, fields, spot, reference, pupil)
 
 
-def _rms(lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor]) -> RmsOverField:
-    points, weights = pupil
+def _rms(lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor] | None) -> RmsOverField:
     shares = wavelength_shares(lens)
     if spot:
+        rings, arms = _RINGS
+        points, weights = clear_pupil(lens, fields=fields, rings=rings, arms=arms) if pupil is None else pupil
         rays = image_rays(lens, points, fields=fields)
-        joint = (shares[:, None] * weights).flatten()
+        joint = (shares[:, None] * weights).flatten(-2)
         whole = spot_of_points(rays.position[:2].flatten(2), rays.valid.flatten(1), joint).rms_radius
-        return RmsOverField(lens, fields, spot_of(rays, weights).rms_radius, whole, None, *pupil, reference)
+        return RmsOverField(lens, fields, spot_of(rays, weights).rms_radius, whole, None, reference, pupil)
     view, waves = scene_of(lens, fields), 1e-3 * lens.wavelengths
-    each = joint = rms(wavefront_of(view, points, weights))[0] / waves
+    front_of = partial(clear_wavefront, view, *_RINGS) if pupil is None else partial(wavefront_of, view, *pupil)
+    each = joint = rms(front_of())[0] / waves
     if reference == "primary":
-        joint = rms(wavefront_of(view, points, weights, reference=primary_wavelength(lens)))[0] / waves
+        joint = rms(front_of(reference=primary_wavelength(lens)))[0] / waves
     together = (shares * joint * joint).sum(-1)
     polychromatic = torch.where(together.isnan(), torch.nan, safe_sqrt(together))
     strehl = (shares * torch.exp(-((2 * math.pi * joint) ** 2))).sum(-1)
-    return RmsOverField(lens, fields, each, polychromatic, strehl, *pupil, reference)
+    return RmsOverField(lens, fields, each, polychromatic, strehl, reference, pupil)

@@ -18,6 +18,7 @@ from raytrace.tracing.ray_failures import check_reach, ray_failures
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
+from raytrace.words import RaytraceWarning
 
 #: Fields, y or pairs (x, y), and other numbers as analyses take them; None: those of the lens.
 Points = Tensor | Sequence | float | None
@@ -31,7 +32,7 @@ class NothingToShow(ValueError):
     """An analysis of a lens, or of fields, that would show nothing."""
 
 
-class Incomplete(UserWarning):
+class Incomplete(RaytraceWarning):
     """A field lacks a part of the results of an analysis."""
 
 

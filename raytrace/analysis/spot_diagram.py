@@ -22,15 +22,13 @@ from raytrace.system.lens import (
     field_label,
     field_points,
     field_title,
-    name_of_field,
     one_lens,
     with_wavelengths,
 )
-from raytrace.tracing.clear_pupil import arms_of, is_clipped
+from raytrace.tracing.clear_pupil import clear_rays, clipped
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
 from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
-from raytrace.tracing.scene import trace_apertures
 from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, image_rays, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
@@ -120,8 +118,12 @@ class Spots(Result):
         several = len(waves) > 1
         together = [""] * several
         whole, each = _figures(self.whole), _figures(self.each)
-        fields, lost = map(name_of_field, self.fields.unbind(1)), (self.launched - each.pop("rays")).tolist()
-        columns = {"field_y": [text for field in fields for text in (*[field] * len(waves), *together)]}
+        lost = (self.launched - each.pop("rays")).tolist()
+        columns = {
+            name: [text for place in row.tolist() for text in (*[f"{place:g}"] * len(waves), *together)]
+            for name, row in zip(("field_x", "field_y"), self.fields, strict=True)
+            if name == "field_y" or bool(row.any())
+        }
         columns["wavelength"] = [*waves, *["all"] * several] * self.fields.shape[1]
         for name, values in each.items():
             columns[name] = (torch.cat([values, whole[name][:, None]], 1) if several else values).flatten()
@@ -243,64 +245,53 @@ def spot(
     about = None if about is None else about[..., 0]
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
     if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):
-        aimed, size = with_ray_aiming(lens, ray_aiming), SAMPLINGS["gauss"][2] if rings is None else rings
-        how = fields, at[:, shares > 0], size
-        if lens.count is None:
-            spots, whole = _of_clear_pupils(aimed, *how, about, spots, whole)
-        else:
-            each = [
-                _of_clear_pupils(one_lens(aimed, k), *how, None if about is None else about[:, k], *parts)
-                for k, parts in enumerate(zip(_unbound(spots), _unbound(whole), strict=True))
-            ]
-            spots, whole = (_stacked(parts) for parts in zip(*each, strict=True))
+        rings = SAMPLINGS["gauss"][2] if rings is None else rings
+        spots, whole = _of_clear_pupils(
+            with_ray_aiming(lens, ray_aiming), fields, at[:, shares > 0], rings, about, spots, whole
+        )
     return Spots(lens, fields, spots, whole, found, reference, weights)
 
 
-def _unbound(spot: Spot) -> list[Spot]:
-    """The spots of each lens of a batch."""
-    vectors = ("centroid", "points")
-    parts = {f.name: getattr(spot, f.name).unbind(int(f.name in vectors)) for f in dataclasses.fields(spot)}
-    return [Spot(**dict(zip(parts, entries, strict=True))) for entries in zip(*parts.values(), strict=True)]
-
-
-def _stacked(spots: Sequence[Spot]) -> Spot:
-    """The spots of the lenses of a batch, whose axis comes first."""
-    vectors = ("centroid", "points")
-    names = [field.name for field in dataclasses.fields(Spot)]
-    return Spot(**{name: torch.stack([getattr(s, name) for s in spots], int(name in vectors)) for name in names})
+#: Statistics of a `Spot` and the axes that each has by itself.
+_STATISTICS = {"centroid": 1, "mean_square_radius": 0, "rms_radius": 0, "geometric_radius": 0}
 
 
 def _of_clear_pupils(
     lens: Lens, fields: Tensor, launched: Tensor, rings: int, about: Tensor | None, each: Spot, whole: Spot
 ) -> tuple[Spot, Spot]:
-    """The spots (F, W) and (F,) of launched rays, with the statistics of the clear pupils of fields (2, F) if clipped.
+    """The spots (F, W) and (F,) of launched rays, (L, F, W) and (L, F) of a batch, with the statistics of the clear
+    pupils of lenses that clip them.
 
-    about: (2, F) mm, or None. The points, and which of them are valid, stay those of the rays that were launched.
+    about: (2, F) mm, (2, L, F) of a batch, or None. The points, and which of them are valid, stay those launched.
     """
     size = max(1, _KERNELS // len(lens.wavelengths))
-    scenes = [scene_of(lens, some) for some in fields.split(size, 1)]
-    if not any(is_clipped(scene, launched) for scene in scenes):
-        return each, whole
+    parts = torch.arange(fields.shape[1]).split(size)
+    lenses = torch.stack([clipped(scene_of(lens, fields[:, part]), launched) for part in parts]).any(0).nonzero()[:, 0]
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    found: tuple[list[Spot], list[Spot]] = [], []
-    for part, scene in enumerate(scenes):
-        arms = arms_of(scene, 4 * rings)
-        points, weights = arms.rule(rings)
-        ends, exist = arms.ends()
-        hits, _, met = trace_apertures(scene, torch.cat([points, ends], -1))
-        weights = torch.cat([weights, torch.zeros_like(ends[0])], -1)[0]  # ends count for the geometric radius alone
-        hits, valid = hits[:, 0], (met & torch.cat([weights[None, ..., : -exist.shape[-1]] > 0, exist], -1))[0]
-        centre = None if about is None else about[:, part * size : (part + 1) * size]
-        found[0].append(spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None]))
-        together = hits.flatten(2), valid.flatten(1), (weights * shares[:, None]).flatten(1)
-        found[1].append(spot_of_points(*together, about=centre))
-    names = "centroid", "mean_square_radius", "rms_radius", "geometric_radius"
-    return tuple(
-        dataclasses.replace(
-            launched, **{name: torch.cat([getattr(s, name) for s in several], int(name == names[0])) for name in names}
-        )
-        for launched, several in zip((each, whole), found, strict=True)
-    )
+    found = each, whole
+    for some in lenses.split(max(1, size // fields.shape[1])):
+        chosen = lens if lens.count is None else one_lens(lens, some)
+        spots = []
+        for part in parts:
+            rays, weights = clear_rays(scene_of(chosen, fields[:, part]), rings)
+            hits, valid = rays.position[:2], rays.valid
+            centre = None if about is None else about.reshape(2, -1, fields.shape[1])[:, some][..., part]
+            together = hits.flatten(-2), valid.flatten(-2), (weights * shares[:, None]).flatten(-2)
+            alone = spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None])
+            spots.append((alone, spot_of_points(*together, about=centre)))
+        found = tuple(
+            dataclasses.replace(old, **{
+                name: _put(getattr(old, name), torch.cat([getattr(spot, name) for spot in new], axis + 1), axis, some)
+                for name, axis in _STATISTICS.items()
+            })
+            for old, new in zip(found, zip(*spots, strict=True), strict=True)
+        )  # fmt: skip
+    return found
+
+
+def _put(numbers: Tensor, new: Tensor, axis: int, lenses: Tensor) -> Tensor:
+    """Numbers with those of some lenses replaced; of one lens, which has no such axis, the new ones."""
+    return numbers.index_copy(axis, lenses, new) if new.dim() == numbers.dim() else new.squeeze(axis)
 
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:
@@ -350,10 +341,10 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
-    weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
-    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
-    from where radii count, the centroid by default. rings: of dots.
+    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`.
+    The dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are
+    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about:
+    (2, F) mm, from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
@@ -366,7 +357,12 @@ def field_spots(
         hits, valid = rays.position[:2], rays.valid
         whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten(), about=about)
         drawn = points.shape[1]
-        return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        seen = spot_of_points(hits[..., drawn:], valid[..., drawn:])
+        if pupil is None and not bool(valid.all()):
+            lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+            fields, inside = field_points(fields, like=lens), points[:, weights[:drawn] > 0]
+            seen, whole = _of_clear_pupils(lens, fields, inside, SAMPLINGS["gauss"][2], about, seen, whole)
+        return whole, seen
 
 
 def even_hexapolar(rings: int, **like) -> Tensor:

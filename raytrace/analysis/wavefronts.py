@@ -1,6 +1,7 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import dataclasses
+import math
 import warnings
 from typing import Literal
 
@@ -17,10 +18,10 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
-from raytrace.psf_models.wave import strehl
+from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
-from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
+from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.words import calling_level
 
 _RINGS = 14, 56
@@ -37,8 +38,8 @@ class WavefrontMap(Analysis):
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
     coefficients: (F, W, J) Zernike coefficients 1 … J over the entrance pupil, numbered as `numbering` says: "noll", in
         waves RMS, or "fringe", in waves at the rim.
-    rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over a square grid of 127 points across the pupil,
-        centre and ends of its axes among them.
+    rms: (F, W) waves about the mean, over the clear pupil up to its edges; peak_to_valley: (F, W) waves, over a square
+        grid of 127 points across the pupil, centre and ends of its axes among them.
     strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
         where the blur is too large for the sum of waves.
     fields: (2, F); listed: whether the text lists the coefficients.
@@ -147,6 +148,7 @@ def wavefront(
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
         helps="ask for a smaller `size`, or fewer fields or wavelengths",
     )
+    zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
     parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
     over = 0 if lens.count is None else 1
@@ -179,7 +181,7 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
         opd=opd,
         valid=valid,
         coefficients=of(zernike_coefficients(front, terms, numbering)) / wave[:, None],
-        rms=of(rms(front)) / wave,
+        rms=of(rms(clear_wavefront(view, *_RINGS))) / wave,
         peak_to_valley=of(peak_to_valley(dense)) / wave,
         strehl=of(_strehl(view)),
         numbering=numbering,

@@ -33,7 +33,7 @@ class Request:
         return machine() | (self.peers.versions() if self.peers else {})
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Measured(Result):
     """Rows of a benchmark.
 

@@ -25,7 +25,7 @@ from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import Criterion, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.study import Study
+from raytrace.tolerancing.study import Study, View
 from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.paraxial import first_order
@@ -119,7 +119,7 @@ CRITERION = Criterion("RMS spot radius of each wavelength", "mm", _square, _para
 
 
 def study(lens: Lens, rule: tuple[Tensor, Tensor]) -> Study:
-    return Study(lens, tolerances(), CRITERION, sampling(lens, *rule))
+    return Study([View(lens, CRITERION, sampling(lens, *rule))], tolerances(), loss=0.01)
 
 
 @torch.no_grad()

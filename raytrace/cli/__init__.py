@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
                 return _fail(as_options(_one_line(error), spelled), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-                return _fail("not enough memory; ask for less (--rings, --points, --rays), or set --max-bytes", 1)
+                return _fail(f"not enough memory{_largest(arguments)}; --max-bytes refuses sooner", 1)
             kind = type(error).__name__
             return _fail(
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1
@@ -147,6 +147,8 @@ def script() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without µ shows ?
+    if sys.stdout is None:  # Python drops what is printed there
+        sys.exit(_fail("output: standard output is closed; send it to a file, or to /dev/null", 1))
     keep_freed_memory()
     sys.exit(main())
 
@@ -160,6 +162,15 @@ def as_options(message: str, spelled: Mapping[str, str]) -> str:
         return spelled[match[1]] + (f" {match[2]}" if match[2] else "")
 
     return re.sub(r"`(\w+)(?:=([^`]*))?`", option, message)
+
+
+def _largest(arguments: argparse.Namespace) -> str:
+    """The option with the largest number, of which less may help, as the end of a message."""
+    numbers = {
+        name: value for name, value in vars(arguments).items() if type(value) is int and name in arguments.spelled
+    }
+    name = max(numbers, key=numbers.get, default=None)
+    return f"; ask for less by {arguments.spelled[name]}, which is {numbers[name]}" if name else ""
 
 
 def _fail(message: str, code: int) -> int:

@@ -74,8 +74,13 @@ class Experiment:
         return spectrum_of(self.train, self.settings)
 
 
-def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -> Experiment:
-    """Open the lens, refuse what cannot be simulated, then read the pictures."""
+def open_experiment(
+    arguments: argparse.Namespace, settings: CodesignSettings, pictures: str | None = None
+) -> Experiment:
+    """Open the lens, refuse what cannot be simulated, then read the pictures.
+
+    pictures: digest of those of a finished run, which are read no more.
+    """
     path, lens = find_lens(arguments.lens), _file_lens(arguments)
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
@@ -95,12 +100,15 @@ def open_experiment(arguments: argparse.Namespace, settings: CodesignSettings) -
     sensor = sensor_at_start(settings)
     colour = sensor is not None and len(sensor.channels) == 3
     leaves = arguments.limit or _LEAVES, max(256, least), colour
-    samples, kind = pictures_of(arguments, least, lambda: _leaves(*leaves), colour=colour)
+    kind, parts = "", (Pictures((), ()),) * 2
+    if pictures is None:
+        samples, kind = pictures_of(arguments, least, lambda: _leaves(*leaves), colour=colour)
+        parts, pictures = split(samples), digest(samples.samples)
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
-        "pictures": digest(samples.samples),
+        "pictures": pictures,
     }
-    return Experiment(lens, path.stem, settings, *split(samples), about, kind, catalogs(arguments), arguments.device)
+    return Experiment(lens, path.stem, settings, *parts, about, kind, catalogs(arguments), arguments.device)
 
 
 def _leaves(count: int, size: int, colour: bool) -> Pictures:
@@ -207,7 +215,8 @@ def focus_of(lens: Lens, settings: CodesignSettings) -> Callable[[float], float]
 
 def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, label: str) -> Outcome:
     """Train both steps of a run, or their remaining epochs, with a bar and a line for every epoch."""
-    per_epoch, focus = experiment.steps_per_epoch, focus_of(experiment.lens, settings)
+    per_epoch = experiment.steps_per_epoch if len(experiment.train) else 0  # of a finished run
+    focus = focus_of(experiment.lens, settings)
     length, losses, bar = (settings.epochs + settings.relearn) * per_epoch, [], None
 
     def testing(batches: Sequence[int]) -> Iterator[int]:
@@ -251,7 +260,7 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
 # -- results
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class CodesignResult(Result):
     """The outcome of a run, or the optimum of the closed form. curves: losses by their name, for the figure."""
 
@@ -360,7 +369,9 @@ def _train(arguments: argparse.Namespace) -> None:
     stored = folder / STEPS[0] / "settings.json"
     if arguments.resume and not stored.exists():
         raise CommandError(f"{folder}: no run was started here; omit --resume to start one")
-    experiment = open_experiment(arguments, settings_of(arguments, stored))
+    is_finished = arguments.resume and (folder / "outcome.json").exists()
+    pictures = read_json(stored).get("pictures") if is_finished else None
+    experiment = open_experiment(arguments, settings_of(arguments, stored), pictures)
     settings = experiment.settings
     result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")
     if lens_file and not share().rank:

@@ -675,7 +675,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
     _command(
         "glass",
         "look up a glass",
-        "Print index, nd, Vd, formula, range and catalog of a glass; similar names are suggested for an unknown one. "
+        "Print index, nd, Vd, formula, range, expansion, density, price, internal transmittance and catalog of a "
+        "glass; similar names are suggested for an unknown one. "
         "With a temperature or a pressure also its indices there, relative to air at that temperature and pressure, "
         "and their change with temperature.",
         """
@@ -894,7 +895,9 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         "Change of a criterion (RMS spot radius or wavefront, MTF, merit, …) by every tolerance at its limits, "
         "its mean of the lens as built by second derivatives, and its distribution over perturbed and compensated "
         "lenses. The tolerances are those of the file (TRAD, TTHI, TETX …), of a grade, or of --limits; the "
-        "compensator is the sensor distance unless the file has others.",
+        "compensators are those of the file (COMP, CPAR), or the sensor distance if its tolerances are not used. All "
+        "configurations are judged together. TSTX, TIRX and a wedge tilt a surface rigidly "
+        "about its vertex; TEZI, TEXI and TSDR move all their terms at once.",
         """
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv

@@ -25,7 +25,7 @@ from raytrace.maths.result import Result
 from raytrace.system.lens import Lens
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class RenderedPictures(Result):
     """A text and a record each; record: file, written (None without -o), and the document of the rendering."""
 

@@ -168,7 +168,7 @@ def training_pictures(arguments: argparse.Namespace, leaves: str) -> Pictures:
 # -- restoration
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class RestoredImages(Result):
     """A record each: file, restored, and of simulated ones psnr_image and psnr_restored in dB."""
 

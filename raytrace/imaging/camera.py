@@ -2,18 +2,20 @@
 
 A training step of lens and network, in colour, at random places of the sensor:
 
+    lens = rt.read_lens("cooke_triplet")
     sensor = rt.Sensor(size=(24, 16), pixels=(4800, 3200), response="rgb", full_well=2e4, read_noise=3)
     camera = rt.Camera(rt.Variables(lens, "curvature thickness"), rt.UNet(channels=3), sensor=sensor)
     optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
-    origins = sensor.random_patches(index, size=128)        # index (B,): global numbers of the samples
-    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
-    where = {"points": sensor.patch_points(origins, 128), "origins": origins, "index": index}
-    restored = camera(pictures, distances, **where)         # (B, 3, H, W): blurred, recorded, restored
+    index = torch.arange(2)                                  # (B,): global numbers of the samples
+    points = sensor.patch_points(sensor.random_patches(index, size=32), 32)
+    pictures = torch.rand(2, 3, 32 + camera.margin, 32 + camera.margin)
+    distances = 10e3 + 40e3 * torch.rand(len(pictures))      # mm, one per image
+    restored = camera(pictures, distances, points=points, index=index)  # (B, 3, 32, 32): blurred, recorded, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-    camera.variables.project()                              # onto the bounds, if there are any
+    camera.variables.project()                               # onto the bounds, if there are any
 
 Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise. A phase element at the
 stop, whose heights are learned with the lens, or an element without a lens:
@@ -32,7 +34,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
-from raytrace.imaging.field_kernels import check_model, order_of
+from raytrace.imaging.field_kernels import check_model, is_sampled_in_common, order_of
 from raytrace.imaging.image import add_noise, as_picture, blur
 from raytrace.imaging.render import Rendering, element_in_stop, linearised, patch_kernels, render
 from raytrace.imaging.sensor import Sensor
@@ -277,12 +279,13 @@ class Camera(nn.Module):
                 about = self.lens(), self.sensor, self.model, self._places, distances, self.size, self.tol
                 self._order = order_of(*about, elements=self.elements())
                 return self._order
-            self._order = self._psf(distances, self.fields, tol=self.tol, errors=errors).order
+            each = self.fields.split(1, 1)  # alone, as in `order_of`
+            self._order = max(self._psf(distances, field, tol=self.tol, errors=errors).order for field in each)
         return self._order
 
     def kernels(
         self,
-        object_distances: Tensor,
+        object_distances: Tensor | Sequence[float] | float,
         field: int = 0,
         errors: Tensor | None = None,
         *,
@@ -290,27 +293,35 @@ class Camera(nn.Module):
     ) -> Tensor:
         """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, in a window about its `center`.
 
+        object_distances: a tensor, a sequence or one number.
         errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, one for each distance: PSFs
-        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination.
+        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination, 0 where no light arrives, with the
+        warning DarkPlaces. Raises ValueError for points that are not finite.
         """
         if (points is None) != (self.sensor is None):
             missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
             raise ValueError(f"the camera has no {missing}")
+        object_distances = self._distances(object_distances)
         if self.sensor is not None:
             if errors is not None:
                 raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
-            return self._kernels_of_places(points.to(self.fields), object_distances.to(self.fields))
+            return self._kernels_of_places(points.to(self.fields), object_distances)
         if self.pupil_points is not None:
             return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
         order = self.plan() if self._order is None else self._order
-        return self._psf(object_distances, self.fields[:, field : field + 1], order=order, errors=errors).kernel[:, 0]
+        parts = [(object_distances, errors)]
+        if is_sampled_in_common(self.variables.lens, self.model):
+            many = [errors] * len(object_distances) if errors is None or errors.dim() == 1 else errors.split(1)
+            parts = zip(object_distances.expand(len(many)).split(1), many, strict=True)
+        fields = self.fields[:, field : field + 1]
+        return torch.cat([self._psf(z, fields, order=order, errors=some).kernel[:, 0] for z, some in parts])
 
     def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
 
         points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
         """
-        points, distances = self._places if points is None else points, object_distances.to(self.fields)
+        points, distances = self._places if points is None else points, self._distances(object_distances)
         pairs = points.to(distances).repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
         return self._kernels_of_places(*pairs).unflatten(0, (len(distances), -1))
 
@@ -328,6 +339,14 @@ class Camera(nn.Module):
             elements=self.elements(),
         )
 
+    def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
+        """Object distances (B,) mm. Raises ValueError for none and for other shapes."""
+        distances = torch.as_tensor(object_distances, dtype=self.fields.dtype, device=self.fields.device)
+        if distances.dim() > 1 or not distances.numel():
+            shape = tuple(distances.shape)
+            raise ValueError(f"object_distances of shape {shape}: expected (B,) mm, one for each of B images, B ≥ 1")
+        return distances.reshape(-1)
+
     def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
         """The current lens with its stored rays, or as built, whose rays are of one call."""
         return (self.variables(), self._memo) if errors is None else (self.as_built(errors), None)
@@ -342,30 +361,28 @@ class Camera(nn.Module):
         errors: Tensor | None = None,
     ):
         # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
-        # traced one by the distortion.
-        fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
+        # traced one by the distortion and by tilts.
+        traces = MODELS[self.model].traces
         lens, memo = self._lens(errors)
-        distances, is_nominal = distances.to(self.fields.dtype), errors is None and self.center == "chief"
         return psf(
             lens,
             Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
             tol=tol,
-            fields=fields,
+            fields=fields if traces else torch.zeros_like(fields),
             object_distances=distances,
-            grid=self._window(lens, fields, distances, memo) if is_nominal else self.pixels,
-            center="axis" if is_nominal else self.center,
+            grid=self.pixels,
+            center=self.center if traces or self.center == "centroid" else "axis",
             normalise=self.normalise,
             execution=Execution(memo=memo),
         )
 
     def _kernels_of_points(self, distances: Tensor, fields: Tensor, errors: Tensor | None) -> Tensor:
         """PSFs (B, rows, columns) of the rays through the pupil points alone."""
-        (lens, memo), distances = self._lens(errors), distances.to(fields.dtype)
+        lens, memo = self._lens(errors)
         light = scene(lens, fields, distances, lens.wavelengths, memo)
-        window = self._window(lens, fields, distances, memo)
-        if window.centre.dim() > 1:  # chief rays (2, D, F), for every wavelength
-            centre = window.centre[..., None].expand(*window.centre.shape, len(lens.wavelengths))
-            window = dataclasses.replace(window, centre=centre)
+        chief = chief_landing(dataclasses.replace(light, wavelengths=lens.primary[None]))
+        centre = self.pixels.centre[:, None, None, None] + chief.expand(2, *light.shape)
+        window = dataclasses.replace(self.pixels, centre=centre)
         points = self.pupil_points.to(fields)
         weights = torch.full_like(points[0], 1 / len(points[0]))
         if self.model == "drt":
@@ -384,13 +401,6 @@ class Camera(nn.Module):
         kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
 
-    def _window(self, lens: Lens, fields: Tensor, distances: Tensor, memo: Memo | None) -> Grid:
-        """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""
-        if bool((fields == 0).all()) and memo is not None:
-            return self.pixels
-        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], memo))[..., 0]
-        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
-
     def image(
         self,
         picture: Tensor,
@@ -404,15 +414,18 @@ class Camera(nn.Module):
 
         picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
         With a sensor (B, C, H, W), centred at points (2, B) mm on it; integers are levels of sRGB (`linearised`).
+        Pictures of half precision are blurred in float32, which the image has.
         errors: of manufacture, (N,) of one lens or (B, N).
         Raises ValueError for other shapes and other ranges, as 0 to 255.
         """
+        object_distances = self._distances(object_distances)
         if self.sensor is None:
             picture = _grey(picture, object_distances)
         else:
             picture = self._of_channels(picture, object_distances)
         kernels = self.kernels(object_distances, field, errors, points=points)
-        return blur(picture, kernels.to(picture.dtype))
+        light = picture.to(torch.promote_types(picture.dtype, torch.float32))
+        return blur(light, kernels.to(light.dtype))
 
     def _of_channels(self, picture: Tensor, object_distances: Tensor) -> Tensor:
         """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,)."""

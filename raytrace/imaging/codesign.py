@@ -343,7 +343,7 @@ def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor])
         restored = camera(batch.picture, batch.distance, noise=batch.noise, errors=batch.errors)
         difference = restored - camera.target(batch.picture)
         return [measure(difference).sum((-2, -1)) for measure in measures]
-    sums = [torch.zeros(len(batch.field)) for _ in measures]
+    sums = [batch.picture.new_zeros(len(batch.field)) for _ in measures]
     for field in sorted(set(batch.field)):
         where = torch.tensor([i for i, number in enumerate(batch.field) if number == field])
         picture, distance, noise, errors = batch.part(where)

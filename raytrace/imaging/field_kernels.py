@@ -2,7 +2,7 @@
 
 Rows of a kernel grow towards +y of the sensor and columns towards -x, as the rows and columns of an upright picture do.
 A kernel has its origin where the chief ray of the primary wavelength meets the sensor, and sums to 1: the light that
-arrives is the relative illumination, an image of its own.
+arrives is the relative illumination, an image of its own. Where no chief ray or no light arrives a kernel is 0.
 
 Of a rotationally symmetric lens and the Gaussian model, centroids and covariances along one radius are turned to every
 place. Kernels of the other models are computed in one octant and mirrored to the others.
@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.imaging.sensor import Sensor
 from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
@@ -37,7 +38,7 @@ from raytrace.wave_optics.element import Element, is_radial
 from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
 #: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
@@ -52,6 +53,10 @@ _DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
 
 class WindowTooLarge(ValueError):
     """A blur of more pixels than a window has."""
+
+
+class DarkPlaces(RaytraceWarning):
+    """Places of the sensor without light, whose kernels are 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +84,7 @@ class FieldKernels:
         check_model(self.model, self.elements)
 
     def at(self, points: Tensor) -> Tensor:
-        """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor; where no chief ray arrives, a point."""
+        """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
         parts = [dataclasses.replace(self, object_distances=distance) for distance in self.object_distances.split(1)]
         return torch.cat([part._of_one_distance(points) for part in parts], 1)
 
@@ -95,33 +100,40 @@ class FieldKernels:
     def _groups(self) -> list[Tensor]:
         """Numbers of the places whose kernels one call computes: all finite or all infinite distances."""
         distances = self.object_distances.detach()
-        if MODELS[self.model].traces and not (self.model == "gaussian" and is_round_about_axis(self.lens)):
+        if MODELS[self.model].traces and not self._has_radii:
             return [torch.nonzero(distances == distance)[:, 0] for distance in distances.unique()]
         sides = [torch.nonzero(side)[:, 0] for side in (distances.isfinite(), distances.isinf())]
         near_first = (side[distances[side].argsort()] for side in sides if len(side))
-        return [some for side in near_first for some in side.split(_DISTANCES)]
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _DISTANCES
+        return [some for side in near_first for some in side.split(count)]
 
     def _paired(self, points: Tensor) -> Tensor:
         """The same of a group."""
-        distances, which = self.object_distances, torch.arange(points.shape[1], device=points.device)
-        if not varies(distances):
-            distances, which = distances.unique(return_inverse=True)
+        distances, which = _distinct(self.object_distances)
         kernels = dataclasses.replace(self, object_distances=distances)
         if not MODELS[self.model].traces:
             return kernels._computed(torch.zeros_like(points[:, :1]))[0, which]
+        if self._has_radii:
+            # Moments of all radii and distances, pixels of the pairs: these cost more.
+            radii, places = self._distinct_radii(points)
+            moments = [moment[which, places][None] for moment in kernels._moments(radii)]
+            return self._gaussians(points, moments)[:, 0]
         if len(distances) == 1:
             return kernels._of_one_distance(points)[:, 0]
-        # Moments of all radii and distances, pixels of the pairs: these cost more.
-        radii, places = self._distinct_radii(points)
-        moments = [moment[which, places][None] for moment in kernels._moments(radii)]
-        return self._gaussians(points, moments)[:, 0]
+        pairs = zip(distances.split(1), points.split(1, 1), strict=True)  # each with its own derivative by the distance
+        return torch.cat([dataclasses.replace(self, object_distances=z)._of_one_distance(at)[:, 0] for z, at in pairs])
+
+    @property
+    def _has_radii(self) -> bool:
+        """Whether the moments at a radius are those of all its azimuths."""
+        return self.model == "gaussian" and is_round_about_axis(self.lens)
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
         if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
             return self._in_parts(points)
-        compute = self._turned if self.model == "gaussian" else self._in_parts
+        compute = self._turned if self._has_radii else self._in_parts
         octant = torch.stack([points.abs().amin(0), points.abs().amax(0)])
         places, which = torch.unique((octant / self.sensor.pitch * 1e6).round(), dim=1, return_inverse=True)
         if self.model == "gaussian" and places.shape[1] == points.shape[1]:  # no place is the image of another
@@ -138,7 +150,8 @@ class FieldKernels:
         return kernels.flip(-1)
 
     def _in_parts(self, points: Tensor) -> Tensor:
-        return torch.cat([self._computed(part) for part in points.split(_TOGETHER, 1)])
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
+        return torch.cat([self._computed(part) for part in points.split(count, 1)])
 
     def _computed(self, points: Tensor) -> Tensor:
         """By the PSF model, field by field."""
@@ -146,23 +159,25 @@ class FieldKernels:
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
         kernels = self._of_elements(fields) if self.elements else self._of_model(fields)
         kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
-        kept = arrives[:, None, None, None, None] & ~kernels.isnan()
-        return torch.where(kept, kernels, _point(kernels))
+        return torch.where(arrives[:, None, None, None, None], _of_sum_1(kernels), 0.0)
 
     def _of_model(self, fields: Tensor) -> Tensor:
-        """(D, F, W, h, w) of sum 1, columns towards +x."""
-        about = {"fields": fields, "object_distances": self.object_distances, "normalise": "window", "center": "axis"}
-        model, kernels = model_of(self.model, order=self.order), []
-        for wavelengths, window in self._windows(fields):
-            how = {"grid": window, "wavelengths": wavelengths, "per_wavelength": True}
-            kernels.append(psf(self.lens, model, **about, **how).kernel)
-        return torch.cat(kernels, 2)
+        """(D, F, W, h, w) of sum 1, 0 without light, columns towards +x."""
+        numbers = pytree.tree_leaves((self.lens, self.object_distances))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
+            if MODELS[self.model].in_common and not varies(fields):
+                # Fields of places vary with the lens, which breaks symmetry: one sampling, with derivatives or not.
+                fields = fields.detach().requires_grad_()
+            about = {"fields": fields, "object_distances": self.object_distances}
+            about |= {"normalise": "window", "center": "axis", "per_wavelength": True}
+            model, kernels = model_of(self.model, order=self.order), []
+            for wavelengths, window in self._windows(fields):
+                kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=wavelengths).kernel)
+            return torch.cat(kernels, 2)
 
     def _of_elements(self, fields: Tensor) -> Tensor:
-        """(D, F, W, h, w) of sum 1, nan without light, columns towards +x: of the lens with elements at its stop."""
-        kernel = self.light(fields)
-        total = kernel.sum((-2, -1), keepdim=True)
-        return torch.where(total > 0, safe_divide(kernel, total), torch.nan)
+        """The same of the lens with elements at its stop."""
+        return _of_sum_1(self.light(fields))
 
     def light(self, fields: Tensor) -> Tensor:
         """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
@@ -189,6 +204,7 @@ class FieldKernels:
         else:  # linear between radii: vignetting factors are, too, with a kink on the axis
             nodes = radii(points, self.nodes)
             moments = [along(nodes, moment.movedim(1, 0), points).movedim(0, 1) for moment in self._moments(nodes)]
+            moments[-1] = (moments[-1] > 1 - 1e-9).to(moments[-1])  # no light between a radius with and one without
         return self._gaussians(points, moments)
 
     def _distinct_radii(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,29 +214,30 @@ class FieldKernels:
         return units * (1e-6 * self.sensor.pitch), which
 
     def _gaussians(self, points: Tensor, moments: list[Tensor]) -> Tensor:
-        """Kernels (N, D, C, size, size) of shift, sagittal and tangential variance, (D, N, W), at places (2, N)."""
+        """Kernels (N, D, C, size, size) of `_moments` (D, N, W) at places (2, N)."""
         radius = safe_sqrt((points * points).sum(0))
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
         window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        narrowest = torch.minimum(*moments[1:]).amin((0, 2))  # of each place: kernels do not depend on other places
+        narrowest = torch.minimum(*moments[1:3]).amin((0, 2))  # of each place: kernels do not depend on other places
         order, parts = torch.argsort((narrowest >= self.sensor.pitch**2).to(torch.int8), stable=True), []
         narrow = int((narrowest < self.sensor.pitch**2).sum())
         for group, pixels in ((order[:narrow], gaussian_pixels), (order[narrow:], wide_gaussian_pixels)):
             for some in group.split(_TOGETHER):
                 if not len(some):
                     continue
-                shift, sagittal, tangential = (moment[:, some] for moment in moments)  # (D, N, W)
+                shift, sagittal, tangential, light = (moment[:, some] for moment in moments)  # (D, N, W)
                 x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
                 pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
                 covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-                kernels = pixels(window, torch.stack([x * shift, y * shift]), covariance)
+                kernels = light[..., None, None] * pixels(window, torch.stack([x * shift, y * shift]), covariance)
                 kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
-                parts.append(kernels / kernels.sum((-2, -1), keepdim=True))
+                parts.append(_of_sum_1(kernels))
         kernels = torch.cat(parts)
         return kernels if narrow in (0, len(order)) else kernels[torch.argsort(order)]
 
-    def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Centroid from the origin, mm, sagittal and tangential variance, mm², (D, K, W) at radii (K,) along +y."""
+    def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Centroid from the origin, mm, sagittal and tangential variance, mm², and 1 where light arrives, else 0,
+        (D, K, W) at radii (K,) along +y."""
         points = torch.stack([torch.zeros_like(radii), radii])
         fields = self.sensor.fields(self.lens, points)
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
@@ -230,7 +247,7 @@ class FieldKernels:
         )
         moments = spots.centroid[1] - self._origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
-        return tuple(torch.where(known, moment, 0.0) for moment in moments)
+        return *(torch.where(known, moment, 0.0) for moment in moments), known.to(radii)
 
     def _origin(self, fields: Tensor) -> Tensor:
         """(2, D, N, 1 or W)."""
@@ -272,7 +289,7 @@ class ElementKernels:
     def of_light(self, light: Tensor) -> Tensor:
         """Kernels (D, C, size, size) of sum 1 of `light`."""
         kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
-        return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+        return _of_sum_1(kernels)
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
@@ -281,8 +298,15 @@ class ElementKernels:
 
     def paired(self, points: Tensor) -> Tensor:
         """Kernels (N, C, size, size) at places (2, N) mm, each of its own of the object distances (N,)."""
-        distances, which = self.object_distances.unique(return_inverse=True)
+        distances, which = _distinct(self.object_distances)
         return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
+
+
+def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances without repetition, and the number of that of each; all of them where they vary."""
+    if varies(distances):
+        return distances, torch.arange(len(distances), device=distances.device)
+    return distances.unique(return_inverse=True)
 
 
 def channel_moments(
@@ -366,11 +390,22 @@ def along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
     return (1 - part) * curve[left] + part * curve[left + 1]
 
 
-def _point(kernels: Tensor) -> Tensor:
-    """All light in the middle pixel."""
-    point = torch.zeros_like(kernels[0])
-    point[..., point.shape[-2] // 2, point.shape[-1] // 2] = 1
-    return point
+def _of_sum_1(kernels: Tensor) -> Tensor:
+    """Kernels (..., h, w) over their sums; 0 without light."""
+    return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+
+
+def warn_of_dark_places(kernels: Tensor, points: Tensor) -> None:
+    """Warn DarkPlaces of kernels (B, C, h, w) at points (2, B) mm that are 0 in a channel."""
+    dark = (kernels.detach() == 0).flatten(2).all(2).any(1)
+    if bool(dark.any()):
+        x, y = min(points.detach()[:, dark].T.tolist(), key=lambda point: math.hypot(*point))
+        warnings.warn(
+            f"{int(dark.sum())} of {len(dark)} places of the sensor receive no light, and their kernels are 0: the "
+            f"nearest to the axis is ({x:.4g}, {y:.4g}) mm; give a sensor within the image circle",
+            DarkPlaces,
+            stacklevel=calling_level(),
+        )
 
 
 def window_size(
@@ -456,6 +491,11 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
     return float(reach)
 
 
+def is_sampled_in_common(lens: Lens, model: str) -> bool:
+    """Whether the sampling of a kernel depends on the others of a call: of DRT, and where apertures may clip one."""
+    return MODELS[model].in_common or any(surface.apertures for surface in lens.surfaces)
+
+
 def order_of(
     lens: Lens,
     sensor: Sensor,
@@ -482,8 +522,10 @@ def order_of(
         fields = fields[:, ~fields.isnan().any(0)]
         # The error of a Gaussian is that of its width and of its light in the window: a single pixel is enough.
         pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size)}
-        return psf(lens, model, fields=fields, object_distances=object_distances, **about, tol=tol).order
+        about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size), "tol": tol}
+        about |= {"object_distances": object_distances}
+        # Each place alone: a clipped beam has more rays of an order, which those of other places do not have.
+        return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))
 
 
 def _order_of_elements(

@@ -1,6 +1,6 @@
 """Pictures that a lens projects onto a sensor: blur over the whole field, distortion, illumination, colour, depth.
 
-    sensor = rt.Sensor(size=(24, 16), pixels=(1200, 800), response="rgb")
+    sensor = rt.Sensor(size=(24, 16), pixels=(240, 160), response="rgb")
     image = rt.render(lens, picture, sensor=sensor).image
 
 A picture is the image of an ideal lens of the same focal length. The real lens moves every point of it to the landing
@@ -36,6 +36,7 @@ from raytrace.imaging.field_kernels import (
     field_kernels,
     order_of,
     radii,
+    warn_of_dark_places,
     window_size,
 )
 from raytrace.imaging.image import as_picture, blur, depth_masks, extended_layers, occlusion
@@ -799,7 +800,8 @@ def render_patches(
     the `ImageFormation` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1
     to the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers
     of the lens, of the elements and in the distances.
-    Raises ValueError for numbers of patches, points and distances that differ.
+    Warns DarkPlaces of points without light, whose kernels are 0. Raises ValueError for numbers of patches, points and
+    distances that differ, and for points that are not finite.
     """
     patches = as_picture(patches)
     if patches.dim() != 4 or points.shape != (2, len(patches)):
@@ -828,16 +830,23 @@ def patch_kernels(
     illumination: bool = False,
 ) -> Tensor:
     """Kernels (B, C, size, size) of the channels at points (2, B) mm; arguments as for `render_patches`."""
+    if not bool(torch.isfinite(points.detach()).all()):
+        count = int((~torch.isfinite(points.detach())).any(0).sum())
+        raise ValueError(
+            f"{count} of {points.shape[1]} points are nan or infinite: expected places of the sensor in mm"
+        )
+    distances = like = lens.surfaces[0].thickness
     if object_distances is not None:
-        _check_distances(torch.as_tensor(object_distances), points.shape[1])
+        distances = torch.as_tensor(object_distances, dtype=like.dtype, device=like.device)
+        _check_distances(distances, points.shape[1])
         lens = by_angle(lens)
-    distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
-    distances = distances.to(lens.surfaces[0].thickness).reshape(-1)
+    distances = distances.reshape(-1).expand(points.shape[1])
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
     elements = in_contact(elements)
     model = model or ("wave" if elements else "gaussian")
     kernels = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
-    kernels = kernels.at(points)[:, 0] if len(distances) == 1 else kernels.paired(points)
+    kernels = kernels.paired(points)
+    warn_of_dark_places(kernels, points)
     return _illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
 
 
@@ -906,7 +915,7 @@ def encoded(light: Tensor) -> Tensor:
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Rendering(Result):
     """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
 

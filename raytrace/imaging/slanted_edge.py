@@ -24,7 +24,7 @@ _STRAIGHT = 2.0  # pixels: RMS distance of the lines' centroids from the fitted 
 _PASSES = 4
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class SlantedEdgeMtf(Result):
     """frequencies: (K,) cycles/mm up to one a pixel, perpendicular to the edge; mtf: (K,), 1 at 0.
 

@@ -57,7 +57,8 @@ from raytrace.system.identity import alike, digest, identity, other_lens
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
-from raytrace.system.surface import Surface, medium_surfaces, sag, sag_at
+from raytrace.system.surface import medium_surfaces, sag_at
+from raytrace.tracing.geometry import edge_thickness, rims
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
@@ -111,27 +112,26 @@ def violation(lens: Lens, limits: Limits | None = None) -> Tensor:
 
 def _shortfalls(lens: Lens, limits: Limits) -> Iterator[Tensor]:
     """Shortfall of each thickness, on the axis and at the edge; negative where its limit is met."""
-    surfaces = lens.surfaces
-    air = [is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)]
-    elements = [k for k in range(1, len(surfaces) - 1) if surfaces[k].is_mirror or not (air[k - 1] and air[k])]
-    last, side = len(surfaces) - 1, 1
+    surfaces, last, side = lens.surfaces, len(lens.surfaces) - 1, 1
+    in_air = np.array([is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)])
+    elements = [k for k in range(1, last) if surfaces[k].is_mirror or not (in_air[k - 1] and in_air[k])]
+    sizes = np.array([surface.semi_diameter or math.nan for surface in surfaces])
     start = None  # the element before the current air space
     for k in range(1, last):
         side = -side if surfaces[k].is_mirror else side
-        before, after = surfaces[k], surfaces[k + 1]
         if k in elements:
             start = k
-        if not air[k]:
-            yield from _outside(side * before.thickness, *limits.glass)
-            yield from _edge(before, after, side, limits.edge)
+        if not in_air[k]:
+            yield from _outside(side * surfaces[k].thickness, *limits.glass)
+            yield from _edge(surfaces, (k, k + 1), side, sizes, in_air, limits.edge)
             continue
-        yield from _edge(before, after, side, 0.0)
+        yield from _edge(surfaces, (k, k + 1), side, sizes, in_air, 0.0)
         if start is None or k + 1 not in (*elements, last):
             continue
         gap = torch.stack([surface.thickness for surface in surfaces[start : k + 1]]).sum()
         yield from _outside(side * gap, limits.air[0], limits.air[1] if k + 1 < last else math.inf)
         if start < k:
-            yield from _edge(dataclasses.replace(surfaces[start], thickness=gap), after, side, 0.0)
+            yield from _edge(surfaces, (start, k + 1), side, sizes, in_air, 0.0)
 
 
 def _outside(thickness: Tensor, least: float, most: float) -> Iterator[Tensor]:
@@ -140,15 +140,17 @@ def _outside(thickness: Tensor, least: float, most: float) -> Iterator[Tensor]:
         yield thickness - most
 
 
-def _edge(before: Surface, after: Surface, side: int, least: float) -> Iterator[Tensor]:
-    if before.semi_diameter and after.semi_diameter:
-        yield least - side * edge_thickness(before, after)
-
-
-def edge_thickness(before: Surface, after: Surface) -> Tensor:
-    """Thickness in mm between two surfaces at the smaller of their semi-diameters."""
-    height = before.thickness.new_tensor(min(before.semi_diameter, after.semi_diameter)) ** 2
-    return before.thickness + sag(after, height) - sag(before, height)
+def _edge(surfaces, pair: tuple[int, int], side: int, sizes, in_air, least: float) -> Iterator[Tensor]:
+    """The shortfall at the edge between two surfaces of known clear heights (S,)."""
+    k, end = pair
+    ends = np.append(np.arange(1, len(surfaces)), len(surfaces) - 1)
+    ends[k] = end
+    rim = float(rims(sizes, ends, ~in_air & (ends > np.arange(len(ends))))[k])
+    if math.isfinite(rim):
+        y = surfaces[k].thickness.new_tensor(rim)
+        front, back = (sag_at(surfaces[j], torch.zeros_like(y), y) for j in pair)
+        thickness = torch.stack([surface.thickness for surface in surfaces[k:end]]).sum()
+        yield least - side * edge_thickness(thickness, front, back)
 
 
 # -- states that carry their identity ----------------------------------------------------------------------------------
@@ -489,13 +491,11 @@ class Variables(Owned):
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
                 self.get_parameter(variable.name).clamp_(min(low, high), max(low, high))
-        if self._constraints is None:
-            return
-        x = self._values()
         fixed = {variable.name for variable, is_frozen in zip(self.variables, frozen, strict=True) if is_frozen}
-        nearest = self._constraints.nearest(
-            x, self._before, fixed=np.array([variable.name in fixed for variable in self._all])
-        )
+        fixed = np.array([variable.name in fixed for variable in self._all])
+        x = self._values()
+        with torch.device("cpu"):  # whatever the default device
+            nearest = x if self._constraints is None else self._constraints.nearest(x, self._before, fixed=fixed)
         for variable, before, after in zip(self._all, x, nearest, strict=True):
             if variable in self.variables and after != before:
                 self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
@@ -508,6 +508,10 @@ class Variables(Owned):
     def _load_from_state_dict(self, *arguments) -> None:
         super()._load_from_state_dict(*arguments)
         self._before = self._values()
+
+    def __getstate__(self) -> dict:
+        """All but the prepared conditions, which a copy prepares again."""
+        return {name: part for name, part in vars(self).items() if name not in ("_constraints", "_glasses")}
 
     def _conditions(self) -> tuple[Condition, ...]:
         """The conditions of `hold` on the lens. Raises BadVariables."""

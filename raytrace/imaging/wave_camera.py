@@ -256,7 +256,7 @@ def quality(
     )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ElementReport(Result):
     """Elements of a camera, their kernels and image quality; initial: those before an optimisation, to compare with."""
 

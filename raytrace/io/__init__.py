@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
 from raytrace.io import oslo, ray_optics
-from raytrace.io.assembly import changes
+from raytrace.io.assembly import TILTED_OBJECT, changes
 from raytrace.io.codev import read as codev_read
 from raytrace.io.codev import write as codev_write
 from raytrace.io.melts import check_catalog, with_melts
@@ -56,6 +56,7 @@ from raytrace.io.table import write as table_write
 from raytrace.io.zemax import archive as zemax_archive
 from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
+from raytrace.io.zemax.tolerances import read_lines
 from raytrace.materials.agf import write_agf
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import check_unit
@@ -63,6 +64,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Result
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData
+from raytrace.system.surface import is_posed
 from raytrace.words import calling_level, did_you_mean, named_value
 
 #: Substitutes for glasses of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown glass.
@@ -112,7 +114,7 @@ FORMATS = {
     ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True, catalogs=True),
     ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format("seq", codev_read.read, codev_write.write),
-    ".len": Format("len", oslo.read),
+    ".len": Format("len", oslo.read, load=oslo.load),
     ".roa": Format("roa", ray_optics.read, load=read_content),
     ".csv": Format("table", table_read.read, table_write.write, catalogs=True),
     ".tsv": _TEXT_TABLE,
@@ -208,8 +210,17 @@ def read_lens_with_report(
         kept=tuple(map(str, data.kept)),
         operands=operand_uses(data.merit, evaluated),
         tolerances=len(data.tolerances),
+        unread_tolerances=_unread_tolerances(lens),
     )
     return lens, report
+
+
+def _unread_tolerances(lens: Lens) -> tuple[str, ...]:
+    """The lines of tolerances that are not read, with the reason, or the first that the lens does not have."""
+    try:
+        return read_lines(lens, lens.optimization_data.tolerances).unread if lens.optimization_data else ()
+    except LensFileError as error:
+        return (str(error),)
 
 
 def shipped_lens(name: str | os.PathLike) -> Path | None:
@@ -295,6 +306,8 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     except ValueError as error:
         raise LensFileError(str(error), place) from error
     form = _format(path, WRITTEN)
+    if is_posed(lens.surfaces[0]):
+        raise LensFileError(TILTED_OBJECT, place._replace(surface=0))
     plain, melts = with_melts(lens, path) if form.catalogs else (lens, None)
     with tempfile.TemporaryDirectory() as folder:
         if melts is not None:  # as it will be found beside the file

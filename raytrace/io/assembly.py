@@ -309,8 +309,14 @@ class LensDraft:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "auto"
+    afocal: bool = False
     environment: Environment | None = None
     sources: Sources = dataclasses.field(default_factory=dict)
+
+
+TILTED_OBJECT = (
+    "a tilt or decentre of the object, which lens files do not hold here; tilt the axes of surface 1, a break, instead"
+)
 
 
 def assemble(draft: LensDraft, file: str) -> Lens:
@@ -321,6 +327,8 @@ def assemble(draft: LensDraft, file: str) -> Lens:
         raise LensFileError(f"{keyword}{message}", place)
 
     last = len(draft.surfaces) - 1
+    if draft.surfaces[0].before is not None or draft.surfaces[0].after is not None:
+        raise LensFileError(TILTED_OBJECT, Place(file, None, 0))
     if not 0 < draft.stop < last:
         refuse("stop", f" is surface {draft.stop}, expected 1 to {last - 1}: a surface between object and image")
     if not draft.aperture > 0:
@@ -363,6 +371,7 @@ def assemble(draft: LensDraft, file: str) -> Lens:
         notes=draft.notes,
         catalogs=draft.catalogs,
         ray_aiming=draft.ray_aiming,
+        afocal=draft.afocal,
         environment=draft.environment,
     )
     _refuse_overflow(lens, file)

@@ -43,11 +43,14 @@ from raytrace.io.source import (
     Record,
     UnsupportedSurface,
     by_word,
+    decode,
     double,
     in_lines,
+    is_binary,
     is_number,
     nonzero,
     number,
+    read_content,
     refuse_few,
     refuse_surplus,
     shown,
@@ -155,7 +158,10 @@ def _sections(text: str, file: str, report: Draft) -> _Sections:
     records = list(_commands(text, file))
     if not records or records[0].keyword != "LEN" or [word.upper() for word in records[0].words[:1]] != ["NEW"]:
         place = records[0].place if records else Place(file)
-        raise LensFileError("expected LEN NEW at the beginning; is it a lens file of OSLO (.len)?", place)
+        message = "expected LEN NEW at the beginning of a lens file of OSLO (.len)"
+        if any(record.keyword in ("RDM", "SO", "DIM") for record in records):
+            message += "; the commands are those of CODE V: rename the file to .seq"
+        raise LensFileError(message, place)
     system, waves = Block(Place(file)), _Wavelengths()
     surfaces = [_Commands(records[0].place._replace(surface=0))]
     end = next((k for k, record in enumerate(records) if record.keyword == "END"), None)
@@ -263,6 +269,15 @@ _APERTURES = {
     "FNO": ("image_f_number", True),
     "NAO": ("object_na", False),
 }
+
+
+def load(path: Path) -> str:
+    """The text of a file. Raises LensFileError, also for the binary .len files of CODE V."""
+    content = read_content(path)
+    if is_binary(content):
+        message = "is binary: a .len file of CODE V, which is not read; OSLO's is text. In CODE V, write it by WRL"
+        raise LensFileError(f"{message} as a sequence file (.seq)", Place(str(path)))
+    return decode(content, Place(str(path)))
 
 
 def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> Lens:
@@ -414,7 +429,7 @@ def _solved(
     which suffices for a height of 0.
     """
     surfaces, n = list(surfaces), []
-    for k in medium_surfaces(surfaces[:-1]):
+    for k in medium_surfaces(surfaces)[:-1]:
         n.append(float(refractive_index(surfaces[k].glass, double(primary))))
         if not n[-1]:
             name = surfaces[k].glass.name or "the medium"

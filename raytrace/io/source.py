@@ -32,7 +32,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Surface, is_freeform, is_posed
-from raytrace.words import named
+from raytrace.words import RaytraceWarning, named
 
 #: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
 MAX_BYTES = 16 * 2**20
@@ -81,7 +81,7 @@ class UnsupportedSurface(LensFileError):
     """A surface of a type that is not modelled; it is never dropped and never read as another type."""
 
 
-class LensFileWarning(UserWarning):
+class LensFileWarning(RaytraceWarning):
     """A lens file was read, but something in it was left out or assumed."""
 
 
@@ -119,6 +119,17 @@ def read_content(path: Path, most: int = MAX_BYTES) -> bytes:
         if isinstance(error, LensFileError):
             raise
         raise LensFileError(f"cannot be opened: {error}", place) from error
+
+
+#: Bytes of ASCII text.
+_PLAIN = bytes([*b"\t\n\v\f\r", *range(32, 127)])
+
+
+def is_binary(content: bytes) -> bool:
+    """Whether bytes are no text: in their encoding more than a fifth of the characters is not of ASCII."""
+    text = content.decode(encoding(content), "replace")
+    ascii = text.encode("ascii", "ignore")
+    return len(ascii) - len(ascii.translate(None, _PLAIN)) < 0.8 * len(text)
 
 
 def decode(content: bytes, place: Place) -> str:
@@ -541,7 +552,16 @@ def operand_uses(merit: Sequence[Row], evaluated: Collection[str] | None) -> tup
 
 
 #: Keys that a document has only where they are not empty.
-_OPTIONAL_KEYS = ("configurations", "variables", "solves", "kept", "operands", "tolerances", "geometry")
+_OPTIONAL_KEYS = (
+    "configurations",
+    "variables",
+    "solves",
+    "kept",
+    "operands",
+    "tolerances",
+    "unread_tolerances",
+    "geometry",
+)
 
 
 @value
@@ -552,7 +572,8 @@ class ImportReport(Result):
     the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its number, from 1), wavelengths
     (µm), ray_aiming: of the lens that was read. configurations: values of multi-configuration operands.
     variables, solves, kept: of `Lens.optimization_data`, in words; operands: of its merit function; tolerances: number
-    of its lines. geometry: surfaces and gaps that cannot be fabricated.
+    of its lines; unread_tolerances: lines that are not read, with the reason. geometry: surfaces and gaps that cannot
+    be fabricated.
     """
 
     file: str
@@ -572,6 +593,7 @@ class ImportReport(Result):
     kept: tuple[str, ...] = ()
     operands: tuple[OperandUse, ...] = ()
     tolerances: int = 0
+    unread_tolerances: tuple[str, ...] = ()
     geometry: tuple[str, ...] = ()
 
     def document(self) -> dict:
@@ -621,7 +643,8 @@ class ImportReport(Result):
             lines.append(f"  merit function of {sum(use.count for use in self.operands)} lines:")
         for status in dict.fromkeys(use.status for use in self.operands):
             lines += [f"    {status}:", *_wrapped([str(use) for use in self.operands if use.status == status])]
-        return [*lines, *([f"  tolerances: {self.tolerances} lines, kept"] if self.tolerances else [])]
+        lines += [f"  tolerances: {self.tolerances} lines, kept"] if self.tolerances else []
+        return lines + [f"    not read: {line}" for line in self.unread_tolerances]
 
 
 def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:

@@ -12,28 +12,30 @@ import torch
 
 from raytrace.files import encoding, read_bytes, write_text
 from raytrace.materials.glass import BY_NUMBER, FORMULAS, Glass
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
 _NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
 #: An unknown thermal coefficient is 0 in AGF, and its temperature 20 °C; any other unknown figure is -1.
 _UNKNOWN = {"TD": (*"000000", "20", "0")}
-_KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
+_KEYWORDS = {"CC", "NM", "GC", *_NUMERIC}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _LARGEST_FILE = 16 * 2**20
 
 #: More glasses than any catalog has; all makers together list some thousands.
 MOST_GLASSES = 20_000
 
-_NAMES = re.compile(r"^[ \t]*NM[ \t]+(\S+)", re.MULTILINE)
+#: Characters that no text has, and a name; both are sought in catalogs of megabytes, so without regard to lines.
+_BINARY = bytes({*range(32)} - {*b"\t\n\v\f\r"})
+_NAME = re.compile(r"NM[ \t]+(\S+)")
 
 
 class CatalogError(ValueError):
     """A malformed glass catalog; the message has file and line, the text found, the text expected and a likely fix."""
 
 
-class CatalogWarning(UserWarning):
+class CatalogWarning(RaytraceWarning):
     """A catalog was read, but something in it was left aside."""
 
 
@@ -80,11 +82,18 @@ def decode(content: bytes, path: str | Path) -> str:
         text = content.decode(codec).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
     except UnicodeDecodeError as error:
         raise CatalogError(f"{path}: damaged {codec.upper()} text at byte {error.start}; cut off?") from error
-    binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
-    if binary:
+    plain = text.encode()
+    if len(plain.translate(None, _BINARY)) < len(plain):
+        binary = re.search(f"[{re.escape(_BINARY.decode())}]", text)
         line = text.count("\n", 0, binary.start()) + 1
         raise _fault(path, line, f"binary data (byte {ord(binary[0]):#04x})", "the text of an AGF")
-    return text
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _names(text: str) -> list[tuple[str, int]]:
+    """The name of every glass of a text, and where its record begins."""
+    records = ((match[1], match.start()) for match in _NAME.finditer(text))
+    return [(name, at) for name, at in records if not text[text.rfind("\n", 0, at) + 1 : at].strip()]
 
 
 class _Listing(Mapping):
@@ -92,17 +101,19 @@ class _Listing(Mapping):
 
     def __init__(self, text: str, catalog: str, path: Path):
         self._text, self._catalog, self._path = text, catalog, path
-        starts = [(match[1], match.start()) for match in _NAMES.finditer(text)]
+        starts = _names(text)
+        _refuse_many(len(starts), path)
         ends = [start for _, start in starts[1:]] + [len(text)]
-        self._places: dict[str, tuple[int, int]] = {}
+        self.header = text[: starts[0][1]] if starts else ""
+        line, self._places = 1 + self.header.count("\n"), {}
         for (name, start), end in zip(starts, ends, strict=True):
-            self._places.setdefault(name, (start, end))
+            self._places.setdefault(name, (start, end, line))
+            line += text.count("\n", start, end)
         self._parsed: dict[str, Glass] = {}
 
     def __getitem__(self, name: str) -> Glass:
         if name not in self._parsed:
-            start, end = self._places[name]
-            line = self._text.count("\n", 0, start) + 1
+            start, end, line = self._places[name]
             block = next(_blocks(_records(self._text[start:end], {}, line)))
             self._parsed[name] = _glass(block, self._catalog, self._path)
         return self._parsed[name]
@@ -122,16 +133,16 @@ def listed(text: str, path: str | Path) -> Catalog:
 
     Raises CatalogError where there is none, or more than MOST_GLASSES; of a damaged glass when it is asked for.
     """
-    path, text = Path(path), re.sub(r"\r\n|\r", "\n", text)
-    _refuse_many(text, path)
+    path = Path(path)
     glasses = _Listing(text, path.stem.upper(), path)
     if not glasses:
         raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
-    return Catalog(path.stem.upper(), glasses)
+    return Catalog(
+        path.stem.upper(), glasses, tuple(re.findall(r"^[ \t]*CC[ \t]+(\S.*)$", glasses.header, re.MULTILINE))
+    )
 
 
-def _refuse_many(text: str, path: Path) -> None:
-    count = sum(1 for _ in _NAMES.finditer(text))
+def _refuse_many(count: int, path: Path) -> None:
     if count > MOST_GLASSES:
         raise CatalogError(f"{path}: {count} glasses, more than any catalog ({MOST_GLASSES}); not read")
 
@@ -139,7 +150,7 @@ def _refuse_many(text: str, path: Path) -> None:
 def parse_agf(text: str, path: str | Path) -> Catalog:
     """The catalog written in the text of an AGF file; `path` gives its name and its place in messages."""
     path = Path(path)
-    _refuse_many(text, path)
+    _refuse_many(len(_names(text)), path)
     name, comments, glasses = path.stem.upper(), [], {}
     unknown: dict[str, int] = {}
     for block in _blocks(_records(text, unknown)):
@@ -177,12 +188,12 @@ def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tup
         word, *rest = content.split(maxsplit=1) or [""]
         if not word or word.startswith("!"):
             continue
-        if keyword in _NUMERIC and _NUMBER.fullmatch(word):
-            parts.append(content)
-        elif word in _KEYWORDS:
+        if word in _KEYWORDS:
             if keyword:
                 yield line_of_record, keyword, " ".join(parts).strip()
             line_of_record, keyword, parts = line, word, rest
+        elif keyword in _NUMERIC and _NUMBER.fullmatch(word):
+            parts.append(content)
         elif len(unknown) < 100:
             unknown.setdefault(word[:20], line)
     if keyword:
@@ -260,6 +271,12 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
 
 def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: Sequence[str] = ()) -> tuple[float, ...]:
     """Numbers of a record; blanks: the figures in place of "-" and "_", the last for all further words."""
+    try:  # a catalog has some ten thousand of them
+        numbers = tuple(map(float, words))
+    except ValueError:
+        numbers = (math.nan,)
+    if math.isfinite(sum(numbers)) and "_" not in "".join(words):
+        return numbers
     numbers = []
     for k, word in enumerate(words):
         if blanks and word in ("-", "_"):

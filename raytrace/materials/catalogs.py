@@ -36,16 +36,20 @@ from raytrace.materials.agf import read_agf as read_agf
 from raytrace.materials.agf import read_text
 from raytrace.materials.agf import write_agf as write_agf
 from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, abbe_number, constant, model_glass, nd, refractive_index
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
 #: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
 SHIPPED = (
     *("SCHOTT", "OHARA", "HOYA", "CDGM", "HIKARI", "SUMITA", "LZOS", "CORNING", "INFRARED", "MISC", "HERAEUS", "TOPAS"),
-    *("ZEON", "ARTON", "LIGHTPATH", "RPO", "UMICORE", "ISUZU", "ARCHER", "RAD_HARD", "BIREFRINGENT"),
+    *("NHG", "PLASTIC", "ZEON", "ARTON", "LIGHTPATH", "RPO", "UMICORE", "ISUZU", "ARCHER", "RAD_HARD", "PILKINGTON"),
+    "BIREFRINGENT",
 )
 #: Further names that lens files give to a shipped catalog.
-CATALOG_NAMES = {"NIKON": "HIKARI", "NIKON-HIKARI": "HIKARI", "NIKON_HIKARI": "HIKARI"}
+CATALOG_NAMES = {
+    "NIKON": "HIKARI", "NIKON-HIKARI": "HIKARI", "NIKON_HIKARI": "HIKARI", "PLASTIC2022": "PLASTIC",
+    "ANGSTROMLINK": "PLASTIC", "CORNING_FS": "CORNING", "CORNING_B": "CORNING", "SCHOTT_IG": "INFRARED",
+}  # fmt: skip
 #: Environment variable: paths of AGF files, separated as in PATH.
 ENVIRONMENT = "RAYTRACE_CATALOGS"
 #: Glasses of an older edition than that of lens files of 2023: the newer edition, and the largest difference of its
@@ -60,7 +64,7 @@ _PER_ABBE = 0.01
 SAME_INDEX = 1e-6
 
 
-class AmbiguousGlass(UserWarning):
+class AmbiguousGlass(RaytraceWarning):
     """Two catalogs define a name differently, and the lens file does not specify the catalog."""
 
 
@@ -187,7 +191,7 @@ def edition(glass: Glass) -> tuple[str, ...]:
     if not glass.catalog:
         return ()
     parts = [part.strip() for part in glass.comment.split(";")]
-    sources = [part for part in parts if "sources agree" in part or "deviate by" in part]
+    sources = [part for part in parts if re.search(r"\bsources? (agree|alone)\b|deviate by|^sources of figures", part)]
     if not sources:
         edition = f": {glass.comment}" if glass.comment else " does not state its edition"
         return (glass.catalog + edition,)
@@ -258,11 +262,11 @@ def shipped_file(name: str) -> Path | None:
 
 
 def shipped_catalog(name: str) -> Catalog:
-    """A shipped catalog by its name, parsed once. Raises CatalogError for a name that is not shipped."""
+    """A shipped catalog by its name, a glass parsed when it is used. Raises CatalogError for a name not shipped."""
     shipped = _shipped_name(name)
     if shipped is None:
         raise CatalogError(f"no catalog {name!r} is shipped; there are {', '.join(SHIPPED)}")
-    return load(shipped_folder() / f"{shipped}.AGF")
+    return load(shipped_folder() / f"{shipped}.AGF", listed=True)
 
 
 def load(path: str | Path, *, listed: bool = False) -> Catalog:
@@ -301,8 +305,7 @@ def aliases() -> dict[str, Alias]:
 @lru_cache(maxsize=64)
 def _shipped_names(catalog: str) -> dict[str, str]:
     """Capitals -> name of the glasses of a shipped catalog, without parsing their figures."""
-    text = read_text(shipped_folder() / f"{catalog}.AGF")
-    return {name.upper(): name for name in re.findall(r"^NM (\S+)", text, re.MULTILINE)}
+    return {name.upper(): name for name in shipped_catalog(catalog).glasses}
 
 
 def _shipped_name(catalog: str) -> str | None:
@@ -321,6 +324,7 @@ def shipped_difference(glass: Glass) -> float:
     return _difference(glass, shipped) if shipped else 0.0
 
 
+@lru_cache(maxsize=1024)
 def _shipped_glass(name: str, catalog: str) -> Glass:
     return shipped_catalog(catalog).glasses[_shipped_names(catalog)[name.upper()]]
 

@@ -20,16 +20,20 @@ from torch import Tensor
 
 from raytrace.materials.glass import FORMULAS, WITH_ERRORS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide, value
+from raytrace.words import RaytraceWarning
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)
 
-#: °C above which the formula of air has a density: its pole is at -272.5.
-COLDEST = -272.0
+#: °C above which the formula of air has a density: its pole is at -272.5; and up to which a glass is one.
+COLDEST, HOTTEST = -272.0, 1000.0
+
+#: °C between which thermal coefficients of catalogs are fitted (SCHOTT TIE-19).
+FITTED = -100.0, 140.0
 
 
-class NoThermalCoefficients(UserWarning):
-    """A glass without thermal coefficients is used at another temperature than its catalog's."""
+class NoThermalCoefficients(RaytraceWarning):
+    """A glass is used at another temperature than its catalog's without thermal coefficients, or beyond their range."""
 
 
 @value
@@ -143,8 +147,10 @@ def dn_dt(glass: Glass, wavelength: Tensor, air: Environment) -> tuple[Tensor, T
 def objection(place: Environment) -> str:
     """The error of a temperature or a pressure out of range, else ""."""
     temperature, pressure = _numbers(place)
-    if not COLDEST < temperature < torch.inf:
-        return f"`temperature={temperature:g}`: expected degrees Celsius above {COLDEST:g}"
+    if not COLDEST < temperature <= HOTTEST:
+        limit = f"above {COLDEST:g}" if temperature <= COLDEST else f"up to {HOTTEST:g}"
+        fitted = "thermal coefficients of catalogs hold from {:g} to {:g}".format(*FITTED)
+        return f"`temperature={temperature:g}`: expected degrees Celsius {limit}; {fitted}"
     if not 0 <= pressure < torch.inf:
         return f"`pressure={pressure:g}`: expected atmospheres, 0 (vacuum) or more"
     return ""
@@ -173,4 +179,7 @@ def unknown_change(glass: Glass, place: Environment) -> str:
             f"{source} has no thermal coefficients: at {temperature:g} °C it keeps its index relative to vacuum of "
             f"{thermal(glass).reference:g} °C"
         )
+    if not is_model(glass) and not FITTED[0] <= temperature <= FITTED[1]:
+        hold = "hold from {:g} to {:g} °C".format(*FITTED)
+        return f"the thermal coefficients of {name} are extrapolated to {temperature:g} °C; those of catalogs {hold}"
     return ""

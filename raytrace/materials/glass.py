@@ -22,7 +22,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------
 
@@ -243,7 +243,7 @@ class InvalidIndex(ValueError):
     """A glass has no real, positive refractive index at a wavelength asked of it."""
 
 
-class OutOfRange(UserWarning):
+class OutOfRange(RaytraceWarning):
     """A wavelength lies outside the range that the coefficients of a glass were fitted to."""
 
 
@@ -281,6 +281,35 @@ class Glass:
     def __repr__(self) -> str:
         return f"<Glass: {', '.join(_description(self))}>"
 
+    @property
+    def expansion(self) -> float | None:
+        """Linear thermal expansion from -30 to 70 °C, 1e-6/K; None if not listed."""
+        return self._figure("ED", 0)
+
+    @property
+    def expansion_20_300(self) -> float | None:
+        """Linear thermal expansion from 20 to 300 °C, 1e-6/K; None if not listed."""
+        return self._figure("ED", 1)
+
+    @property
+    def density(self) -> float | None:
+        """g/cm³; None if not listed."""
+        return self._figure("ED", 2)
+
+    @property
+    def relative_price(self) -> float | None:
+        """Price by volume relative to the maker's glass of the kind BK7; None if not listed."""
+        return self._figure("OD", 0)
+
+    @property
+    def transmittance(self) -> tuple[tuple[float, float, float], ...]:
+        """Rows (wavelength µm, internal transmittance, thickness mm) by wavelength; empty if not listed."""
+        return tuple(sorted(numbers[:3] for keyword, numbers in self.records if keyword == "IT" and len(numbers) > 2))
+
+    def _figure(self, keyword: str, place: int) -> float | None:
+        numbers = next((numbers for word, numbers in self.records if word == keyword), ())
+        return next((number for number in numbers[place : place + 1] if number not in (0.0, -1.0)), None)
+
 
 # -- the index --------------------------------------------------------------------------------------------------------
 
@@ -310,6 +339,27 @@ def refractive_index(glass: Glass, wavelength: Tensor | float) -> Tensor:
     usable = (exact > shortest) & (exact < longest) & finite.all(0)
     n = formula.index(torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
     return torch.where(usable & (n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+
+
+def internal_transmittance(glass: Glass, wavelength: Tensor | float, thickness: Tensor | float = 10.0) -> Tensor:
+    """The part of the light that a glass of some thickness (...) mm does not absorb, by the catalog; without surfaces.
+
+        τ = exp(-α t),  α linear between the listed wavelengths
+
+    wavelength: (...) µm. nan outside the listed wavelengths, and for a medium that lists none.
+    """
+    wavelength, thickness = _as_wavelength(wavelength), torch.as_tensor(thickness, dtype=torch.float64)
+    rows = [row for row in glass.transmittance if row[0] > 0 and row[2] > 0]
+    if len(rows) < 2:
+        return torch.full_like(wavelength * thickness, torch.nan)
+    columns = [*zip(*rows, strict=True)]
+    at, τ, depth = torch.tensor(columns, dtype=torch.float64, device=wavelength.device)
+    absorption, exact = -torch.log(τ.clamp(torch.finfo(τ.dtype).tiny, 1.0)) / depth, wavelength.to(torch.float64)
+    k = torch.searchsorted(at, exact.detach().contiguous()).clamp(1, len(rows) - 1)
+    share = safe_divide(exact - at[k - 1], at[k] - at[k - 1])
+    α = absorption[k - 1] + share * (absorption[k] - absorption[k - 1])
+    listed = (exact >= at[0]) & (exact <= at[-1])
+    return torch.where(listed, torch.exp(-α * thickness), torch.nan).to(wavelength.dtype)
 
 
 def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:

@@ -25,12 +25,13 @@ from raytrace.materials.glass import (
     abbe_number,
     check_unit,
     check_wavelengths,
+    internal_transmittance,
     mil_glass,
     nd,
     refractive_index,
 )
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Result, Table, number
+from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.words import calling_level
 
 
@@ -39,24 +40,28 @@ class GlassFigures(Result):
     """A glass and its indices (W,) at wavelengths (W,) µm.
 
     environment: that whose air the indices and wavelengths refer to, None for the catalog's reference air; dn_dt,
-    dn_dt_absolute: (W,) 1/K, relative to air at the glass's temperature and relative to vacuum.
+    dn_dt_absolute: (W,) 1/K, relative to air at the glass's temperature and relative to vacuum. transmittance: (W,)
+    internal, of 10 mm, nan where not listed. Expansion, density and price are those of `glass`.
     """
 
     COLUMNS = (
         Column("wavelength", "µm", "g"), Column("index", "", ".10f"), Column("dn_dt", "1/K", ".3e", "dn/dT, air"),
         Column("dn_dt_absolute", "1/K", ".3e", "dn/dT, vacuum"),
+        Column("transmittance", "10 mm", ".4f", "internal\ntransmittance"),
     )  # fmt: skip
 
     glass: Glass
     wavelengths: Tensor
     indices: Tensor
+    transmittance: Tensor
     environment: Environment | None = None
     dn_dt: Tensor | None = None
     dn_dt_absolute: Tensor | None = None
 
     def columns(self) -> dict[str, Tensor]:
         changes = {"dn_dt": self.dn_dt, "dn_dt_absolute": self.dn_dt_absolute} if self.environment else {}
-        return {"wavelength": self.wavelengths, "index": self.indices, **changes}
+        listed = {"transmittance": self.transmittance} if self.glass.transmittance else {}
+        return {"wavelength": self.wavelengths, "index": self.indices, **changes, **listed}
 
     def document(self) -> dict:
         glass = self.glass
@@ -69,7 +74,9 @@ class GlassFigures(Result):
             "wavelength_range": list(glass.wavelength_range) if glass.wavelength_range else None,
             "nd": number(nd(glass)),
             "vd": number(abbe_number(glass)),
+            **{name: number(getattr(glass, name)) for name in _FIGURES},
             "wavelengths": self.wavelengths.tolist(),
+            "transmittance": numbers(self.transmittance),
             "indices": self.indices.tolist(),
         } | (
             {}
@@ -85,19 +92,30 @@ class GlassFigures(Result):
     def tables(self) -> list[Table]:
         glass, span = self.glass, self.glass.wavelength_range
         source = "MIL code" if glass.formula == "model" else "no catalog"
-        lines = [
-            f"{glass.name}  ({glass.catalog or source})",
-            f"  nd       {float(nd(glass)):.7f}",
-            f"  Vd       {float(abbe_number(glass)):.4f}",
-            f"  formula  {glass.formula}",
-            f"  range    {span[0]:g} to {span[1]:g} µm" if span else "  range    not listed",
-            *(f"  edition  {sentence}" for sentence in edition(glass)),
-        ]
+        expansions = ((glass.expansion, "−30 to 70 °C"), (glass.expansion_20_300, "20 to 300 °C"))
+        listed = [f"{figure:g}·10⁻⁶/K from {span}" for figure, span in expansions if figure is not None]
+        price = glass.relative_price
+        figures = {
+            "nd": f"{float(nd(glass)):.7f}",
+            "Vd": f"{float(abbe_number(glass)):.4f}",
+            "formula": glass.formula,
+            "range": f"{span[0]:g} to {span[1]:g} µm" if span else "",
+            "expansion": ", ".join(listed),
+            "density": "" if glass.density is None else f"{glass.density:g} g/cm³",
+            "price": "" if price is None else f"{price:g}, relative to the maker's BK7",
+            "transmittance": "internal, of 10 mm, below" if glass.transmittance else "",
+        }
+        lines = [f"{glass.name}  ({glass.catalog or source})"]
+        lines += [f"  {title:13}  {figure or 'not listed'}" for title, figure in figures.items()]
+        lines += [f"  {'edition':13}  {sentence}" for sentence in edition(glass)]
         if self.environment is not None:
-            lines.append(
-                f"  at       {in_words(self.environment)}, relative to air; dn/dT relative to air, and to vacuum"
-            )
+            where = f"{in_words(self.environment)}, relative to air; dn/dT relative to air, and to vacuum"
+            lines.append(f"  {'at':13}  {where}")
         return [Table(self.columns(), [*lines, ""])]
+
+
+#: Fields of a glass beside its dispersion.
+_FIGURES = "expansion", "expansion_20_300", "density", "relative_price"
 
 
 def glass(
@@ -121,11 +139,12 @@ def glass(
     check_unit(waves, [medium])
     check_wavelengths(medium, waves)
     if temperature is None and pressure is None:
-        return GlassFigures(medium, waves, refractive_index(medium, waves))
+        return GlassFigures(medium, waves, refractive_index(medium, waves), internal_transmittance(medium, waves))
     state = (REFERENCE[0] if temperature is None else temperature, REFERENCE[1] if pressure is None else pressure)
     air = Environment(*(torch.as_tensor(number, dtype=torch.float64) for number in state))
     if wrong := objection(air):
         raise ValueError(f"{name}: {wrong}")
     if unknown := unknown_change(medium, air):
         warnings.warn(unknown, NoThermalCoefficients, stacklevel=calling_level())
-    return GlassFigures(medium, waves, index_in(medium, waves, air), air, *dn_dt(medium, waves, air))
+    transmittance = internal_transmittance(medium, waves)
+    return GlassFigures(medium, waves, index_in(medium, waves, air), transmittance, air, *dn_dt(medium, waves, air))

@@ -366,6 +366,31 @@ _VALUE_TYPES: set[type] = set()
 Value = typing.TypeVar("Value")
 
 
+def summary(instance) -> str:
+    """A value with its fields that are not None."""
+    fields = ((field.name, getattr(instance, field.name)) for field in dataclasses.fields(instance))
+    entries = (f"{name}={_summary(item)}" for name, item in fields if item is not None)
+    return f"{type(instance).__name__}({', '.join(entries)})"
+
+
+def _summary(item: object) -> str:
+    """A tensor of at most nine numbers as these, a larger one as shape, type and range; other items as they are."""
+    if type(item) is tuple:
+        return f"({', '.join(map(_summary, item))}{',' if len(item) == 1 else ''})"
+    if not isinstance(item, Tensor) or item.is_meta or is_functorch_wrapped_tensor(item):
+        return repr(item)
+    array = item.detach().cpu().resolve_conj()
+    if array.numel() <= 9:
+        return _listed(array.tolist(), "{:.6g}".format if array.is_floating_point() else str)
+    limits = "" if array.is_complex() else " … ".join(f"{float(end):.6g}" for end in array.aminmax())
+    return f"<{tuple(array.shape)} {str(array.dtype).removeprefix('torch.')}{limits and ', '}{limits}>"
+
+
+def _listed(entry: object, form: Callable[[object], str]) -> str:
+    """Nested lists of numbers as text."""
+    return f"[{', '.join(_listed(part, form) for part in entry)}]" if isinstance(entry, list) else form(entry)
+
+
 def value(cls: type) -> type:
     """Make a class a frozen, slotted dataclass and register it as a pytree.
 
@@ -373,10 +398,12 @@ def value(cls: type) -> type:
     that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
     `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would raise
     on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
-    A class with a `__repr__` keeps it. `torch.load` accepts it: restoring its fields executes nothing.
+    A class with a `__repr__` keeps it; others print large tensors by shape and range. `torch.load` accepts it:
+    restoring its fields executes nothing.
     """
-    shown = cls.__repr__ is object.__repr__
-    cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
+    if cls.__repr__ is object.__repr__:
+        cls.__repr__ = summary
+    cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=False)(cls)
     fields = dataclasses.fields(cls)
     numeric = {field.name for field in fields if holds_numbers(field.type)}
     mixed = [field.name for field in fields if _may_hold_tensors(field.type)]

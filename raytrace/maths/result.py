@@ -1,5 +1,6 @@
 """Results of public functions: numbers, a table, a text, a document for JSON and a figure."""
 
+import html
 import json
 import math
 import os
@@ -54,12 +55,15 @@ COLUMNS = {
 }  # fmt: skip
 SUFFIXES = {"_percent": "%", "_um": "µm"}
 
+#: Rows of a table in a notebook.
+MOST_ROWS = 100
+
 
 class Result:
     """A result of a public function; a class of results defines its columns, and `draw` if it has a figure.
 
     columns: a table; to_frame: the same for pandas; document: of `--json`; str: the text that the command prints, of
-    `tables`; plot: the figure; save: what `-o` writes.
+    `tables`, which a notebook shows as HTML; plot: the figure; save: what `-o` writes.
     """
 
     __slots__ = ()
@@ -85,7 +89,7 @@ class Result:
         if column := next((column for column in self.COLUMNS if column.name == name), None):
             return column
         if name in ("field_x", "field_y"):
-            return Column(name, self.lens.fields.unit, heading="field")
+            return Column(name, self.lens.fields.unit)
         ending = next((unit for suffix, unit in SUFFIXES.items() if name.endswith(suffix)), "")
         return Column(name, COLUMNS.get(name, ending))
 
@@ -143,17 +147,29 @@ class Result:
     def __repr__(self) -> str:
         return str(self)
 
+    def _repr_html_(self) -> str:
+        """The tables of the text for a notebook, or the text of a result without a table."""
+        try:
+            tables = self.tables()
+        except TypeError:
+            return _block(str(self).splitlines())
+        parts = ((_block(t.title), html_table(self._printed(t.columns)), _block(t.notes)) for t in tables)
+        return "\n".join(part for table in parts for part in table if part)
+
     def _lines(self, columns: Mapping[str | Column, Tensor | Sequence]) -> list[str]:
-        """Columns as text; x and y of a field share a column."""
+        return text_table(self._printed(columns))
+
+    def _printed(self, columns: Mapping[str | Column, Tensor | Sequence]) -> dict[Column, Sequence]:
+        """Columns as they are printed: of fields with x = 0 without field_x."""
         listed, words = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}, self.words()
-        if "field_x" in listed and "field_y" in listed:
-            listed["field_y"] = [*map(point_text, listed.pop("field_x"), listed["field_y"])]
+        if "field_x" in listed and not np.any(listed["field_x"]):
+            del listed["field_x"]
         found = {}
         for name, values in listed.items():
             known = name in words and name in columns and isinstance(columns[name], Tensor)
             column = self.column(name) if isinstance(name, str) else name
             found[column] = [words[name][int(value)] for value in values] if known else values
-        return text_table(found)
+        return found
 
 
 def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
@@ -213,17 +229,42 @@ def cell(value: float, form: str) -> str:
     return shown if float(shown) else f"{0.0:{form.removeprefix('<')}}"  # what rounds to 0 has no sign
 
 
+def _cells(column: Column, values: Sequence) -> list[str]:
+    """The texts of a column: two lines of its heading with its unit, and its numbers or texts."""
+    first, _, second = (column.heading or column.name).partition("\n")
+    shown = [value if isinstance(value, str) else cell(value, column.form) for value in values]
+    return [first, ", ".join(filter(None, (second, column.unit))), *shown]
+
+
 def text_table(columns: Mapping[Column, Sequence]) -> list[str]:
     """Lines of columns of numbers, or of texts, under their headings and units."""
     texts = []
-    for (name, unit, form, heading), values in columns.items():
-        first, _, second = (heading or name).partition("\n")
-        shown = [value if isinstance(value, str) else cell(value, form) for value in values]
-        shown = [first, ", ".join(filter(None, (second, unit))), *shown]
-        width = max(map(len, shown))
-        texts.append([text.ljust(width) if form.startswith("<") else text.rjust(width) for text in shown])
+    for column, values in columns.items():
+        cells = _cells(column, values)
+        width = max(map(len, cells))
+        texts.append([text.ljust(width) if column.form.startswith("<") else text.rjust(width) for text in cells])
     lines = ["  ".join(row).rstrip() for row in zip(*texts, strict=True)]
-    return lines if lines[1] else [lines[0], *lines[2:]]
+    return [line for k, line in enumerate(lines) if k > 1 or line]
+
+
+def html_table(columns: Mapping[Column, Sequence]) -> str:
+    """The same as HTML, at most MOST_ROWS rows of it; empty without columns."""
+    if not columns:
+        return ""
+    sides = ["left" if column.form.startswith("<") else "right" for column in columns]
+    first, second, *body = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
+    heads = ["<br>".join(filter(None, map(html.escape, pair))) for pair in zip(first, second, strict=True)]
+    lines = [("th", heads), *(("td", map(html.escape, row)) for row in body[:MOST_ROWS])]
+    table = "\n".join(
+        "<tr>" + "".join(f'<{tag} style="text-align:{side}">{c}</{tag}>' for side, c in zip(sides, row, strict=True))
+        + "</tr>" for tag, row in lines
+    )  # fmt: skip
+    rest = len(body) - MOST_ROWS
+    return f"<table>\n{table}\n</table>" + (_block([f"and {rest:,} rows; to_frame() has all"]) if rest > 0 else "")
+
+
+def _block(lines: Sequence[str]) -> str:
+    return f"<pre>{html.escape(chr(10).join(lines))}</pre>" if lines else ""
 
 
 def object_text(distance: float) -> str:

@@ -25,9 +25,9 @@ def _at_least_one(rule: str, **sizes: float) -> None:
             raise ValueError(f"{rule}: `{name}` is {size}; expected 1 or more")
 
 
-def _afford(count: float, what: str) -> None:
+def _afford(count: float, what: str, option: str) -> None:
     """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
-    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps="ask for fewer")
+    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer `{option}`")
 
 
 def gauss_rings(
@@ -40,7 +40,7 @@ def gauss_rings(
     """
     arms = 4 * rings if arms is None else arms
     _at_least_one("gauss_rings", rings=rings, arms=arms)
-    _afford(rings * arms, f"{rings} rings of {arms} arms")
+    _afford(rings * arms, f"{rings} rings of {arms} arms", "rings")
     nodes, weights = gauss_legendre(rings)
     radius = np.sqrt(0.5 * (nodes + 1))
     angle = (np.arange(arms) + 0.5) * (2 * math.pi / arms)
@@ -80,7 +80,7 @@ def hexapolar(
     leads to: OpticStudio traces a wavelength of weight w with √w times the rings).
     """
     _at_least_one("hexapolar", rings=rings)
-    _afford(3.0 * rings * (rings + 1) + 1, f"{rings} hexapolar rings")
+    _afford(3.0 * rings * (rings + 1) + 1, f"{rings} hexapolar rings", "rings")
     points, weights = [np.zeros((2, 1))], [np.array([0.25])]
     for ring in range(1, int(rings) + 1):
         angle = np.arange(6 * ring) * (math.pi / 3 / ring)
@@ -95,7 +95,7 @@ def square(
 ) -> tuple[Tensor, Tensor]:
     """Cell centres of an across × across grid over [-1, 1]² that lie inside the disc, equal weights."""
     _at_least_one("square", across=across)
-    _afford(float(across) ** 2, f"a square grid of {across} points across")
+    _afford(float(across) ** 2, f"a square grid of {across} points across", "points")
     axis = (2 * np.arange(across) + 1 - across) / across
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
     kept = x * x + y * y <= 1
@@ -107,7 +107,7 @@ def sobol(
 ) -> tuple[Tensor, Tensor]:
     """Scrambled Sobol points mapped to the disc by r = √u, equal weights; the same points for the same seed."""
     _at_least_one("sobol", count=count)
-    _afford(count, f"{count} Sobol points")
+    _afford(count, f"{count} Sobol points", "points")
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return _disc(engine.draw(count, dtype=torch.float64), dtype, device)
 
@@ -122,7 +122,7 @@ def random(
 ) -> tuple[Tensor, Tensor]:
     """Independent uniform points of the disc, equal weights; drawn from `generator`, or from a new one of `seed`."""
     _at_least_one("random", count=count)
-    _afford(count, f"{count} random points")
+    _afford(count, f"{count} random points", "points")
     generator = torch.Generator().manual_seed(seed) if generator is None else generator
     return _disc(torch.rand(count, 2, generator=generator, dtype=torch.float64), dtype, device)
 
@@ -132,7 +132,7 @@ def fan(
 ) -> tuple[Tensor, Tensor]:
     """`count` points from -1 to 1 along x or y, equal weights: for drawing, not for integrating."""
     _at_least_one("fan", count=count)
-    _afford(count, f"a fan of {count} rays")
+    _afford(count, f"a fan of {count} rays", "points")
     line = np.linspace(-1, 1, count) if count > 1 else np.zeros(1)
     zero = np.zeros_like(line)
     return _equal(np.stack([line, zero] if axis == "x" else [zero, line]), dtype, device)

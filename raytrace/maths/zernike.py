@@ -99,7 +99,7 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
     Raises ValueError if a fit has fewer points of positive weight than coefficients.
     """
     weights = torch.ones_like(values) if weights is None else weights.expand(values.shape)
-    _refuse_few(int((weights > 0).sum(-1).min()), len(basis))
+    refuse_few(int((weights > 0).sum(-1).min()), len(basis))
     root = torch.sqrt(torch.where(weights > 0, weights, 1.0))
     root = torch.where(weights > 0, root, 0.0)
     return _solved(values, root, *torch.linalg.qr(root[..., None] * basis.T))
@@ -111,7 +111,7 @@ def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -
     Known are those of a `condition` below `worst`. No derivative is taken by the weights: on what all have in common,
     the light of a field, no fit depends. Raises ValueError for fewer points than coefficients.
     """
-    _refuse_few(weights.shape[-1], len(basis))
+    refuse_few(weights.shape[-1], len(basis))
     root = torch.sqrt(weights.detach())
     q, r = torch.linalg.qr(root[..., None] * basis.T)
     known = _condition(r, root) < worst
@@ -140,9 +140,11 @@ def _solved(values: Tensor, root: Tensor, q: Tensor, r: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(r, right, upper=True)[..., 0]
 
 
-def _refuse_few(points: int, coefficients: int) -> None:
+def refuse_few(points: int, coefficients: int) -> None:
     if points < coefficients:
-        raise ValueError(f"{points} points of positive weight cannot fit {coefficients} coefficients")
+        raise ValueError(
+            f"{points} points of positive weight cannot fit {coefficients} coefficients; ask for fewer `terms`"
+        )
 
 
 def harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:

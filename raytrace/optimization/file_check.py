@@ -10,7 +10,7 @@ from raytrace.io.source import Place
 from raytrace.optimization.operands.operand import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import check as check_lens
-from raytrace.system.lens import check_media
+from raytrace.system.lens import check_media, glass_on_image
 from raytrace.tracing.geometry import defects
 
 
@@ -35,4 +35,10 @@ def check(
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
     check_media(lens, lens.wavelengths, where=str(path))
-    return dataclasses.replace(report, geometry=tuple(map(str, defects(lens))))
+    notes, image = report.notes, len(lens.surfaces) - 1
+    if unused := glass_on_image(lens):
+        notes = (
+            *notes,
+            f"surface {image}: light does not enter {unused}, the glass of the image: results are in front of it",
+        )
+    return dataclasses.replace(report, notes=notes, geometry=tuple(map(str, defects(lens))))

@@ -27,6 +27,8 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
+from raytrace.words import RaytraceWarning
+
 _SHARED = 1e-5  # weight of the single sides of a row relative to their sum, which alone does not distinguish them
 _ROUNDS = 12  # in which inequalities that a step violates are added
 _SLACK = 1e-11  # of the scaled step: violation of a condition that is tolerated
@@ -617,7 +619,7 @@ _FAR = 1e3  # of the merit at the start: charged where the merit is not finite
 _STEPS = 15_000
 
 
-class NoOptimum(UserWarning):
+class NoOptimum(RaytraceWarning):
     """A search ended where the error still falls; its last point is used."""
 
 

@@ -26,8 +26,9 @@ from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
 from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
-from raytrace.system.surface import sag_at, signed, vertex_curvature
+from raytrace.system.surface import is_flat, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
+from raytrace.tracing.geometry import edge_thickness
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
@@ -93,7 +94,7 @@ def _edge_thickness(state, solve: Solve):
     def thickness(lens: Lens) -> list[Tensor]:
         at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
         near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
-        return [(edge + near - far).reshape(())]
+        return [(edge - edge_thickness(0.0, near, far)).reshape(())]
 
     return state.through_torch(thickness)[0]
 
@@ -672,10 +673,8 @@ class Bundle:
     @cached_property
     def _launches_itself(self) -> bool:
         lens = self.view.lens
-        source = lens.surfaces[0]
-        plane = source.is_plane and source.after is None
         usual = lens.fields.kind in ("angle", "object_height", "paraxial_image_height") and not lens.fields.telecentric
-        return plane and usual and (not self._aims or not is_bent(lens))
+        return is_flat(lens.surfaces[0]) and usual and (not self._aims or not is_bent(lens))
 
     @cached_property
     def _aims(self) -> bool:
@@ -877,17 +876,12 @@ class Bundle:
     def _hits_by_torch(self, state: LensState) -> Hits:
         def end(lens: Lens) -> Rays:
             wavelength = lens.wavelengths[:, None]
-            indices = unbent(lens, media(lens, wavelength)[: self.last + 1])
+            indices = media(lens, wavelength)[: self.last + 1]
             rays = self._start_by_torch(lens)
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength)
 
         parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=self._aims_bent)
         return self._as_hits(state, parts, valid)
-
-
-def unbent(lens: Lens, indices: list) -> list:
-    """Indices behind the first surfaces of a lens, the object's first; behind the image as before it."""
-    return [*indices[:-1], indices[-2]] if len(indices) == len(lens.surfaces) else indices
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:

@@ -30,6 +30,7 @@ import numpy as np
 
 from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.maths.sampling import gauss_legendre
+from raytrace.optimization.operands.boundaries import AT_RIM, BOUNDARIES
 from raytrace.optimization.operands.operand import (
     SETTINGS,
     Conventions,
@@ -65,8 +66,8 @@ class BadMerit(ValueError):
 class Boundaries:
     """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum at the edge.
 
-    None: no such row. `edge` is of glass; the minimum of air also holds at its edge. The space before the image has
-    no maximum.
+    None: no such row. `edge` is of glass; the minimum of air also holds at its edge. Edges are at the common rim of the
+    two surfaces (`tracing.geometry.rims`). The space before the image has no maximum.
     """
 
     glass: tuple[float, float] | None = None
@@ -91,7 +92,8 @@ class Boundaries:
         )
         for operand, end, target in bounds:
             if target is not None and np.isfinite(target) and end > 0:
-                yield Row(operand, (1, end), target=float(target), weight=1.0)
+                numbers = AT_RIM if operand in ("MNEA", "MNEG") else (0.0,) * 4
+                yield Row(operand, (1, end), numbers, target=float(target), weight=1.0)
 
 
 @dataclass(frozen=True)
@@ -403,7 +405,8 @@ def arguments(row: Row) -> str:
     named = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
     plain = [] if named or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
     numbers = [f"{number:.6g}" for number in row.numbers]
-    return "  ".join([*named, *plain, *([" ".join(numbers)] if any(row.numbers) else [])])
+    has_numbers = any(row.numbers) and not (row.operand in BOUNDARIES and row.numbers == AT_RIM)
+    return "  ".join([*named, *plain, *([" ".join(numbers)] if has_numbers else [])])
 
 
 def configurations_of(rows: Iterable[Row], current: int) -> list[int]:

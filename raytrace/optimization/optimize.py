@@ -71,7 +71,7 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 # -- conditions: what is required, and what is reached -----------------------------------------------------------------
 
@@ -84,7 +84,7 @@ _TRIES = 4
 _NAMED = 4  # variables in one sentence
 
 
-class NotReached(UserWarning):
+class NotReached(RaytraceWarning):
     """A condition or a boundary that the optimised lens does not meet."""
 
 
@@ -130,7 +130,7 @@ class Reached:
 
 def reached(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> tuple[Reached, ...]:
     """Every condition, then every boundary of the merit function, at variables (n,) between bounds (n,)."""
-    results = [*_conditions(problem, x), *_boundaries(problem, x)]
+    results = [*conditions_at(problem, x), *_boundaries(problem, x)]
     if all(result.met for result in results):
         return tuple(results)
     reasons, rows = _reasons(problem, x, lower, upper), [*_held_rows(problem), *_bounding_rows(problem)]
@@ -148,7 +148,7 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     if conflict is None or not _holds_elsewhere(problem, conflict, x, lower, upper):
         return
     named = [_condition_text(problem, number) for number in conflict.numbers]
-    values = {condition.words: condition.reached for condition in _conditions(problem, x)}
+    values = {condition.words: condition.reached for condition in conditions_at(problem, x)}
     listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
     raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
 
@@ -172,15 +172,19 @@ def _bounding_rows(problem: Problem) -> list[int]:
     ]
 
 
-def _conditions(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
-    values, model = problem.evaluated(x).values, problem.model
+def conditions_at(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+    """Every condition at variables (n,), without reasons."""
+    evaluated, model = problem.evaluated(x), problem.model
+    excesses = _largest_excesses(evaluated)
     for k, condition in zip(_held_rows(problem), problem.conditions, strict=True):
         unit = problem.unit ** OPERANDS[condition.row.operand].length
-        relation, target, number = condition.relation, unit * problem.evaluation.rows[k].target, unit * float(values[k])
+        number, surface = _number_of(problem, k, evaluated, excesses)
+        relation, target, number = condition.relation, unit * problem.evaluation.rows[k].target, unit * number
         missed = abs(number - target) if relation == "=" else RELATIONS[relation] * (number - target)
         met = bool(missed <= EXACT * max(abs(target), 1.0))
         configuration = (condition.configuration or model.lens.current_configuration) if len(model.views) > 1 else 0
-        yield Reached(_name(condition), relation, target, number, met, configuration=configuration)
+        where = {"configuration": configuration, "surface": 0 if met else surface}
+        yield Reached(_name(condition), relation, target, number, met, **where)
 
 
 def _name(condition: Condition) -> str:
@@ -188,29 +192,45 @@ def _name(condition: Condition) -> str:
     return f"{condition.name or condition.row.name}{at}"
 
 
-def _boundaries(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
-    evaluation, evaluated = problem.evaluation, problem.evaluated(x)
-    largest: dict[int, tuple[float, int]] = {}  # excess of every one-sided row, and its surface
+def _largest_excesses(evaluated: Evaluated) -> dict[int, tuple[float, int]]:
+    """The largest excess of every one-sided row, also below 0, and its surface."""
+    largest: dict[int, tuple[float, int]] = {}
     for rows, excesses, _, surfaces in evaluated.sides:
         for row, excess, surface in zip(rows.tolist(), excesses.tolist(), surfaces.tolist(), strict=True):
             if row not in largest or excess > largest[row][0]:
                 largest[row] = excess, surface
+    return largest
+
+
+def _number_of(
+    problem: Problem, k: int, evaluated: Evaluated, excesses: dict[int, tuple[float, int]]
+) -> tuple[float, int]:
+    """The quantity of a row, which a one-sided operand reports as its target where it is met, and its surface."""
+    row, number = problem.evaluation.rows[k], float(evaluated.values[k])
+    operand = OPERANDS[row.operand]
+    if k in excesses:
+        excess, surface = excesses[k]
+        side = -1.0 if operand.bounds == ">=" else 1.0
+        return row.target + side * excess / problem.evaluation.factors[k], surface
+    if operand.bounds and operand.refers:
+        number = float(evaluated.values[row.integers[0] - 1])
+        number = abs(number) if row.operand.startswith("AB") else number
+    return number, 0
+
+
+def _boundaries(problem: Problem, x: np.ndarray) -> Iterator[Reached]:
+    evaluation, evaluated = problem.evaluation, problem.evaluated(x)
+    excesses = _largest_excesses(evaluated)
     configurations = {
         line.number - 1: planner.view.configuration for planner, lines, _ in evaluation.groups for line in lines
     }
     several = len(problem.model.views) > 1
     for k in _bounding_rows(problem):
         row, operand = problem.rows[k], OPERANDS[problem.rows[k].operand]
-        relation, number, surface = operand.bounds or "=", float(evaluated.values[k]), 0
-        side = -1.0 if relation == ">=" else 1.0
-        if k in largest:
-            excess, surface = largest[k]
-            number = row.target + side * excess / evaluation.factors[k]
-            surface = surface if excess > 0 else 0
-        elif operand.bounds and operand.refers:
-            number = float(evaluated.values[row.integers[0] - 1])
-            number = abs(number) if row.operand.startswith("AB") else number
-        missed = abs(number - row.target) if relation == "=" else side * (number - row.target)
+        relation = operand.bounds or "="
+        number, surface = _number_of(problem, k, evaluated, excesses)
+        surface = surface if k in excesses and excesses[k][0] > 0 else 0
+        missed = abs(number - row.target) if relation == "=" else RELATIONS[relation] * (number - row.target)
         tolerance = EXACT if evaluation.weights[k] < 0 else SOFT
         least = 1e-3 / problem.unit if tolerance == SOFT and operand.length == 1 else tolerance
         met = bool(missed <= max(tolerance * abs(row.target), least))
@@ -466,11 +486,13 @@ def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
 
 
 def _draw_history(axes, found) -> None:
-    merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
+    of_glasses = [step.reached for step in found.glasses]
+    merit = np.concatenate([[found.merit_before], of_glasses, style.array(found.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
     _scale_merit(axes, merit)
     axes.locator_params(axis="x", integer=True)
-    axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
+    axis = "step of the choice of glasses, then cycle" if of_glasses else "cycle"
+    axes.set_xlabel(f"{axis} ({found.evaluations} evaluations, {found.seconds:.2g} s)")
     axes.set_ylabel("merit")
     axes.set_title("Merit function", fontweight="bold")
     axes.annotate(
@@ -560,13 +582,15 @@ class AsBuiltChange:
 
 @value
 class Optimized(Result):
-    """The lens at the lowest merit reached, and the initial one.
+    """The lens at the lowest merit reached, and the initial one, `before`.
 
-    merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
-    before and after; contributions: (R,) of each to the square of the merit, of sum 1; history: (cycles, 5) merit,
-    largest violation of a condition, step, damping and seconds of every cycle; stopped: a key of `checkpoint.STOPPED`;
-    glasses: the steps in which variable glasses were chosen; conditions: targets and attained values; as_built: spots
-    of the lens as built, if it is a term of the merit, which then includes it.
+    merit: the rows of the merit function (R,); merit_before, merit_after: its values. names: (n,) of the variables;
+    variables_before, variables_after: (n,) their values, lengths in mm. values_before, values_after: (R,) of the rows;
+    contributions_before, contributions: (R,) of each to the square of the merit, of sum 1. history: (cycles, 5) merit,
+    largest violation of a condition, step, damping and seconds of every cycle of the last descent. cycles, evaluations,
+    seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
+    glasses were chosen. conditions: targets and values reached of conditions and boundaries. as_built: spots of the
+    lens as built, if it is a term of the merit, which then includes it.
     """
 
     lens: Lens

@@ -27,10 +27,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.analysis.chief import SAMPLES
 from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.least_squares import Sides, State
 from raytrace.optimization.lens_state import Bundle, LensState, Ray
 from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit
+from raytrace.optimization.operands.aberrations import unvignetted
 from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import BadHold, Model, constraint_words, has_power, split_constraint
@@ -38,6 +40,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
+from raytrace.tracing.paraxial import largest_field
 from raytrace.words import did_you_mean
 
 
@@ -62,16 +65,12 @@ _NONE: Arguments = ((0, 0), (0.0, 0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class Word:
-    """A quantity of constraint syntax: an operand with its arguments, in mm or `unit`.
-
-    one_sided: whether the operand is the excess over its target, so that the relation has to be "<=".
-    """
+    """A quantity of constraint syntax: an operand with its arguments, in mm or `unit`."""
 
     operand: str
     text: str
     unit: str = "mm"
     arguments: Callable[[Lens], Arguments] = lambda lens: _NONE
-    one_sided: bool = False
 
 
 def conditions_of(lens: Lens, hold: str | Sequence[str] | None) -> tuple[Condition, ...]:
@@ -106,8 +105,9 @@ def _condition(lens: Lens, word: str) -> Condition:
     else:
         meant = f"; did you mean {_INSTEAD[name.lower()]}?" if name.lower() in _INSTEAD else did_you_mean(name, WORDS)
         raise BadHold(f"`hold`: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}")
-    if known.one_sided and relation != "<=":
-        raise BadHold(f"`hold`: {word!r}: {name} is the largest that there is; expected {name}<={number}")
+    bounds = OPERANDS[known.operand].bounds
+    if bounds and relation != bounds:
+        raise BadHold(f"`hold`: {word!r}: {name} is a limit on one side; expected {name}{bounds}{number}")
     try:
         target = float(number.removesuffix(known.unit) if known.unit else number)
     except ValueError:
@@ -141,13 +141,23 @@ def _behind_the_lens(lens: Lens) -> Arguments:
 
 
 def _chief_ray(lens: Lens) -> Arguments:
-    """The chief ray of the largest field on the image."""
+    """The ray of the largest field through the centre of its pupil, vignetting applied, on the image."""
     radius = torch.hypot(lens.fields.x, lens.fields.y)
     if not bool(radius.any()):
         raise BadHold("`hold`: all fields are on the axis: there is no off-axis chief ray")
-    largest = int(radius.argmax())
-    field = (float(part[largest] / radius[largest]) for part in (lens.fields.x, lens.fields.y))
-    return (len(lens.surfaces) - 1, 0), (*field, 0.0, 0.0)
+    x, y = (largest_field(lens)[:, 0] / radius.max()).tolist()
+    return (len(lens.surfaces) - 1, 0), (x, y, 0.0, 0.0)
+
+
+def _through_stop(lens: Lens) -> Arguments:
+    """The ray of the largest field through the centre of the stop, without vignetting factors, on the image."""
+    surface, (x, y, *_) = _chief_ray(lens)
+    return surface, (x, y, *unvignetted(lens, (x, y)))
+
+
+def _curve(lens: Lens) -> Arguments:
+    """The fields of the curve of `analysis.chief.distortion`."""
+    return (0, 0), (0.0, float(SAMPLES), 0.0, 0.0)
 
 
 def _outer_colours(lens: Lens) -> Arguments:
@@ -155,7 +165,6 @@ def _outer_colours(lens: Lens) -> Arguments:
     return (int(lens.wavelengths.argmin()) + 1, int(lens.wavelengths.argmax()) + 1), _NONE[1]
 
 
-#: Quantities of constraint syntax.
 #: Names of quantities in other programs, and the name here.
 _INSTEAD = {
     **dict.fromkeys(("bfl", "back_focal_length", "back_focal_distance"), "bfd"),
@@ -166,6 +175,7 @@ _INSTEAD = {
     "na": "numerical_aperture",
 }
 
+#: Quantities of constraint syntax; each is the number of the analysis of that name.
 WORDS = {
     "efl": Word("EFFL", "effective focal length"),
     "f_number": Word("ISFN", "focal length / entrance pupil diameter", ""),
@@ -173,11 +183,13 @@ WORDS = {
     "numerical_aperture": Word("ISNA", "of the image, paraxial", ""),
     "magnification": Word("PMAG", "paraxial, of an object at a finite distance", ""),
     "angular_magnification": Word("AMAG", "paraxial, of the chief ray", ""),
-    "total_track": Word("TOTR", "from surface 1 to the image"),
+    "total_track": Word("TOTR", "from the first vertex to the image"),
     "bfd": Word("TTHI", "from the last powered surface to the image", arguments=_behind_the_lens),
-    "image_height": Word("REAR", "of the chief ray of the largest field", arguments=_chief_ray),
+    "image_height": Word(
+        "REAR", "of the ray of the largest field through the centre of the stop", arguments=_through_stop
+    ),
     "paraxial_image_height": Word("PIMH", "of the largest field"),
-    "distortion": Word("DIMX", "the largest of all fields", "%", one_sided=True),
+    "distortion": Word("DIMX", "the largest absolute value from the axis to the largest field", "%", _curve),
     "petzval_radius": Word("PETZ", "of the image without astigmatism"),
     "entrance_pupil_diameter": Word("EPDI", "of the beam"),
     "entrance_pupil": Word("ENPP", "distance from surface 1"),

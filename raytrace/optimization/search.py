@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import ClassVar
@@ -25,7 +26,7 @@ from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
-from raytrace.optimization.optimize import drawn_fields, opened, refuse_contradictions
+from raytrace.optimization.optimize import conditions_at, drawn_fields, opened, refuse_contradictions
 from raytrace.optimization.problem import (
     Condition,
     ExpectationSettings,
@@ -67,6 +68,7 @@ STOPPED = {
     "interrupted": "interrupted; these were found so far",
 }
 MOST = 40  # minima of a result
+NEAREST = "nearest.zmx"  # of a search without minima
 _MOST, _COLUMNS = 9, 3  # lenses of the figure
 
 
@@ -171,6 +173,7 @@ class Searched(Result):
                     warnings.simplefilter("ignore", LensFileWarning)
                 write_lens(lens, folder / f"minimum_{number:02d}.zmx")
             thumbnail(lens, folder / f"minimum_{number:02d}.png")
+        (folder / NEAREST).unlink(missing_ok=True)
         for path in folder.glob("minimum_*.*"):
             if path.stem.removeprefix("minimum_").isdigit() and int(path.stem.removeprefix("minimum_")) > number:
                 path.unlink()
@@ -191,12 +194,7 @@ def searched(
     seconds: float,
     as_built: ExpectationSettings | None = None,
 ) -> Searched:
-    """The result: minima, the best first, each with its problem. Raises NoProblem without any."""
-    if not each:
-        raise NoProblem(
-            f"no lens without failing rays that meets `hold`, from {starts} starts: allow more `starts`, `seconds` or "
-            "wider `bounds`, or hold less"
-        )
+    """The result: minima, the best first, each with its problem."""
     terms: list[tuple[float, float, float]] = []
     if as_built is not None:
         terms = [_as_built(problem, one, as_built) for problem, one in each[:MOST]]
@@ -204,14 +202,9 @@ def searched(
         each, terms = [each[k] for k in order], [terms[k] for k in order]
     minima, lenses, tables = each[:MOST], [], []
     for k, (problem, one) in enumerate(minima, 1):
-        model = problem.model
-        design = model.lens_at(one.result.x)
-        data = design.optimization_data or optimization_data_of(model, problem.rows, problem.unit)
-        name = f"{lens.name}, minimum {k}".removeprefix(", ")
-        lenses.append(replace(design, name=name, optimization_data=data))
-        tables.append(
-            {f"{v.quantity}_{v.surface}": number for v, number in zip(model.variables, one.result.x, strict=True)}
-        )
+        variables = zip(problem.model.variables, one.result.x, strict=True)
+        lenses.append(_design(problem, one.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
+        tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
     names = tuple(dict.fromkeys(name for table in tables for name in table))
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
     return Searched(
@@ -232,6 +225,31 @@ def searched(
         as_built=tensor(terms) if terms else None,
         tolerances=as_built.words() if terms else "",
     )
+
+
+def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None) -> NoProblem:
+    """The error of a search without minima, with the nearest lens of all its descents, which is written."""
+    parts = [f"no lens without failing rays that meets `hold`, from {starts} starts"]
+    ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
+    if ends:
+        nearest = min(ends, key=lambda end: end.rank)
+        missed = [one for one in conditions_at(task.whole, nearest.x) if not one.met]
+        rays = [f"failing rays in {nearest.lost:g} rows"] if nearest.lost else []
+        words = ", ".join([*rays, *(f"{one.words} at {one.reached:.6g}" for one in missed)])
+        place = ""
+        if folder is not None:
+            path = Path(folder) / NEAREST
+            write_lens(_design(task.whole, nearest.x, task.free.lens.name), path)
+            place = f", in {path}"
+        parts.append(f"the nearest of {len(ends)} descents{place}: {words or 'it is not at its minimum yet'}")
+    return NoProblem("; ".join(parts) + ": allow more `starts`, `seconds` or wider `bounds`, or hold less")
+
+
+def _design(problem: Problem, x: np.ndarray, name: str) -> Lens:
+    """The lens at variables (n,), with its optimisation data."""
+    design = problem.model.lens_at(x)
+    data = design.optimization_data or optimization_data_of(problem.model, problem.rows, problem.unit)
+    return replace(design, name=name, optimization_data=data)
 
 
 def _as_built(problem: Problem, one: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
@@ -284,6 +302,7 @@ def thumbnail(lens: Lens, path: str | PathLike) -> None:
 
 STARTS = 64
 _BATCH = 16  # starts; what is done in a batch is shared by processes
+_FIRST = 4  # starts of the first batch of several: a limit of time passes after a minimum
 _POINTS = 8  # of which a start is the best
 _NARROW = 0.5, 0.6  # parts of pupil and field that a start descends on first
 _SHORT = 10, 12  # cycles on the narrow and on the whole beam
@@ -321,7 +340,7 @@ def search(
     square spot of the manufactured lens: the minima are those of the merit function alone, in the order of the merit
     with this term; of each lens with the tolerances of its own surfaces. folder: keeps the minima as lens
     files, a table and figures, and the journal: called again the search resumes, with the same result as without the
-    interruption. Ctrl-C ends with the minima so far.
+    interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all descents is written there.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch, BadTolerance.
     """
     if as_built is not None:
@@ -363,8 +382,10 @@ def search(
         stopped = "seconds" if time.monotonic() > until else "interrupted"
     except KeyboardInterrupt:
         stopped = "interrupted"
+    if not (each := run.each()):
+        raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None)
     result = searched(
-        lens, run.each(), starts=run.started, descents=run.followed, stopped=stopped,
+        lens, each, starts=run.started, descents=run.followed, stopped=stopped,
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
     if folder is not None and not (share and share.rank):
@@ -408,8 +429,9 @@ class _Run:
         """All batches. Raises SearchStopped."""
         bar = None if progress is None else progress(self.starts, "start")
         try:
-            for first in range(0, self.starts, _BATCH):
-                self._batch(range(first, min(first + _BATCH, self.starts)), bar)
+            first = [_FIRST] if self.starts > _BATCH else []
+            for numbers in pairwise([0, *first, *range(_BATCH, self.starts, _BATCH), self.starts]):
+                self._batch(range(*numbers), bar)
         finally:
             if bar is not None:
                 bar.close()
@@ -423,7 +445,7 @@ class _Run:
 
         keys = [f"start {i}" for i in numbers]
         ends = self._results([(key, lambda i=i: start(i)) for key, i in zip(keys, numbers, strict=True)])
-        self.started = numbers[-1] + 1
+        self.started = numbers.stop
         best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
         self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
         springs = self.minima.each[:_SPRINGS]

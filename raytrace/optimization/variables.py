@@ -36,7 +36,7 @@ from raytrace.materials.glass import (
     normal_line_deviation,
     refractive_index,
 )
-from raytrace.optimization.lens_state import LensState, unbent
+from raytrace.optimization.lens_state import LensState
 from raytrace.system.configurations import Operand, ScaledPath, same
 from raytrace.system.lens import Lens, is_round_about_axis, media
 from raytrace.system.optimization_data import Solve, Vary
@@ -54,11 +54,11 @@ from raytrace.system.parameter_paths import (
 )
 from raytrace.system.phases import power_of
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import Surface, gap_behind, medium_surfaces, vertex_curvature
+from raytrace.system.surface import Surface, medium_surfaces, vertex_curvature
 from raytrace.tracing.compiled import structure_of
 from raytrace.tracing.paraxial import signed
 from raytrace.tracing.trace import sequence_of
-from raytrace.words import calling_level, did_you_mean
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -97,7 +97,7 @@ _PICKUP = re.compile(rf"([-+]?)(?:({_NUMBER})\*)?([a-z]\w*):(\d+)(?:([-+])({_NUM
 _SOLVE = re.compile(r"([a-z]\w*)\(([^()]*)\)")
 
 
-class VariedGlass(UserWarning):
+class VariedGlass(RaytraceWarning):
     """A glass of a catalog is replaced by a model glass, whose numbers can vary."""
 
 
@@ -354,7 +354,7 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
 
 def has_power(lens: Lens, k: int) -> bool:
     """Whether a surface is a mirror, or has other media before and behind it."""
-    surfaces, media = lens.surfaces, medium_surfaces(lens.surfaces[: k + 1])
+    surfaces, media = lens.surfaces, medium_surfaces(lens.surfaces)
     return surfaces[k].is_mirror or not same(surfaces[media[k - 1]].glass, surfaces[media[k]].glass)
 
 
@@ -749,8 +749,6 @@ class View:
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
 
-        Rays on the image have the direction in front of it: the image does not refract.
-
         indices: (W,) of media by the surface in front of each, instead of the indices of the lens.
         """
         wavelength = lens.wavelengths[:, None]
@@ -760,9 +758,7 @@ class View:
             given[surface][:, None] if surface in given else n
             for surface, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
         ]
-        indices = unbent(lens, indices)
-        gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None
-        structure, table = structure_of(surfaces, indices, 1, gap, wavelength)
+        structure, table = structure_of(surfaces, indices, 1, None, wavelength)
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
         return surfaces, structure, torch.stack(rows, -1)
 

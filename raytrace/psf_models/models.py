@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import OverBudget, within
+from raytrace.budget import OverBudget, afford, within
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.maths.sampling import grid as make_grid
@@ -33,9 +33,10 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
+_PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
 
 
 @value
@@ -118,6 +119,8 @@ class Model:
     is_rung: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
+    in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them:
+        cameras, whose kernels do not depend on the others of a batch, call it for each.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -141,6 +144,7 @@ class Model:
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
     by_field: bool = False
+    in_common: bool = False
     by_width: bool = False
     proof: float | None = None
     first: float | None = None
@@ -170,7 +174,7 @@ _ROWS = (
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
-        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0,
+        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0, in_common=True,
         compared={"model": DRT(rays=256)}, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
@@ -182,7 +186,7 @@ _ROWS = (
 MODELS = {row.name: row for row in _ROWS}
 
 
-class NotConverged(UserWarning):
+class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
 
 
@@ -239,7 +243,9 @@ def psf(
         does not move. The kernels are the same.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
     normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
-    Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead.
+    Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead. Without an
+    order, that of each object distance or lens is chosen alone, and so is the model of "auto": its PSFs are those of a
+    call for it alone. `model` and `order` of the result are then the finest of them.
     execution: memory, processes and progress, see `Execution`.
 
     Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
@@ -300,14 +306,22 @@ def psf(
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+    D, F, W = len(distances), fields.shape[1], len(wavelengths) if per_wavelength else 1
+    rows, columns = base.shape
+    afford(
+        _PIXEL_BYTES * D * F * W * rows * columns,
+        f"{D * F * W:,} PSFs of {rows:,} × {columns:,} pixels",
+        helps="ask for a smaller `size`, or fewer `fields` at once",
+    )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)
-    drive = _driver(lens, name, parameters, tol or 0.01, execution)
     shares = weights / weights.sum()
 
     def compute(chosen: Tensor) -> Psf:
-        centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
-        batch = scene(lens, fields, distances[chosen], wavelengths, execution.memo)
+        centre = base.centre[:, chosen] if base.centre.dim() > 1 and base.centre.shape[1] > 1 else base.centre
+        part = lens if lenses in (None, len(chosen)) else one_lens(lens, chosen)
+        drive = _driver(part, name, parameters, tol or 0.01, execution)
+        batch = scene(part, fields, distances[chosen], wavelengths, execution.memo)
         origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
         if center == "axis" or symmetry(batch) == "round":
             pass
@@ -315,7 +329,7 @@ def psf(
             alone = gaussian.kernels_alone(batch, make_grid(batch.wavelengths.new_tensor(1.0), 1), order=6)
             origin = polychromatic(alone, shares, "").centroid
         else:
-            origin = chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
+            origin = chief_landing(dataclasses.replace(batch, wavelengths=part.primary[None]))[..., 0]
         if origin is not None and window == "fixed":
             origin = origin.detach()
         if origin is not None or centre.dim() > 1:  # a single point stays a single point
@@ -324,12 +338,14 @@ def psf(
             centre = centre[..., None].expand(*centre.shape, len(wavelengths))
         return drive(batch, dataclasses.replace(base, centre=centre), None if per_wavelength else shares)
 
-    infinite = torch.isinf(distances)
+    # A choice by an estimate is made for each object distance, or lens, alone: no PSF depends on its neighbours.
+    # A fixed amount of work is done together, for finite distances and infinite ones apart.
+    infinite, numbers = torch.isinf(distances), torch.arange(len(distances), device=distances.device)
+    is_fixed = order is not None or (rays is not None and MODELS[name].plain is not None)
+    groups = [numbers[~infinite], numbers[infinite]] if is_fixed else list(numbers.split(1))
+    groups = [group for group in groups if len(group)]
     with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():
-        if bool(infinite.any()) and not bool(infinite.all()):
-            psfs = _merged(compute(~infinite), compute(infinite), infinite)
-        else:
-            psfs = compute(torch.ones_like(infinite))
+        psfs = _merged([compute(group) for group in groups], torch.cat(groups).argsort())
     points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
@@ -401,18 +417,31 @@ def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution)
     return stream
 
 
-def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
-    """The PSFs of finite and of infinite object distances, in their original order."""
-    order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
+def _merged(parts: Sequence[Psf], order: Tensor) -> Psf:
+    """One PSF of those of several object distances or lenses, in this order; of the finest model among them.
 
-    def in_order(parts: Sequence[Tensor], axis: int) -> Tensor:
-        return torch.cat(parts, axis).index_select(axis, order)
-
-    merged, centre = combined([finite, infinite], in_order), finite.grid.centre
+    `order` is the finest of that model's, for loops; a residual that a model does not have is nan.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    model = max((part.model for part in parts), key=list(MODELS).index)
+    finest = max((part for part in parts if part.model == model), key=lambda part: part.order or 0)
+    if any(part.residual is not None for part in parts):
+        known = (torch.full_like(part.error, torch.nan) if part.residual is None else part.residual for part in parts)
+        parts = [dataclasses.replace(part, residual=residual) for part, residual in zip(parts, known, strict=True)]
+    merged = combined(parts, lambda tensors, axis: torch.cat(tensors, axis).index_select(axis, order))
+    centre = finest.grid.centre
     if centre.dim() > 1:
-        centre = in_order([centre, infinite.grid.centre], 1)
-    reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
-    return dataclasses.replace(merged, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)
+        centre = torch.cat([part.grid.centre for part in parts], 1).index_select(1, order)
+    reason = "; ".join(dict.fromkeys(part.reason for part in parts if part.reason))
+    return dataclasses.replace(
+        merged,
+        grid=dataclasses.replace(finest.grid, centre=centre),
+        model=model,
+        waves=finest.waves,
+        order=finest.order,
+        reason=reason,
+    )
 
 
 def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, order: int) -> Psf:

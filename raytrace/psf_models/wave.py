@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import safe_divide, safe_sqrt, to, value
+from raytrace.maths.numerics import safe_sqrt, to, value
 from raytrace.maths.sampling import Grid, gauss_rings
 from raytrace.psf_models import dft
 from raytrace.psf_models.radial import is_centred, light_of_radii, radii_of_waves
@@ -108,35 +108,6 @@ def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
     else:
         U = dft.to_grid(field, L, M, x, y, inside)
     return U / inside[..., None, None]
-
-
-def strehl(scene: Scene, *, order: int = 0) -> Tensor:
-    """Strehl ratio (D, F, W): the largest intensity on the sensor over Σ² of the same amplitudes without aberrations.
-
-    The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient: to first order the
-    value does not depend on it. 0 where no light arrives.
-    """
-    return torch.cat([_strehl(one_field(scene, f), order) for f in range(scene.shape[1])], 1).to(scene.wavelengths)
-
-
-def _strehl(scene: Scene, order: int) -> Tensor:
-    probe = probe_of(scene)
-    spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
-    light = waves(scene, 20 * spacing.max(), order=order + 1, probe=probe)
-    front = light.wavefront
-    with torch.no_grad():
-        x, y = _moments(light)[0] - front.centre[:2]
-        offsets = torch.arange(-16, 17, dtype=x.dtype, device=x.device)
-        for _ in range(8):
-            near_x, near_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
-            U = amplitude(light, near_x, near_y)
-            best = (U.real**2 + U.imag**2).flatten(-2).argmax(-1, keepdim=True)
-            x = torch.gather(near_x, -1, best % len(offsets))[..., 0]
-            y = torch.gather(near_y, -1, best // len(offsets))[..., 0]
-            spacing = spacing / 8
-    U = amplitude(light, x[..., None], y[..., None])[..., 0, 0]
-    peak = light.amplitude.sum(-1) / (1e-3 * front.wavelength / front.index)
-    return safe_divide(U.real**2 + U.imag**2, peak**2)
 
 
 def phase_along_radius(

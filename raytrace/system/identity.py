@@ -14,7 +14,7 @@ from raytrace.system.lens import Lens
 #: Fields that change no ray.
 _WORDS = {
     *("name", "notes", "comment", "catalogs", "optimization_data", "catalog", "status", "nd_listed", "abbe_listed"),
-    *("alternatives", "listed_name", "records", "wavelength_range"),
+    *("alternatives", "listed_name", "records", "wavelength_range", "afocal"),
 }
 _SHOWN = ("curvature", "thickness")  # of a surface, in its identity
 #: Names that fields had when the first identities were stored: a digest hashes these, so that stored ones stay valid.

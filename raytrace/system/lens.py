@@ -21,8 +21,8 @@ from raytrace.materials.environment import (
     objection,
     unknown_change,
 )
-from raytrace.materials.glass import Glass, check_unit, check_wavelengths, refractive_index
-from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, value
+from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
+from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, is_any, value
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
@@ -320,6 +320,7 @@ class Lens:
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
     optimization_data: variables, solves and the merit function of the file; None without any.
+    afocal: whether image space is afocal: the lens as built is judged in angle. Spots are those on the image surface.
     A number of the surfaces, the aperture or the environment may be a tensor (L,), and a coefficient (m, L): a batch of
     `count` lenses, of which `lens[k]` is one and `lens[:10]` some.
     """
@@ -339,6 +340,7 @@ class Lens:
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
     optimization_data: OptimizationData | None = None
+    afocal: bool = False
 
     count = property(lens_count)
     __getitem__ = one_lens
@@ -354,6 +356,12 @@ class Lens:
 
     def __getattr__(self, name: str):
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
+
+    def __repr__(self) -> str:
+        several = "" if self.count is None else f"{self.count} lenses of "
+        kinds = {"surface": self.surfaces, "field": self.fields.y, "wavelength": self.wavelengths}
+        counts = ", ".join(f"{len(part)} {kind}{'' if len(part) == 1 else 's'}" for kind, part in kinds.items())
+        return f"<Lens: {self.name}{self.name and '; '}{several}{counts}>"
 
     def __str__(self) -> str:
         from raytrace.tracing.lens_report import text
@@ -439,7 +447,8 @@ class Lens:
         surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
         x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
-        Raises ValueError naming what the surface does not have, UnknownGlass.
+        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. Raises
+        ValueError naming what the surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
@@ -449,6 +458,7 @@ class Lens:
             numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
         surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
         found = dataclasses.replace(self, surfaces=tuple(surfaces))
+        _check_object(found)
         return multiple.kept(found) if self.operands else found
 
 
@@ -630,8 +640,9 @@ def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
 def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     """Refractive index behind every surface, object first; positive also behind a mirror.
 
-    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
-    break keeps the medium. A medium that does not change is the same tensor, so that a trace refracts nothing there.
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror, a coordinate break
+    and the image keep the medium. A medium that does not change is the same tensor, so that a trace refracts nothing
+    there: rays on the sensor have the direction and the index of the last gap.
     """
     dtype, numbers = lens.surfaces[-2].thickness.dtype, medium_surfaces(lens.surfaces)
     in_air = lens.environment is None and all(surface.environment is None for surface in lens.surfaces)
@@ -649,6 +660,18 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
         indices = [index_behind(lens, number, wavelength) for number in distinct.values()]
     by_medium = {key: n.to(dtype) for key, n in zip(distinct, indices, strict=True)}
     return [by_medium[key] for key in keys]
+
+
+def glass_on_image(lens: Lens) -> str:
+    """The name of a glass on the image surface, "" where it is air or the medium in front of it.
+
+    No light enters it: rays, spots, wavefronts and PSFs are those in the last gap.
+    """
+    glass = lens.surfaces[-1].glass
+    if lens.surfaces[-1].is_mirror or is_air(glass):
+        return ""
+    before = lens.surfaces[medium_surfaces(lens.surfaces)[-1]].glass
+    return "" if multiple.same(glass, before) else label(glass)
 
 
 def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Tensor]:
@@ -755,6 +778,7 @@ def check(lens: Lens) -> None:
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
     _check_environments(lens)
     _check_cone(lens)
+    _check_object(lens)
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
@@ -795,6 +819,25 @@ def _check_cone(lens: Lens) -> None:
         index = float(index_behind(lens, 0, lens.primary).min())
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")
+
+
+def _check_object(lens: Lens) -> None:
+    """Refuse poses of the object other than tilts of a surface at a finite distance whose points are the fields."""
+    source = lens.surfaces[0]
+    if source.after is not None:
+        raise ValueError("surface 0: a pose behind the object; expected tilt_x, tilt_y or tilt_z, which tilt it alone")
+    if source.before is None:
+        return
+    moved = ", ".join(name for name in ("x", "y", "z") if getattr(source.before, name) is not None)
+    if moved:
+        message = f"surface 0: the object is decentred ({moved})"
+        raise ValueError(f"{message}; its place is that of the fields and of the object distance: expected tilts alone")
+    if is_any(torch.isinf(source.thickness)):
+        raise ValueError("surface 0: a tilted object at infinity; give an object distance")
+    if lens.fields.kind not in ("object_height", "real_image_height"):
+        kind = lens.fields.kind.replace("_", " ")
+        message = f"surface 0: a tilted object, with fields of the kind {kind}, which does not locate its points"
+        raise ValueError(f"{message}; expected object heights, along its tilted axes, or real image heights")
 
 
 def is_round_about_axis(lens: Lens) -> bool:

@@ -134,7 +134,8 @@ class OptimizationData:
 
     variables, solves: of the numbers of the lens, in the order of surfaces; kept: rules that are stored and not
     followed: their numbers stay fixed. merit: the rows of its merit function, in order, text included: row i of the
-    function is merit[i - 1]; tolerances: lines of the file; unit: mm in the unit of length of both, in which a file of
+    function is merit[i - 1]; tolerances: lines of the file; distributions: tables of errors that they name, (file,
+    density) as of `Tolerance`; unit: mm in the unit of length of both, in which a file of
     the lens is written.
     semi_diameters: surfaces of fixed semi-diameter; all others follow the rays; semi_diameter_margin: per cent, and mm.
     """
@@ -147,6 +148,7 @@ class OptimizationData:
     semi_diameters: tuple[int, ...] = ()
     semi_diameter_margin: tuple[float, float] = (0.0, 0.0)
     kept: tuple[Solve, ...] = ()
+    distributions: tuple[tuple[str, tuple[tuple[float, float], ...]], ...] = ()
 
     def __str__(self) -> str:
         counts = Counter(row.name for row in self.merit)

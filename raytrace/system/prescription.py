@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.catalogs import medium
+from raytrace.materials.catalogs import ENVIRONMENT, SHIPPED, medium, missing_catalogs
 from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
@@ -39,20 +39,25 @@ def lens(
 
     rows: mappings, or a DataFrame: radius (mm, inf is a plane) or curvature (1/mm), thickness (mm to the next vertex,
     of the last row to the sensor), glass (a name, an index, (nd, Vd) or a Glass behind the surface; air by default,
-    "MIRROR" reflects), conic, coefficients (of r², r⁴, … in mm^(1-2j)), semi_diameter, apertures, comment; decentres
-    x, y, z (mm) and tilts tilt_x, tilt_y, tilt_z (degrees) of its axes, and x_after, … of the axes behind it, each pose
-    also as a Pose, before or after; numbers may be tensors that require a gradient.
+    "MIRROR" reflects; of the last row the medium of the image), conic, coefficients (of r², r⁴, … in mm^(1-2j)),
+    semi_diameter, apertures, comment; decentres x, y, z (mm) and tilts tilt_x, tilt_y, tilt_z (degrees) of its axes,
+    and x_after, … of the axes behind it, each pose also as a Pose, before or after; numbers may be tensors that require
+    a gradient.
     stop: number of the stop surface, counted from 1. One aperture by name, as f_number=3.5 or
     entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
     FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: its number, from 1, the first by default.
-    object_distance: mm from surface 1. Raises BadPrescription, UnknownGlass.
+    object_distance: mm from surface 1. catalogs: names of glass catalogs, sought first; one that is not
+    shipped is found by the environment variable RAYTRACE_CATALOGS. Raises BadPrescription, UnknownGlass.
     """
     rows = rows.to_dict("records") if hasattr(rows, "to_dict") else list(rows)
     if not rows:
         raise BadPrescription(
             "no rows: give one mapping for each surface, as dict(radius=50, thickness=5, glass='N-BK7')"
         )
+    if missing := missing_catalogs(catalogs):
+        message = f"catalogs: {missing[0]!r} is no shipped catalog, and no file of {ENVIRONMENT} has this name"
+        raise BadPrescription(f"{message}; expected some of {', '.join(SHIPPED)}, or the path of its AGF file there")
     surfaces = [surface(row, number, catalogs) for number, row in enumerate(rows, 1)]
     wavelengths = _vector(wavelengths, "wavelengths")
     weights = torch.ones_like(wavelengths) if wavelength_weights is None else _vector(wavelength_weights, "weights")

@@ -37,7 +37,7 @@ class Surface:
     phase: optical path added by the surface, or its action in place of Snell's law, of a kind of `phases.PHASES`; None
         for a surface that refracts or reflects.
     before, after: the pose of the surface's axes in those of its vertex, and of the axes of the thickness in those of
-        the surface; None where they are the same.
+        the surface; None where they are the same. That of the object tilts it alone, about its vertex.
     is_break: a coordinate break: rays only change to the axes of `before`, and meet nothing.
     glass: the medium behind the surface; MIRROR reflects and keeps the medium before it, as a coordinate break does.
     semi_diameter: mm, as stored in the file; it never clips a ray (only `apertures` do), but bounds the search for
@@ -113,16 +113,25 @@ def _thicker(surface: Surface, z: Tensor | None) -> Surface:
 
 
 def medium_surfaces(surfaces: Sequence[Surface]) -> list[int]:
-    """The surface whose glass fills the space behind each surface: mirrors and coordinate breaks keep the medium."""
+    """The surface whose glass fills the space behind each surface of a lens, object to image.
+
+    Mirrors, coordinate breaks and the image keep the medium: the sensor is in the last gap, and refracts nothing.
+    """
     media: list[int] = []
     for k, surface in enumerate(surfaces):
-        media.append(media[-1] if k and (surface.is_mirror or surface.is_break) else k)
+        keeps = surface.is_mirror or surface.is_break or k == len(surfaces) - 1
+        media.append(media[-1] if k and keeps else k)
     return media
 
 
 def is_posed(surface: Surface) -> bool:
     """Whether the surface is tilted or decentred, or a coordinate break."""
     return surface.is_break or surface.before is not None or surface.after is not None
+
+
+def is_flat(source: Surface) -> bool:
+    """Whether the object is a plane across the axis."""
+    return source.is_plane and source.before is None
 
 
 def is_round(surface: Surface) -> bool:

@@ -4,9 +4,11 @@ A row is a number that differs from its nominal value within limits: a radius, a
 value, the error, is in the row's own unit. Rows hold plain numbers, so that two sets compare by their parts.
 
     tilt, decentre   old = d + Rx Ry Rz new: decentre first, then tilts about x, y and z, as a coordinate break
+    runout           the tilt with tan θ = e/(2h): the plane across the vertex rises by e from rim to rim
     power            z(h) of the conic grows by N λ/2 at the semi-diameter h: N fringes in double pass
     irregularity     Δz = N λ/4 (ρ⁴ + v²),  ρ = r/h,  v = (y cos θ - x sin θ)/h
-    surface tilt     Δz = y tan θ_x - x tan θ_y, a plane term on the sag; runout: Δz = e x/(2h), e y/(2h)
+
+A surface or an element is tilted rigidly about its vertex: a tilted sphere is the sphere about a centre that has moved.
 
 KINDS has a row for each kind: a new kind is a new row.
 """
@@ -21,10 +23,9 @@ from torch import Tensor
 
 from raytrace.materials.glass import with_index_errors
 from raytrace.maths.bivariate import zernike_to_powers
-from raytrace.maths.zernike import noll, norm
+from raytrace.maths.zernike import fringe, noll, norm
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, with_number
-from raytrace.system.poses import cos_sin
 from raytrace.system.sag_terms import IrregularSag, as_polynomial
 from raytrace.system.surface import Surface
 
@@ -34,7 +35,11 @@ DISTRIBUTIONS = {
     "uniform": "all values between the limits alike",
     "parabolic": "density rising with the square of the distance from the middle of the limits",
     "end_points": "one limit or the other, each in half of the cases",
+    "table": "linear between the points of `density`",
 }
+
+#: The last number of the terms of a kind: Noll's, and the fringe terms.
+MOST_TERM = {"zernike": 231, "fringe": 37}
 
 #: The test wavelength of fringes unless a file has another, in µm: a helium-neon laser.
 TEST_WAVELENGTH = 0.6328
@@ -53,9 +58,10 @@ class Tolerance:
     adjust: of a thickness, the surface whose thickness changes by the opposite, so that all that follows stays; None.
     pivot: of the tilt of an element, how far behind the vertex of its first surface its axis lies, mm.
     parameter: of "parameter", a name of `parameter_paths`, as "a4", "tilt_x".
-    term: of "zernike", Noll's number of the term.
-    group: rows of one group are drawn together: the root of the sum of the squares of the errors is `maximum` times
-        the root of the number of the rows.
+    term: of "zernike", Noll's number of the term; of "fringe", that of the fringe terms.
+    group: rows of one group, as the components of a radial decentre, are drawn together: in a direction that is random
+        in all n of them alike, by √n times what the distribution of a row gives. At its limits all are at once.
+    density: of the distribution "table": fractions of the way from `minimum` to `maximum`, rising, and the density.
     configuration, operand: of "operand", the configuration (from 1) and its place in `lens.operands` (from 0).
     source: file and line, or the grade that the limits come from.
     """
@@ -72,6 +78,7 @@ class Tolerance:
     parameter: str = ""
     term: int = 0
     group: str = ""
+    density: tuple[tuple[float, float], ...] = ()
     configuration: int = 0
     operand: int | None = None
     source: str = ""
@@ -92,7 +99,7 @@ class Tolerance:
     @property
     def name(self) -> str:
         """The quantity in words: the kind, with the parameter or the term."""
-        number = str(self.term) if self.kind == "zernike" else self.parameter
+        number = str(self.term) if self.term else self.parameter
         return f"{self.kind} {number}".rstrip()
 
     def __str__(self) -> str:
@@ -156,7 +163,8 @@ class Kind:
     """A kind of error: its definition, and one of `change`, `sag` and `motion`.
 
     operand: OpticStudio's; unit; words: its definition. change: makes the surface with an error; sag: the powers that
-    it adds to the sag; motion: the field of a `Pose` by which the surface, or all surfaces of an element, are moved.
+    it adds to the sag; motion: the field of a `Pose` by which the surface, or all surfaces of an element, are moved;
+    step: error (...), `Gauge` -> the number (...) of that field, by default the error.
     length: power of length in the unit, by which limits of a file in inches are converted.
     needs_semi_diameter: whether the error is measured at the semi-diameter. elements: whether it has two surfaces.
     parameter: its parameter of an Irregular surface, which other surfaces may pick up.
@@ -168,6 +176,7 @@ class Kind:
     change: Change | None = None
     sag: AddedSag | None = None
     motion: str = ""
+    step: Callable[[Tensor, Gauge], Tensor] = lambda error, gauge: error
     length: int = 0
     needs_semi_diameter: bool = False
     elements: bool = False
@@ -217,25 +226,9 @@ def _parameter(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) ->
     return with_number(surface, gauge.path, number_at(surface, gauge.path) + error)
 
 
-def _tangent(degrees: Tensor) -> Tensor:
-    cosine, sine = cos_sin(degrees)
-    return sine / cosine
-
-
-def _tilt_x(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [0 * error, gauge.radius * _tangent(error)]
-
-
-def _tilt_y(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [-gauge.radius * _tangent(error), 0 * error]
-
-
-def _runout_x(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [error / 2, 0 * error]
-
-
-def _runout_y(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
-    return [0 * error, error / 2]
+def _tilt_of_runout(error: Tensor, gauge: Gauge) -> Tensor:
+    """θ in degrees, tan θ = e/(2h)."""
+    return torch.rad2deg(torch.atan(error / (2 * gauge.radius)))
 
 
 def _irregularity(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
@@ -247,12 +240,21 @@ def _irregularity(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tenso
 
 def _zernike(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
     order = noll(row.term)
-    return [float(entry) * norm(*order) * error for entry in zernike_to_powers((order,))[0][:, 0]]
+    return _term(order, norm(*order) * error)
+
+
+def _fringe_term(error: Tensor, row: Tolerance, gauge: Gauge) -> Sequence[Tensor]:
+    return _term(fringe(row.term), error * (0.5 * gauge.wavelength))
+
+
+def _term(order: tuple[int, int], height: Tensor) -> list[Tensor]:
+    """The powers of a term of a height (...) at the rim."""
+    return [float(entry) * height for entry in zernike_to_powers((order,))[0][:, 0]]
 
 
 _DECENTRE = "decentre of the surface along {}, in its own axes"
-_TILT = "tilt of the surface about {}: a plane term on the sag"
-_RUNOUT = "difference of the sag between the rims at {0} = h and {0} = -h: a plane term"
+_TILT = "tilt of the surface about {} through its vertex"
+_RUNOUT = "total indicator runout along {} over the diameter 2h: a tilt of the surface by arctan(e/2h)"
 _ELEMENT = "of all surfaces from the first to the last"
 
 #: Every kind of error by its name.
@@ -273,13 +275,14 @@ KINDS = {
     "parameter": Kind("TPAR TUDX TUDY TUTX TUTY TUTZ", "", "a number of `parameter_paths`", _parameter),
     "surface_decenter_x": Kind("TSDX", "mm", _DECENTRE.format("x"), motion="x", length=1, parameter=1),
     "surface_decenter_y": Kind("TSDY", "mm", _DECENTRE.format("y"), motion="y", length=1, parameter=2),
-    "surface_tilt_x": Kind("TSTX", "degrees", _TILT.format("x"), sag=_tilt_x, parameter=3),
-    "surface_tilt_y": Kind("TSTY", "degrees", _TILT.format("y"), sag=_tilt_y, parameter=4),
+    "surface_tilt_x": Kind("TSTX", "degrees", _TILT.format("x"), motion="tilt_x", parameter=3),
+    "surface_tilt_y": Kind("TSTY", "degrees", _TILT.format("y"), motion="tilt_y", parameter=4),
     "surface_runout_x": Kind(
         "TIRX",
         "mm",
         _RUNOUT.format("x"),
-        sag=_runout_x,
+        motion="tilt_y",
+        step=lambda error, gauge: -_tilt_of_runout(error, gauge),
         length=1,
         needs_semi_diameter=True,
         parameter=4,
@@ -288,7 +291,8 @@ KINDS = {
         "TIRY",
         "mm",
         _RUNOUT.format("y"),
-        sag=_runout_y,
+        motion="tilt_x",
+        step=_tilt_of_runout,
         length=1,
         needs_semi_diameter=True,
         parameter=3,
@@ -308,6 +312,13 @@ KINDS = {
         "RMS of one of Noll's terms of the sag over the semi-diameter",
         sag=_zernike,
         length=1,
+        needs_semi_diameter=True,
+    ),
+    "fringe": Kind(
+        "TEXI",
+        "fringes",
+        "one of the fringe terms of the sag, λ/2 a fringe at the semi-diameter",
+        sag=_fringe_term,
         needs_semi_diameter=True,
     ),
     "element_decenter_x": Kind("TEDX", "mm", f"decentre along x {_ELEMENT}", motion="x", length=1, elements=True),

@@ -29,10 +29,12 @@ from raytrace.tolerancing.grades import tolerances as tolerances_of
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
-from raytrace.tracing.compiled import Task, forward, is_expressible, prepare, push, task_of
+from raytrace.tracing.compiled import Task, forward, prepare, push
 from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.geometry import semi_diameters
-from raytrace.tracing.spot import image_rays, to_image
+from raytrace.tracing.launch import launch
+from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import lens_task, without_apertures
 
 #: Angle of the astigmatism of an irregularity, degrees, and its change: the squares and the product of cos 2θ and
 #: sin 2θ have the means of a uniform distribution.
@@ -96,7 +98,7 @@ class AsBuiltTerm:
         self.limits = _focus_limits(lens, self.tolerances)
         self.radii = semi_diameters(lens)
         self.errors = design(self.tolerances).to(lens.wavelengths)
-        self.sampling = sampling_of(lens, settings.fields, settings.rings, settings.arms)
+        self.sampling = sampling_of(without_apertures(lens), settings.fields, settings.rings, settings.arms)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         self.weights = (shares[:, None] * self.sampling.weights).flatten()
         if not bool(torch.isfinite(self.expected(lens))):
@@ -209,9 +211,8 @@ class AsBuiltTerm:
 
     def _task(self, lens: Lens) -> Task | None:
         """The rays of the sample as the compiled trace takes them; None if it does not have a surface."""
-        surfaces, rays, arguments = to_image(lens, self.sampling.points, fields=self.sampling.fields)
-        rays = dataclasses.replace(rays, opl=None)
-        return task_of(surfaces, rays, **arguments) if all(map(is_expressible, surfaces)) else None
+        rays = launch(lens, self.sampling.points, fields=self.sampling.fields)
+        return lens_task(lens, dataclasses.replace(rays, opl=None), lens.wavelengths[:, None])
 
 
 def _along(function: Callable, at: Sequence[Tensor], changes: Sequence[Tensor]):

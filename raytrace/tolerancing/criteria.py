@@ -12,8 +12,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from raytrace.analysis.setting import scene_of, wavelength_shares
 from raytrace.analysis.sheared_batch import ShearedPupils
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.sampling import square
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
@@ -22,16 +24,19 @@ from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
 from raytrace.tracing.focus import shift_to_focus, spot_parabola
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import scene
-from raytrace.tracing.spot import image_rays, spot_of_points
+from raytrace.tracing.scene import trace_scene
+from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import wavefront_of, without
 from raytrace.words import did_you_mean
 
+_ACROSS = 10  # points across the pupil, by which lost light is measured
+
 
 @value
 class Sampling:
-    """Fields (2, F) with weights (F,), and pupil points (2, P) with weights (P,)."""
+    """Fields (2, F) with weights (F,), and pupil points with weights: (2, P) and (P,), or (2, 1, F, W, P) and
+    (1, F, W, P) where apertures clip the beams."""
 
     fields: Tensor
     field_weights: Tensor
@@ -64,38 +69,48 @@ class Criterion:
     allows_idle: bool = False
 
 
-def _spots(lens: Lens, sampling: Sampling) -> tuple[Rays, Tensor]:
-    """Rays (3, L, F, N) on the sensor, all wavelengths together, and the weights (N,)."""
-    rays = image_rays(lens, sampling.points, fields=sampling.fields)
-    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
-    return together, (shares[:, None] * sampling.weights).flatten()
-
-
 def _mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square spot radius (L,) µm², all wavelengths together, about the centroid of each field."""
-    rays, weights = _spots(lens, sampling)
-    spots = spot_of_points(rays.position[:2], rays.valid, weights)
-    return 1e6 * (sampling.field_weights * spots.mean_square_radius).sum(-1)
+    return _spot_parabola(lens, sampling)[0]
 
 
 def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """The mean square spot radius as a parabola of the position of the sensor, µm², µm²/mm, µm²/mm²."""
-    rays, weights = _spots(lens, sampling)
-    return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(rays, weights))
+    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
+    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
+    return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+
+
+def _mean_square_angle(lens: Lens, sampling: Sampling) -> Tensor:
+    """Mean square angle (L,) mrad² of the rays at the sensor, of all wavelengths, about the mean of each field."""
+    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
+    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    weights = torch.where(rays.valid.flatten(-2), weights, 0.0)
+    total, directions = weights.sum(-1, keepdim=True), rays.direction.flatten(-2)
+    share = safe_divide(weights, total)
+    offset = directions - (share * directions).sum(-1, keepdim=True)
+    squares = (share * (offset * offset).sum(0)).sum(-1)
+    return 1e6 * (sampling.field_weights * torch.where(total[..., 0] > 0, squares, torch.nan)).sum(-1)
+
+
+@torch.no_grad()
+def light(lens: Lens, sampling: Sampling) -> Tensor:
+    """Share (L,) of the light of the pupils that arrives, at the primary wavelength, of `square` points."""
+    points, _ = square(_ACROSS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    arriving = image_rays(lens, points, fields=sampling.fields, wavelengths=lens.primary[None]).valid
+    return (sampling.field_weights * arriving[..., 0, :].to(points).mean(-1)).sum(-1)
 
 
 def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square (L,) of the OPD about its mean and tilt, waves²."""
-    distance = lens.surfaces[0].thickness.reshape(-1).expand(lens.count or 1)
-    front = wavefront_of(scene(lens, sampling.fields, distance, lens.wavelengths), sampling.points, sampling.weights)
+    front = wavefront_of(scene_of(lens, sampling.fields), sampling.points, sampling.weights)
     lit = (front.energy > 0).sum(-1, keepdim=True) >= 3  # fewer rays have no mean and tilt
     front = dataclasses.replace(front, energy=torch.where(lit, front.energy, 1.0))
     flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
     share = front.energy / front.energy.sum(-1, keepdim=True)
     squares = torch.where(lit[..., 0], (share * flat * flat).sum(-1), torch.nan)
-    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    return (sampling.field_weights * (squares * shares).sum(-1)).sum(-1)
+    return (sampling.field_weights * (squares * wavelength_shares(lens)).sum(-1)).sum(-1)
 
 
 def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
@@ -170,8 +185,14 @@ def _merit(lens: Lens, merit) -> Criterion:
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
+    "angle": Criterion("RMS angle", "mrad", _mean_square_angle, allows_idle=True),
 }
 NAMES = (*CRITERIA, "mtf@F", "merit", "psf", "boresight")
+
+
+def size_of_image(lens: Lens) -> Criterion:
+    """The criterion "rms": of spots, or of an afocal lens of angles."""
+    return CRITERIA["angle" if lens.afocal else "rms"]
 
 
 def criterion_of(
@@ -194,7 +215,7 @@ def criterion_of(
     if word != "psf" and (model, pixel, size) != ("gaussian", None, None):
         raise ValueError(f"criterion {word!r}: `model`, `pixel` and `size` belong to the criterion psf; leave them out")
     if word in CRITERIA:
-        return CRITERIA[word]
+        return size_of_image(lens) if word == "rms" else CRITERIA[word]
     if word == "merit":
         return _merit(lens, merit)
     if word == "psf":
@@ -218,9 +239,7 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def at_best_focus(
-    parabola: tuple[Tensor, Tensor, Tensor], least: Tensor | float, most: Tensor | float
-) -> tuple[Tensor, Tensor]:
+def at_best_focus(parabola: Sequence[Tensor], least: Tensor | float, most: Tensor | float) -> tuple[Tensor, Tensor]:
     """The least of q₀ + 2 s q₁ + s² q₂ between limits of s, and s; (L,) each, differentiable."""
     q0, q1, q2 = parabola
     shift = torch.clamp(shift_to_focus(q1, q2), least, most)

@@ -33,4 +33,4 @@ _LINES = ("TOL", "TCMM")
 def tolerances_of(lens: Lens) -> Tolerances:
     """The tolerances of the file that a lens comes from; none where it has no lines of them."""
     lines = () if lens.optimization_data is None else lens.optimization_data.tolerances
-    return Tolerances(*read_lines(lens, lines, lens.name))
+    return Tolerances(*read_lines(lens, lines))

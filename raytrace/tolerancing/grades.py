@@ -171,7 +171,8 @@ def tolerances(
         the lens's own file.
     distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "parabolic" or "end_points", of rows
         that the file does not have.
-    compensators: what is adjusted after manufacture; by default that of the file, or the distance of the sensor.
+    compensators: what is adjusted after manufacture; by default those of the file for its own tolerances, of which
+        there may be none, and the distance of the sensor for those of a grade or of limits alone.
 
     A thickness of glass is taken up by the first gap of air behind it. Raises BadTolerance.
     """
@@ -194,7 +195,7 @@ def tolerances(
             rows += _rows(lens, parts, limit, drawn)
     if compensators is None:
         sensor = Compensator(len(lens.surfaces) - 2, "thickness")
-        compensators = stored.compensators or (sensor,)
+        compensators = stored.compensators if stored.rows else (sensor,)
     check_tolerances(lens, rows)
     changed = len(rows) != len(stored.rows) or any(a is not b for a, b in zip(rows, stored.rows, strict=True))
     saves = () if changed else stored.saves  # which count the rows of the file
@@ -218,7 +219,7 @@ def _parsed(text: str) -> list[_Limit]:
         if not match:
             raise BadTolerance(f"{piece!r}: expected a kind and its limit, as radius=0.1% or power:2-4=-1..3")
         word, places, low, high, percent = match.groups()
-        if word not in WORDS and (word not in KINDS or word in ("operand", "parameter", "zernike")):
+        if word not in WORDS and (word not in KINDS or word in ("operand", "parameter", "zernike", "fringe")):
             meant = did_you_mean(word, [*WORDS, *KINDS])
             raise BadTolerance(f"{piece!r}: no tolerance {word!r}{meant}; expected one of {', '.join(WORDS)}")
         if percent and word not in ("radius", "abbe"):

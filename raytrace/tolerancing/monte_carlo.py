@@ -24,14 +24,15 @@ _TRIALS = record({"first": whole(), "rows": listed(listed(number(infinite=True))
 
 
 class _Trials:
-    """Finished trials in a file: rows of the criterion and the compensators, by the number of their first trial."""
+    """Finished trials in a file: rows of criterion, light and compensators, by the number of their first trial."""
 
     def __init__(self, path: str | PathLike, study: Study, seed: int):
         rows = [dataclasses.astuple(row) for row in (*study.tolerances, *study.compensators)]
         about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
         about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
-        about |= {"fields and pupil": digest(study.sampling)}
-        about |= {"settings": digest(repr(study.criterion.settings))} if study.criterion.settings else {}
+        about |= {"fields and pupil": digest([view.sampling for view in study.views]), "loss": study.loss}
+        settings = [view.criterion.settings for view in study.views]
+        about |= {"settings": digest(repr(settings))} if any(settings) else {}
         self.store = Records(path, about, _JOURNAL, _TRIALS)
         self.found = {record["first"]: record["rows"] for _, record in self.store.read()}
 
@@ -41,20 +42,20 @@ class _Trials:
 
 
 def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
-    """The criterion (T,) of the trials, and the changes (T, C) of their compensators."""
+    """The criterion (T,) of the trials, the changes (T, C) of their compensators, and their share (T,) of the light."""
     count, others = len(study.tolerances), len(study.compensators)
-    found = study.half.new_zeros(trials, 1 + others)
+    found = study.half.new_zeros(trials, 2 + others)
     chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
     mine = (share or Share()).of(range(len(chunks)))
     stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
-    bar = progress(trials, "lens") if progress and trials else None
+    bar = progress(trials, "trial") if progress and trials else None
     for k in mine:
         part = chunks[k]
         rows = stored.found.get(part.start) if stored else None
         if rows is None or len(rows) != len(part):
             errors = draw_errors(study.tolerances, len(part), seed, first=part.start).to(study.half)
-            q, changes = study.compensated(errors.reshape(len(part), count))
-            rows = torch.cat([study.criterion.value(q)[:, None], changes], -1)
+            q, changes, light = study.compensated(errors.reshape(len(part), count))
+            rows = torch.cat([study.criterion.value(q)[:, None], light[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
         found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
@@ -64,4 +65,4 @@ def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Shar
         bar.close()
     if share is not None and share.processes > 1:
         found = total(found)
-    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 1:]
+    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 2:], found[:, 1]

@@ -6,11 +6,11 @@ thicknesses and other numbers, with the pickups and position solves that follow 
     before′ = M_group ∘ M_element ∘ before ∘ M_surface            M: decentre, then tilts about x, y and z
     after′  = M_surface⁻¹ ∘ after ∘ E_element ∘ E_group           E = T⁻¹ M⁻¹ T,  T: the way through the element
 
-An element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what follows
-keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that surfaces
-keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses before and
-behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such thickness:
-the axes from which rays start follow the vertex of surface 1.
+A surface, an element or a group is moved rigidly about the vertex of its first surface, or a pivot behind it, and what
+follows keeps its place: as with a coordinate break before it and one behind it. Motions are poses of surfaces, so that
+surfaces keep their numbers and the compiled trace carries the lens. Their shifts along z are those of the thicknesses
+before and behind: first-order data count them, and lens files hold them. Before an object at infinity there is no such
+thickness: the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, 
 from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
 from raytrace.system.sag_terms import with_powers
 from raytrace.system.surface import Surface, with_z_in_thicknesses
-from raytrace.system.tolerance_data import KINDS, Gauge, Tolerance
+from raytrace.system.tolerance_data import KINDS, MOST_TERM, Gauge, Tolerance
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
@@ -83,7 +83,11 @@ class Perturbation:
             _change(lens, surfaces, row, value, gauges)
         _follow(start, surfaces)
         numbers = list(surfaces)
-        spread = [(row, k, f * value) for row, value in pairs for k, f in _carriers(lens, row)]
+        spread = [
+            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0])))
+            for row, value in pairs
+            for k, f in _carriers(lens, row)
+        ]
         _add_sags(surfaces, [part for part in spread if KINDS[part[0].kind].sag], gauges)
         moved = _move(surfaces, pairs, [part for part in spread if KINDS[part[0].kind].motion])
         for k, surface in enumerate(surfaces):  # a shift along z is one of thicknesses
@@ -439,8 +443,8 @@ def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Sol
             message = f"the surface has no {row.parameter!r}; it has {known}"
     elif surface.is_break and row.kind != "thickness":
         message = 'the surface is a coordinate break; expected "parameter" with its tilt_x, x, …, or an optical surface'
-    elif row.kind == "zernike" and not 2 <= row.term <= 231:
-        message = f"term {row.term}; expected one of Noll's from 2 to 231"
+    elif row.kind in MOST_TERM and not 2 <= row.term <= MOST_TERM[row.kind]:
+        message = f"term {row.term}; expected a number from 2 to {MOST_TERM[row.kind]}"
     quantity = {"radius": "curvature", "power": "curvature", "index": "glass", "abbe": "glass"}.get(row.kind, row.kind)
     quantity = row.parameter if row.kind == "parameter" else quantity
     if (k, quantity) in solves and not message:

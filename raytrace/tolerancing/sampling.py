@@ -7,17 +7,21 @@ limits a and b, m their middle and h half their distance:
     uniform      a + u (b - a)
     parabolic    m + h ∛(2u - 1),  density 3 (e - m)²/(2h³)
     end_points   a or b
+    table        a + (b - a) x, x of a density that is linear between the points of a table
+
+The rows of a group have the errors √n d F⁻¹(v): d a direction in all n of them alike, v uniform. Both follow from the
+numbers of the rows: d from g = Φ⁻¹(u), v = P(χ²_n ≤ |g|²).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from scipy.special import ndtr, ndtri
+from scipy.special import chdtr, ndtr, ndtri
 from torch import Tensor
 
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.tolerances import Tolerances, check_limits, rows_of
+from raytrace.tolerancing.tolerances import Tolerances, check_limits, groups_of, rows_of
 
 
 def draw_errors(tolerances: Tolerances | Iterable[Tolerance], count: int, seed: int = 0, *, first: int = 0) -> Tensor:
@@ -33,9 +37,13 @@ def draw_errors(tolerances: Tolerances | Iterable[Tolerance], count: int, seed: 
         check_limits(row)
     uniform = _uniform(seed, first, count, len(rows))
     columns = [_errors(row, uniform[:, n]) for n, row in enumerate(rows)]
-    errors = np.stack(columns, -1) if columns else np.zeros((count, 0))
-    _share(rows, errors)
-    return torch.from_numpy(errors)
+    for places in groups_of(rows):
+        if len(places) > 1:
+            normal = ndtri(uniform[:, places])
+            squares = (normal * normal).sum(-1)
+            for n, g in zip(places, normal.T, strict=True):
+                columns[n] = np.sqrt(len(places) / squares) * g * _errors(rows[n], chdtr(len(places), squares))
+    return torch.from_numpy(np.stack(columns, -1) if columns else np.zeros((count, 0)))
 
 
 def _uniform(seed: int, first: int, count: int, rows: int) -> np.ndarray:
@@ -59,16 +67,28 @@ def _errors(row: Tolerance, u: np.ndarray) -> np.ndarray:
         return row.minimum + u * (row.maximum - row.minimum)
     if row.distribution == "parabolic":
         return middle + half * np.cbrt(2 * u - 1)
+    if row.distribution == "table":
+        return row.minimum + 2 * half * _quantile(row.density, u)
     return np.where(u < 0.5, row.minimum, row.maximum)
 
 
-def _share(rows: tuple[Tolerance, ...], errors: np.ndarray) -> None:
-    """Scale the errors of each group so that they add up, in squares, to the square of its limit."""
-    groups: dict[str, list[int]] = {}
-    for n, row in enumerate(rows):
-        if row.group:
-            groups.setdefault(row.group, []).append(n)
-    for places in groups.values():
-        sizes = np.linalg.norm(errors[:, places], axis=1, keepdims=True)
-        whole = np.sqrt(sum(rows[n].maximum ** 2 for n in places))
-        errors[:, places] *= whole / np.maximum(sizes, np.finfo(float).tiny)
+def _quantile(density: Sequence[tuple[float, float]], u: np.ndarray) -> np.ndarray:
+    """Fraction of the way between the limits below which a share u lies: p₀ t + ½ (p₁ - p₀) t²/w of each step w."""
+    x, p = np.array(density).T
+    widths, starts = np.diff(x), p[:-1]
+    areas = np.concatenate([[0.0], np.cumsum(0.5 * widths * (p[1:] + starts))])
+    rest = u * areas[-1]
+    k = np.clip(np.searchsorted(areas, rest, side="right") - 1, 0, len(widths) - 1)
+    rest, slope = rest - areas[k], ((p[1:] - starts) / widths)[k]
+    root = starts[k] + np.sqrt(np.maximum(starts[k] ** 2 + 2 * slope * rest, 0.0))
+    return x[k] + np.clip(2 * rest / np.maximum(root, np.finfo(float).tiny), 0.0, widths[k])
+
+
+def density_moments(density: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Mean and variance of the fraction of the way between the limits."""
+    x, p = np.array(density).T
+    a, b, first, last, widths = x[:-1], x[1:], p[:-1], p[1:], np.diff(x)
+    whole = widths @ (first + last) / 2
+    mean = widths @ (first * (2 * a + b) + last * (a + 2 * b)) / (6 * whole)
+    square = widths @ (first * (3 * a * a + 2 * a * b + b * b) + last * (a * a + 2 * a * b + 3 * b * b)) / (12 * whole)
+    return float(mean), float(square - mean**2)

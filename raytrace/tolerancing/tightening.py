@@ -10,7 +10,12 @@ given, those of least total tightness
 
 are found on a fixed sample of the second-order model: the cost of an error is taken as inverse to its tolerance. In
 place of the step q ≤ q_goal, whose derivative vanishes almost everywhere, a narrow logistic curve has a derivative; the
-share is then met by the step itself.
+share is then met by the step itself. The share of the lenses that are good is that of other draws of the model,
+
+    P = P_model + mean of (traced lens is good - model says so)   over traced lenses of their own seed
+
+and the model's share is shifted until P is the yield. Where that does not settle, traced lenses alone set a common
+factor.
 """
 
 import dataclasses
@@ -23,10 +28,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from raytrace.tolerancing.sampling import draw_errors
+from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 
 _HALVINGS = 30  # of a limit, to 1e-9 of it
-_DRAWS = 4096  # of the second-order model
+_DRAWS, _OTHERS = 4096, 2**15  # of the second-order model, by which factors are found, and others that judge them
+_TRACED = 512  # lenses that correct the share of the model
+_SHIFTS, _CLOSE = 4, 0.003  # times that the share of the model is shifted, and the accepted error of the share
 _SOFT = 0.05  # width of the logistic curve, in standard deviations of q
 _LEAST = 1e-3  # scale of a limit
 
@@ -46,7 +54,7 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
     """
     if not increment > 0:
         raise ValueError(f"increment {increment:g}: expected a change of the criterion above 0")
-    limits = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
+    limits = torch.cat([tolerances.alone(tolerances.minimum), tolerances.alone(tolerances.maximum)])
     found = change(limits)
     reaches = (found > increment) | ~found.isfinite()  # where no light arrives the limit is too wide
     few = limits[reaches]
@@ -57,65 +65,91 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
         good = found <= increment
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
     factors = torch.ones_like(reaches, dtype=few.dtype).masked_scatter(reaches, low)
-    return scaled(tolerances, *factors.chunk(2))
+    return scaled(tolerances, *(part[tolerances.leaders] for part in factors.chunk(2)))
 
 
 def limited_to_yield(
-    tolerances: Tolerances, model: tuple[float, Tensor, Tensor], goal: float, share: float, seed: int
+    tolerances: Tolerances,
+    model: SecondOrder,
+    traced: Callable[[Tensor], Tensor],
+    goal: float,
+    share: float,
+    seed: int,
 ) -> Tolerances:
-    """Tolerances of least total tightness by which a share of the lenses has q ≤ goal in the second-order model.
+    """Tolerances of least total tightness by which a share of the lenses, as they are traced, has q ≤ goal.
 
-    model: q₀, g (N,) and H (N, N). Limits that already give the share stay as they are. Raises BadTolerance where the
-    lens without errors does not reach the goal.
+    traced: errors (L, N) -> q (L,), nan of a lens that fails. Limits that already give the share stay as they are.
+    Raises BadTolerance where the lens without errors does not reach the goal.
     """
-    q0, g, H = model
-    if q0 > goal:
+    if float(traced(torch.zeros(1, len(tolerances)))) > goal:
         raise BadTolerance("the nominal lens itself does not reach the goal; choose a goal that it reaches")
-    errors = draw_errors(tolerances, _DRAWS, seed).to(g)
+    others, checked = (draw_errors(tolerances, count, seed + k + 1) for k, count in enumerate((_OTHERS, _TRACED)))
 
-    def quantity(s: Tensor) -> tuple[Tensor, Tensor]:
-        """q (K,) of the draws, and its derivatives by the errors (K, N)."""
-        drawn = s * errors
-        bent = drawn @ H
-        return q0 + drawn @ g + 0.5 * (bent * drawn).sum(-1), g + bent
+    def good(s: Tensor) -> Tensor:
+        """Which traced lenses reach the goal."""
+        return traced(s * checked.to(s)) <= goal
+
+    def reached(s: Tensor) -> tuple[float, float]:
+        """The share of lenses that reach the goal, and its standard error."""
+        off = good(s).double() - (model(s * checked.to(s))[0] <= goal).double()
+        found = (model(s * others.to(s))[0] <= goal).double()
+        error = (off.var() / len(off) + found.var() / len(found)).sqrt()
+        return float(found.mean() + off.mean()), float(error)
+
+    best = torch.ones(len(tolerances)).to(model.g)
+    there, error = reached(best)
+    if there >= share - error:
+        return tolerances
+    wanted = share
+    for _ in range(_SHIFTS):
+        best = _least_tight(tolerances, model, goal, min(max(wanted, 0.0), 1 - 1 / _DRAWS), seed)
+        there, error = reached(best)
+        if abs(there - share) <= max(error, _CLOSE):
+            return scaled(tolerances, best, best)
+        wanted += share - there
+    best = best * _largest(lambda factor: float(good(factor * best).double().mean()) >= share, steps=12)
+    return scaled(tolerances, best, best)
+
+
+def _least_tight(tolerances: Tolerances, model: SecondOrder, goal: float, share: float, seed: int) -> Tensor:
+    """Factors (N,) of least total tightness by which a share of the lenses has q ≤ goal in the second-order model."""
+    errors = draw_errors(tolerances, _DRAWS, seed).to(model.g)
 
     def met(s: Tensor) -> float:
-        return float((quantity(s)[0] <= goal).double().mean())
+        return float((model(s * errors)[0] <= goal).double().mean())
 
-    ones = torch.ones_like(g)
-    if met(ones) >= share:
-        return tolerances
-    start = torch.full_like(g, _largest(lambda factor: met(factor * ones) >= share))
+    ones = torch.ones_like(model.g)
+    start = ones * _largest(lambda factor: met(factor * ones) >= share)
 
     def tightness(u: np.ndarray) -> tuple[float, np.ndarray]:
         return float(np.exp(-u).mean()), -np.exp(-u) / len(u)
 
     @functools.lru_cache(maxsize=4)
     def excess(u: tuple[float, ...]) -> tuple[float, np.ndarray]:
-        s = torch.exp(g.new_tensor(u))
-        q, by_errors = quantity(s)
+        s = torch.exp(ones.new_tensor(u))
+        q, by_errors = model(s * errors)
         width = _SOFT * q.std()
         y = torch.sigmoid((goal - q) / width)
         slope = ((y * (y - 1) / width) @ (by_errors * errors)) * s / len(q)
         return float(y.mean()) - share, slope.double().numpy()
 
     found = minimize(
-        tightness, np.log(start.double().numpy()), jac=True, method="SLSQP", bounds=[(np.log(_LEAST), 0.0)] * len(g),
+        tightness, np.log(start.double().numpy()), jac=True, method="SLSQP", bounds=[(np.log(_LEAST), 0.0)] * len(ones),
         constraints={"type": "ineq", "fun": lambda u: excess(tuple(u))[0], "jac": lambda u: excess(tuple(u))[1]},
         options={"maxiter": 100, "ftol": 1e-7},
     )  # fmt: skip
-    best = torch.exp(torch.from_numpy(found.x)).to(g)
+    best = torch.exp(torch.from_numpy(found.x)).to(ones)
     # The step itself in place of the logistic curve: all factors times one number.
     best = (best * _largest(lambda factor: met((factor * best).clamp(max=1.0)) >= share, 2.0)).clamp(max=1.0)
     if met(best) < share or float((1 / best).sum()) > float((1 / start).sum()):
         best = start
-    return scaled(tolerances, best, best)
+    return best
 
 
-def _largest(holds: Callable[[float], bool], most: float = 1.0) -> float:
+def _largest(holds: Callable[[float], bool], most: float = 1.0, steps: int = 40) -> float:
     """The largest factor up to `most` for which a condition holds that holds at 0, by halving."""
     low, high = 0.0, most
-    for _ in range(40):
+    for _ in range(steps):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low

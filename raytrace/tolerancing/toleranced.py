@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.budget import afford
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
@@ -25,12 +26,16 @@ from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.study import Study, sampling_of, second_order_draws, with_changes
+from raytrace.tolerancing.second_order import SecondOrder
+from raytrace.tolerancing.study import Study, moments, views_of, with_changes
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
 
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
+_MODEL = 2**15  # draws of the second-order model
+_CHECKED, _UNEXPLAINED = 64, 0.25  # lenses that the model is compared with; accepted part of their standard deviation
+_NEGATIVE = 0.02  # accepted share of draws whose mean square is negative by second order
 
 
 @value
@@ -43,8 +48,11 @@ class Toleranced(Result):
     second order; slope: (N,) its derivative times the half width.
     estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
     second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
-    second-order model. trials: (T,) the criterion of the perturbed and compensated lenses, nan where no ray arrives;
-    changes: (T, C) of the compensators.
+    second-order model, whose compensators keep their limits. holds: whether that model describes the lens: why not, or
+    "". trials: (T,) the criterion of the perturbed and compensated lenses, nan of a lens that failed: no ray of a field
+    arrives, or it loses more than `loss` of the light of the nominal lens; changes: (T, C) of the compensators.
+    lost: (T,) shares of the light of the nominal lens that the trials lose, in the configuration that loses most;
+    lost_minimum, lost_maximum: (N,) those of lenses with one error at its limit, whose changes are nan beyond `loss`.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
     goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
     before their limits were tightened, or None.
@@ -66,6 +74,12 @@ class Toleranced(Result):
     predicted: Tensor
     trials: Tensor
     changes: Tensor
+    lost: Tensor
+    lost_minimum: Tensor
+    lost_maximum: Tensor
+    loss: float = 0.05
+    holds: str = ""
+    configurations: int = 1
     seed: int = 0
     unsettled: int = 0
     angle: float = 0.0
@@ -84,6 +98,7 @@ class Toleranced(Result):
             Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
             Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
+            Column("lost", "%", ".3g", "light\nlost"),
             Column("share", "%", ".4g"),
             Column("trials", self.unit, ".5f"),
             Column("predicted", self.unit, ".5f", "2nd order"),
@@ -103,8 +118,19 @@ class Toleranced(Result):
 
     @property
     def worst(self) -> Tensor:
-        """(N,) places of the tolerances, the largest change to the worse first."""
-        return torch.argsort(torch.maximum(self.sign * self.minimum, self.sign * self.maximum), descending=True)
+        """Places (G,) of the tolerances, the largest change to the worse first; of a group that of its first row."""
+        changes = torch.maximum(self.sign * self.minimum, self.sign * self.maximum)
+        order = torch.argsort(changes.nan_to_num(torch.inf), descending=True)  # nan: the lens fails
+        leaders = self.tolerances.leaders
+        return order[leaders[order] == order]
+
+    @property
+    def labels(self) -> list[str]:
+        """Kind and place of every row in words; of the first row of a group those of all its rows."""
+        labels = self.tolerances.labels
+        for first, *_, last in (places for places in groups_of(self.tolerances) if len(places) > 1):
+            labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
+        return labels
 
     def percentile(self, percent: float) -> Tensor:
         """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
@@ -202,10 +228,14 @@ class Toleranced(Result):
             "second_minimum": self.second_minimum[order],
             "second_maximum": self.second_maximum[order],
             "slope": self.slope[order],
-        }
+        } | (
+            {"lost": lost[order]}
+            if bool((lost := 100 * torch.maximum(self.lost_minimum, self.lost_maximum)).any())
+            else {}
+        )
 
     def words(self) -> dict[str, Sequence[str]]:
-        return {"tolerance": self.tolerances.labels, "unit": [row.unit for row in self.tolerances]}
+        return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
 
     def summary(self) -> dict[str, float]:
         """Figures of the lens as built, in the unit of the criterion."""
@@ -216,11 +246,13 @@ class Toleranced(Result):
         }
         if self.better == "smaller":
             found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
+        found["second_order_holds"] = not self.holds
         if len(self.trials):
             good = self.trials[~self.trials.isnan()]
-            found |= {"mean": float(good.mean()), "sigma": float(good.std())}
-            found |= {"best": float((good * self.sign).min()) * self.sign}
-            found |= {"worst": float((good * self.sign).max()) * self.sign, "failed": int(self.trials.isnan().sum())}
+            ends = (good * self.sign).aminmax() if len(good) else (torch.tensor(torch.nan),) * 2
+            found |= {"mean": float(good.mean()), "sigma": float(good.std()) if len(good) > 1 else math.nan}
+            found |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
+            found |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
             found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
         if self.goal is not None:
             reached = self.sign * self.predicted <= self.sign * self.goal
@@ -232,28 +264,42 @@ class Toleranced(Result):
     def tables(self) -> list[Table]:
         found = self.summary()
         about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
-        root = found.get("expected_root_mean_square")
+        if self.configurations > 1:
+            about[0] += f", of {self.configurations} configurations together"
+        root, failing = found.get("expected_root_mean_square"), int((self.minimum + self.maximum).isnan().sum())
         about.append(
             f"as built, expected by second order: mean {found['expected']:.6g}"
             + (f", root mean square {root:.6g}" if root is not None else "")
             + f"; estimated by RSS {found['estimated']:.6g}"
         )
+        if self.holds:
+            about.append(f"the second order does not hold: {self.holds}; rely on the trials")
+        if failing:
+            about.append(
+                f"{failing} tolerances lose more than {100 * self.loss:g} % of the light at a limit: not in RSS"
+            )
         if self.angle:
             numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
             numbers |= {"90 % within": found["percent_90"]} if len(self.trials) else {}
             listed = ", ".join(f"{word} {1e3 * self.angle * number:.4g}" for word, number in numbers.items())
             about.append(f"as an angle, divided by the focal length, mrad: {listed}")
+        if not self.tolerances.compensators:
+            about.append("no compensator")
         if len(self.trials):
             about.append(
                 f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
                 f"best {found['best']:.6g}, worst {found['worst']:.6g}"
-                + f"; {found['failed']} without light"
-                * (found["failed"] > 0)
             )
+            if found["lost_light"] > 0:
+                about.append(
+                    f"light lost in {int((self.lost > 0).sum())} trials, {100 * found['lost_light']:.3g} % at most; "
+                    f"{found['failed']} failed, by more than {100 * self.loss:g} %, and count as worse than all others"
+                )
+            good = ~self.trials.isnan()
             for k, one in enumerate(self.tolerances.compensators):
-                c = self.changes[:, k]
+                c = self.changes[good, k]
                 if not bool(c.any()):
-                    about.append(f"compensator {one}: it stays, as it has no effect")
+                    about.append(f"compensator {one}: it stays{', as it has no effect' * bool(len(c))}")
                     continue
                 about.append(
                     f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
@@ -273,7 +319,7 @@ class Toleranced(Result):
             )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about)]
+        found = [Table(self.columns(), about, self.tolerances.notes)]
         if len(self.trials):
             bound = "within" if self.sign > 0 else "above"
             found.append(
@@ -282,20 +328,22 @@ class Toleranced(Result):
         return found
 
     def document(self) -> dict:
-        return {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
+        return about | ({"unread": list(self.tolerances.unread)} if self.tolerances.unread else {})
 
     @styled
     def draw(self):
         """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
         figure = new_figure(9.0, 4.2)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
-        shown = self.trials[~self.trials.isnan()] if len(self.trials) else self.predicted
+        good = self.trials[~self.trials.isnan()]
+        shown = good if len(good) else self.predicted
         tail = torch.quantile(self.sign * shown, 0.998) * self.sign
         ends = ((self.sign * shown).min() * self.sign, self.nominal, tail)
         span = (float(min(ends)), float(max(ends)))
         bins = np.linspace(*span, 41)
-        if len(self.trials):
-            left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(self.trials):,} trials")
+        if len(good):
+            left.hist(shown.numpy(), bins=bins, density=True, color="#9ecae1", label=f"{len(good):,} trials")
         density, _ = np.histogram(self.predicted.numpy(), bins=bins, density=True)
         left.stairs(density, bins, color=INK, linewidth=1.2, label="second order")
         left.axvline(float(self.nominal), color=GREY, linestyle=":", label="nominal")
@@ -308,7 +356,7 @@ class Toleranced(Result):
         side = "right" if self.sign > 0 else "left"
         left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)
-        labels = [self.tolerances.labels[k] for k in order.tolist()]
+        labels = [self.labels[k] for k in order.tolist()]
         right.barh(range(len(order)), self.maximum[order].numpy(), height=0.38, align="edge", label="at maximum")
         right.barh(range(len(order)), self.minimum[order].numpy(), height=-0.38, align="edge", label="at minimum")
         right.set_yticks(range(len(order)), labels, fontsize=7.5)
@@ -336,8 +384,9 @@ def tolerance(
     goal: float | None = None,
     yield_: float | None = None,
     fields: Tensor | Sequence | None = None,
-    rings: int = 4,
-    arms: int = 6,
+    rings: int | None = None,
+    arms: int | None = None,
+    loss: float = 0.05,
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
@@ -348,27 +397,33 @@ def tolerance(
 ) -> Toleranced:
     """The lens as built: sensitivities, expectation by second order and Monte Carlo.
 
+    A lens of several configurations is judged in all of them, by the mean of what the compensators minimise.
+    `lens.configuration(2)` of a lens read alone: leave its others out by `operands=()`.
+
     tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`
         and `limits`.
     grade: tolerances of published grades instead of the file's, see `tolerances`.
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
-        centroid of its light; "wavefront", the RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of
-        diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; "psf", the change of the
-        PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the chief
-        ray; "boresight", the distance in µm by which the chief ray of the axial field misses its nominal place on the
-        sensor; "merit", a merit function. The compensators of every lens bring it to its best.
+        centroid of its light, of an afocal lens that of "angle", the RMS angle in mrad of the rays; "wavefront", the
+        RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of diffraction at 30 cycles/mm, mean of
+        tangential and sagittal over the fields; "psf", the change of the PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the
+        nominal lens, mean square over the fields, in windows about the chief ray; "boresight", the distance in µm by
+        which the chief ray of the axial field misses its nominal place on the sensor; "merit", a merit function. The
+        compensators of every lens bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
     goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
-        least total tightness until this share reaches the goal, by second order.
+        least total tightness until this share reaches the goal, by second order corrected by traced lenses.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
-        symmetric, mirrored along y.
-    rings: of the pupil, Gaussian quadrature, 4 by default.
-    arms: of the pupil, 6 by default.
+        symmetric, mirrored along y if the lens is round, at half the weight each: the criterion of the nominal lens is
+        that of its own fields.
+    rings: of the pupil, Gaussian quadrature; by default the fewest that give the spots of `spot`.
+    arms: of the pupil, 4·rings by default.
+    loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has failed.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
@@ -385,56 +440,81 @@ def tolerance(
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
         raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
+    afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer `trials`")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
-    sampling, given = sampling_of(lens, fields, rings, arms), tolerances
-    chosen = criterion_of(criterion, lens, sampling, model=model, pixel=pixel, size=size, merit=merit)
-    study = Study(lens, tolerances, chosen, sampling)
+    if not 0 <= loss <= 1:
+        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.05")
+    options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
+    views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
+    chosen, study, given = views[0].criterion, Study(views, tolerances, loss), tolerances
     if study.compensators:
         study.nominal_curvature()  # refuses those without effect
     with torch.no_grad():
-        nominal_quantity, _ = study.compensated(study.half.new_zeros(1, len(tolerances)))
+        nominal_quantity, *_ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_quantity.isfinite().all()):
             raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
         nominal = chosen.value(nominal_quantity[0])
         if increment is not None:
-            tolerances = limited_to_change(tolerances, study.harm, increment)
-            study = Study(lens, tolerances, chosen, sampling)
-        model = study.second_order()
+            tolerances = limited_to_change(tolerances, lambda errors: study.harm(errors)[0], increment)
+            study = Study(views, tolerances, loss)
+        second = study.second_order()
         if goal is not None and yield_ is not None:
-            tolerances = limited_to_yield(tolerances, model, chosen.quantity_of(goal), yield_, seed + 1)
-            study = Study(lens, tolerances, chosen, sampling)
-        limits_alone = torch.cat([torch.diag(tolerances.minimum), torch.diag(tolerances.maximum)])
-        changes = (chosen.sign * study.harm(limits_alone)).chunk(2)
-        seconds = [
-            _second_order_change(chosen, model, limits.to(study.half))
-            for limits in (tolerances.minimum, tolerances.maximum)
-        ]
-        predicted, expected, mean_square = second_order_draws(tolerances, chosen, *model, seed)
-        values, moved = monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
-    rss = (0.5 * (changes[0] ** 2 + changes[1] ** 2)).sum().sqrt()
+            tolerances = limited_to_yield(
+                tolerances, second, lambda errors: study.compensated(errors.to(study.half))[0],
+                chosen.quantity_of(goal), yield_, seed + 1,
+            )  # fmt: skip
+            study = Study(views, tolerances, loss)
+        alone = torch.cat([tolerances.alone(each) for each in (tolerances.minimum, tolerances.maximum)]).to(study.half)
+        changes, light = study.harm(alone)
+        start, slope = second(torch.zeros_like(alone[:1]))
+        seconds = chosen.value(second(alone)[0].clamp_min(0)) - chosen.value(start.clamp_min(0))
+        mean, variance = (study.half.new_tensor(part) for part in zip(*map(moments, tolerances), strict=True))
+        drawn = draw_errors(tolerances, _MODEL, seed + 1).to(study.half)
+        predicted, expected, mean_square, negative = second.means(drawn, mean, variance, chosen.value)
+        holds = _broken(study, second, drawn[:_CHECKED], float(negative))
+        values, moved, kept = monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
+    low, high = (chosen.sign * changes).chunk(2)
+    light_low, light_high = (1 - light).chunk(2)
+    rss = (0.5 * (low**2 + high**2)).nansum().sqrt()
     return Toleranced(
-        lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal,
-        minimum=changes[0], maximum=changes[1], second_minimum=seconds[0], second_maximum=seconds[1],
-        slope=_slope(chosen, *model) * study.half, estimated=nominal + chosen.sign * rss, expected=expected,
-        expected_square=mean_square, predicted=predicted, trials=values, changes=moved, seed=seed,
-        unsettled=study.unsettled, goal=goal, share=0.9 if yield_ is None else yield_,
-        given=None if tolerances is given else given, better="smaller" if chosen.sign > 0 else "larger",
-        angle=chosen.angle,
+        lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal, minimum=low,
+        maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
+        slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
+        estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
+        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss,
+        holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
+        share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
+        better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
 
 
-def _second_order_change(criterion: Criterion, model: tuple[float, Tensor, Tensor], errors: Tensor) -> Tensor:
-    """f(q₀ + g e + ½ H_ee e²) - f(q₀) (N,) of errors (N,), each alone."""
-    q0, g, H = model
-    found = (q0 + g * errors + 0.5 * torch.diagonal(H) * errors**2).clamp_min(0)
-    return criterion.value(found) - criterion.value(found.new_tensor(q0))
+def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:
+    """Why the second-order model does not describe the lens, "" where it does; errors (L, N) of lenses that are traced.
+
+    It does where it explains the criterion of these lenses but for a quarter of its standard deviation.
+    """
+    if negative > _NEGATIVE:
+        return f"it gives a negative mean square of {100 * negative:.3g} % of the lenses"
+    traced, modelled = (study.criterion.value(q.clamp_min(0)) for q in (study.compensated(errors)[0], model(errors)[0]))
+    arriving = traced.isfinite()
+    if not int(arriving.sum()) > 1:
+        return f"none of {len(errors)} traced lenses has a criterion"
+    off, spread = (modelled - traced)[arriving], traced[arriving].std()
+    root = off.square().mean().sqrt()
+    if root <= _UNEXPLAINED * spread:
+        return ""
+    return (
+        f"the criterion of {int(arriving.sum())} traced lenses differs from it by {float(root):.3g} "
+        f"{study.criterion.unit} (RMS; mean {float(off.mean()):+.3g}), and from lens to lens by {float(spread):.3g}"
+    )
 
 
-def _slope(criterion: Criterion, q0: float, g: Tensor, H: Tensor) -> Tensor:
-    """Derivatives (N,) of the criterion by errors; where its square is 0 of the nominal lens, by their sizes."""
-    if q0 <= 1e-12 * criterion.scale:
-        return torch.sqrt((0.5 * torch.diagonal(H)).clamp_min(0))
+def _slope(criterion: Criterion, q0: Tensor, g: Tensor, H: Tensor, errors: Tensor) -> Tensor:
+    """Changes (L,) of the criterion along errors (L, N) to first order; where its square is 0 of the nominal lens, by
+    their sizes."""
+    if float(q0) <= 1e-12 * criterion.scale:
+        return torch.sqrt((0.5 * ((errors @ H) * errors).sum(-1)).clamp_min(0))
     with torch.enable_grad():
-        q = g.new_tensor(q0).requires_grad_()
-        return g * torch.autograd.grad(criterion.value(q), q)[0]
+        q = q0.detach().clone().requires_grad_()
+        return (errors @ g) * torch.autograd.grad(criterion.value(q), q)[0]

@@ -1,6 +1,7 @@
 """Tolerances: the rows of a lens, what is adjusted after manufacture, and the wavelength of the test."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -62,6 +63,24 @@ class Tolerances(Result):
         """Kind and place of every row in words: "radius of surface 3"."""
         return [f"{row.name} of {row.where}" for row in self.rows]
 
+    @property
+    def notes(self) -> list[str]:
+        """The lines that are not read, in words."""
+        return [f"not read: {line}" for line in self.unread]
+
+    @property
+    def leaders(self) -> Tensor:
+        """The first row (N,) of the group of every row; of one without a group, itself."""
+        leaders = torch.arange(len(self.rows))
+        for places in groups_of(self.rows):
+            leaders[places] = places[0]
+        return leaders
+
+    def alone(self, limits: Tensor) -> Tensor:
+        """Limits (N,) as errors (N, N) of N lenses, one row alone in each; in that of its first row a whole group."""
+        every = torch.arange(len(self.rows))
+        return limits.new_zeros(len(every), len(every)).index_put((self.leaders, every), limits)
+
     def only(self, *kinds: str) -> "Tolerances":
         """The tolerances with the rows of these kinds alone."""
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.kind in kinds), saves=())
@@ -98,15 +117,16 @@ class Tolerances(Result):
 
     def tables(self) -> Sequence[Table]:
         title = [f"{len(self.rows)} tolerances, fringes at {self.test_wavelength:g} µm"]
-        notes = [*(f"compensator: {one}" for one in self.compensators), *(f"not read: {line}" for line in self.unread)]
-        return [Table(self.columns() if self.rows else {}, title, notes)]
+        notes = [f"compensator: {one}" for one in self.compensators]
+        return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
 
     def document(self) -> dict:
         """The rows and compensators as plain values."""
 
         def plain(row) -> dict:
             found = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
-            return {name: number(v) if isinstance(v, float) else v for name, v in found.items() if v not in ("", None)}
+            stated = {name: part for name, part in found.items() if part not in ("", None, ())}
+            return {name: number(part) if isinstance(part, float) else part for name, part in stated.items()}
 
         return {
             "test_wavelength": self.test_wavelength,
@@ -114,6 +134,14 @@ class Tolerances(Result):
             "compensators": [plain(one) for one in self.compensators],
             "unread": list(self.unread),
         }
+
+
+def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
+    """The places of the rows of each group, in the order of its first row."""
+    groups: dict[str | int, list[int]] = {}
+    for place, row in enumerate(rows):
+        groups.setdefault(row.group or place, []).append(place)
+    return list(groups.values())
 
 
 def rows_of(tolerances: Tolerances | Iterable[Tolerance]) -> tuple[Tolerance, ...]:
@@ -128,8 +156,18 @@ def check_limits(row: Tolerance) -> None:
     if row.distribution not in DISTRIBUTIONS:
         known = ", ".join(DISTRIBUTIONS)
         raise BadTolerance(f"{row}{_origin(row)}: distribution {row.distribution!r}; expected one of {known}")
+    if row.distribution == "table":
+        _check_density(row)
     if row.distribution == "normal" and not 0 < row.sigmas < float("inf"):
         raise BadTolerance(f"{row}{_origin(row)}: limits at {row.sigmas:g} standard deviations; expected more than 0")
+
+
+def _check_density(row: Tolerance) -> None:
+    x, p = zip(*row.density, strict=True) if row.density else ((), ())
+    rising = len(x) > 1 and all(a < b for a, b in itertools.pairwise(x)) and x[0] >= 0 and x[-1] <= 1
+    if not rising or min(p) < 0 or not 0 < sum(p) < float("inf"):
+        message = "expected rising fractions from 0 to 1 of the way between the limits, and densities of 0 and more"
+        raise BadTolerance(f"{row}{_origin(row)}: density {row.density}; {message}")
 
 
 def _origin(row: Tolerance) -> str:

@@ -89,16 +89,18 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     one, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
     parallel = near.behind(one, 0 * one)
     fan = near.behind(one, kappa * one)
-    chief = near.behind(-near.E, one)
+    # Through the middle of the stop, A m + B t = 0, also where A = 0, as chief rays are parallel in object space: of
+    # object points 1 mm off the base ray, over κ.
+    through = _inverse(near.A + kappa * near.B)
+    chief = near.behind(through @ near.B, -through @ near.A)
     # From the axial object point to the rim of the stop.
-    move = near.radius[..., None, None] * _inverse(near.A + kappa * near.B) @ near.Q
+    move = near.radius[..., None, None] * through @ near.Q
     rim = near.behind(move, kappa * move)
     exit_pupil, image = _closest(chief), _closest(fan)
     across = _at(rim, exit_pupil)
     magnification = torch.zeros_like(image)
-    if is_any(kappa != 0):  # by chief rays of object points 1 mm off the base ray
-        turn = -kappa * _inverse(one + kappa * near.E)
-        height = _at(near.behind(-near.E @ turn, turn), image)
+    if is_any(kappa != 0):
+        height = kappa * _at(chief, image)
         magnification = _sign(near.carried, height) * _length(height)
     return BaseRay(
         valid=near.valid,
@@ -172,7 +174,6 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     aim = _aim(lens, wavelength)
     launched = _start_direction(aim, distance)
     indices = media(lens, wavelength)
-    indices = [*indices[:-1], indices[-2]]  # the direction before the image surface, whatever medium is behind
     axes, image = _axes(launched), len(lens.surfaces) - 1
     real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
 
@@ -351,7 +352,9 @@ def _sign(carried: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor, axis: int = -2) -> Tensor:
-    return safe_sqrt((vectors * vectors).sum(axis))
+    """Infinite where a vector is not a number, as one of an inverse that does not exist."""
+    square = (vectors * vectors).sum(axis)
+    return torch.where(square.isnan(), torch.inf, safe_sqrt(square))
 
 
 def _over(numerator: Tensor | float, denominator: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ angles of a rule of equal steps err by the step squared, and their derivatives b
 Gaussian nodes between kinks.
 """
 
+import dataclasses
 import math
 
 import torch
@@ -25,8 +26,10 @@ from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.apertures import clearances_of, stands_inside
 from raytrace.system.lens import Lens, field_points
+from raytrace.system.rays import Rays
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
+from raytrace.tracing.trace import without_apertures
 
 _SCAN = 32  # steps along an arm in which edges are looked for
 _SECTIONS, _ZOOMS = 8, 2  # an edge is enclosed in 8⁻² of a step: slopes are good to 5e-4
@@ -105,13 +108,32 @@ def clear_pupil(
     return points[:, None, None].expand(2, *shape), weights.expand(shape)
 
 
+def clear_rays(scene: Scene, rings: int) -> tuple[Rays, Tensor]:
+    """Rays (3, D, F, W, P) on the sensor that fill the clear pupils, and their weights (D, F, W, P).
+
+    `rings` nodes on each of about 4·rings arms; the ends of the arms, on the edge, have no weight. See `Arms.rule`.
+    """
+    arms = arms_of(scene, 4 * rings)
+    (points, weights), (ends, exist) = arms.rule(rings), arms.ends()
+    bare = dataclasses.replace(scene, lens=without_apertures(scene.lens))
+    rays = trace_scene(bare, torch.cat([points, ends], -1))
+    valid = rays.valid & torch.cat([weights > 0, exist], -1)
+    return dataclasses.replace(rays, valid=valid), torch.cat([weights, torch.zeros_like(ends[0])], -1)
+
+
 @torch.no_grad()
 def is_clipped(scene: Scene, points: Tensor) -> bool:
     """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails."""
+    return not scene.everywhere(~clipped(scene, points).any())
+
+
+@torch.no_grad()
+def clipped(scene: Scene, points: Tensor) -> Tensor:
+    """Whether rays of each object distance (D,), or lens of a batch, fail; arguments as for `is_clipped`."""
     if any(surface.apertures for surface in scene.lens.surfaces):
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
-    return not scene.everywhere(trace_scene(scene, points).valid.all())
+    return ~trace_scene(scene, points).valid.flatten(1).all(-1)
 
 
 def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
@@ -138,7 +160,7 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
             origin = torch.stack([safe_divide((passes * at).sum(-1), passes.sum(-1)) for at in points])
             origin = torch.stack([torch.zeros_like(origin[0]), origin[1]]) if fold == "mirror" else origin
             traced = points.shape[1]
-        kinks, searched = _kinks(scene, origin, fold, around, is_hollow)
+    kinks, searched = _kinks(scene, origin, fold, around, is_hollow)
     angle, share = _angles(kinks, count, around)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
     inner, outer, found = _clear_parts(scene, unit, origin)
@@ -178,7 +200,8 @@ def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
 
 
 def _kinks(scene: Scene, origin: Tensor, fold: str, around: float, is_hollow: bool) -> tuple[Tensor, int]:
-    """Angles (D, F, W, K) at which another edge begins to bound the clear pupil, inf where there are fewer than K.
+    """Angles (D, F, W, K) at which another edge begins to bound the clear pupil, or blocked arms begin, inf where there
+    are fewer than K.
 
     K is 0 if an arm has several clear parts. And the number of rays traced for each kernel.
     """
@@ -187,21 +210,26 @@ def _kinks(scene: Scene, origin: Tensor, fold: str, around: float, is_hollow: bo
     step = around / count
     angle = (torch.arange(count, dtype=origin.dtype, device=origin.device) + 0.5) * step
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])[:, None, None, None].expand(2, *scene.shape, -1)
-    (inner, outer), (number_in, number_out), *_, traced = _enclosed(scene, unit, origin)
+    (inner, outer), (number_in, number_out), _, exists, traced = _enclosed(scene, unit, origin)
     if outer.shape[-1] > count:
         return origin.new_zeros(*scene.shape, 0), traced
-    found = [origin.new_zeros(*scene.shape, 0)]
+    found, exists_after = [origin.new_zeros(*scene.shape, 0)], exists.roll(-1, -1)
+    changes = []
     for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
         after = number.roll(-1, -1)
-        change = number != after
+        changes.append((exists & exists_after & (number != after), 0.5 * (radius + radius.roll(-1, -1)), number, after))
+    # The last arm before blocked ones ends where its own two edges meet.
+    last = [torch.where(exists, t, t.roll(-1, -1)) for t in (0.5 * (inner + outer), number_in, number_out)]
+    changes.append(((exists != exists_after) & (last[1] >= 0), *last))
+    for change, radius, number, other in changes:
         if not is_whole:
             change = torch.cat([change[..., :-1], torch.zeros_like(change[..., :1])], -1)
         most = int(change.sum(-1).max())
         if not most:
             continue
         order = change.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., :most]
-        pair = torch.stack([number.gather(-1, order), after.gather(-1, order)])
-        start = (0.5 * (radius + radius.roll(-1, -1))).gather(-1, order), angle[order] + 0.5 * step
+        pair = torch.stack([number.gather(-1, order), other.gather(-1, order)]).clamp_min(0)
+        start = radius.gather(-1, order), angle[order] + 0.5 * step
         kink, rays = _crossing(scene, origin, start, pair, step)
         traced += rays
         found.append(torch.where(change.gather(-1, order), kink, torch.inf))
@@ -214,18 +242,25 @@ def _crossing(scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: 
     here = origin[..., None] + radius * torch.stack([torch.sin(angle), torch.cos(angle)])
     small = torch.finfo(here.dtype).eps ** (1 / 3)
     shifts = small * here.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).reshape(2, 1, 1, 1, 1, 3)
-    for _ in range(_NEWTON):
-        shifted = here[..., None] + shifts
-        values = _clearances_at(scene, shifted.flatten(-2)).unflatten(-1, (-1, 3))
-        c = values.gather(0, pair[..., None].expand(*pair.shape, 3))  # (2, D, F, W, K, 3)
-        (a, b), (p, q) = ((c[i, ..., 1:] - c[i, ..., :1]).unbind(-1) for i in range(2))
-        u, v = c[..., 0]
-        determinant = a * q - b * p
-        change = small * torch.stack([safe_divide(q * u - b * v, determinant), safe_divide(a * v - p * u, determinant)])
-        here = here - change.clamp(-step, step)
+    with torch.no_grad():
+        for _ in range(_NEWTON):
+            shifted = here[..., None] + shifts
+            values = _clearances_at(scene, shifted.flatten(-2)).unflatten(-1, (-1, 3))
+            c = values.gather(0, pair[..., None].expand(*pair.shape, 3))  # (2, D, F, W, K, 3)
+            differences = c[..., 1:] - c[..., :1]
+            here = here - _newton(*c[..., 0], differences, small).clamp(-step, step)
+    for _ in range(2):  # with constant slopes, as in `_clear_parts`
+        here = here - _newton(*_clearances_at(scene, here).gather(0, pair), differences, small)
     x, y = here - origin[..., None]
     turned = torch.remainder(torch.atan2(x, y) - angle + math.pi, 2 * math.pi) - math.pi
-    return angle + torch.where(turned.abs() <= 0.51 * step, turned, 0.0), 3 * _NEWTON * radius.shape[-1]
+    return angle + torch.where(turned.abs() <= 0.51 * step, turned, 0.0), (3 * _NEWTON + 2) * radius.shape[-1]
+
+
+def _newton(u: Tensor, v: Tensor, differences: Tensor, small: float) -> Tensor:
+    """Step (2, ...) to the zero of two clearances (...); differences: (2, ..., 2) of theirs over `small` in x and y."""
+    (a, b), (p, q) = (both.unbind(-1) for both in differences)
+    determinant = a * q - b * p
+    return small * torch.stack([safe_divide(q * u - b * v, determinant), safe_divide(a * v - p * u, determinant)])
 
 
 def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Tensor, int]:
@@ -238,13 +273,13 @@ def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Te
     """
     radius, number, slope, exists, traced = _enclosed(scene, unit, origin)
     unit = unit.repeat(1, 1, 1, 1, radius.shape[-1] // unit.shape[-1])
-    # A step with a constant slope has the error (1 - c'/s)(ρ - ρ₀) to first order, in value and derivatives. Arms that
-    # end at the edge of the pupil, which is fixed, have the slope 0.
+    # A step with a constant slope has the error (1 - c'/s)(ρ - ρ₀) to first order, in value and derivatives.
     for _ in range(2 if bool((slope != 0).any()) else 0):
         clearances = _clearances(scene, radius, unit, origin)
-        here = clearances.gather(0, number.clamp(0, len(clearances) - 1)[None])[0]
+        here = clearances.gather(0, (number - 1).clamp(0, len(clearances) - 1)[None])[0]
         radius = radius - safe_divide(here, slope)
         traced += 2 * unit.shape[-1]
+    radius = torch.where(number == 0, _reach(unit, origin), radius)
     inner, outer = torch.where(exists, radius, 0.0)
     return inner, outer, traced
 
@@ -252,13 +287,13 @@ def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Te
 def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
     """Edges (2, D, F, W, B), inner and outer, just inside the clear side, and which aperture sets them; no derivatives.
 
-    Their numbers are those of `_clearances_at`, -1 for the origin. Then the slope of the clearance, 0 where there is
-    none; whether the part exists (D, F, W, B); and the number of rays traced for each kernel.
+    Their numbers are those of `_clearances_at`: 0 for the edge of the pupil, -1 for the origin. Then the slope of the
+    clearance, 0 where there is none; whether the part exists (D, F, W, B); and the number of rays traced for each
+    kernel.
     """
     arms = unit.shape[-1]
     with torch.no_grad():
-        along = (origin[..., None] * unit).sum(0)
-        reach = torch.sqrt(along * along + 1 - (origin * origin).sum(0)[..., None]) - along
+        reach = _reach(unit, origin)
         step = torch.linspace(0, 1, _SCAN + 1, dtype=unit.dtype, device=unit.device)
         radii = step[:, None, None, None, None] * reach
         passed = (_clearances(scene, radii, unit, origin) >= 0).all(0)
@@ -283,10 +318,15 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
         apertures = len(clearances) - 1
         slope = safe_divide((outside - inside).gather(0, number[None])[0], blocked - passes)
         slope = torch.where((lowest < 0) & (number < apertures) & ~ends, slope, 0.0)
-        number = torch.where(number >= apertures, apertures + 1, number)
-        number = torch.where(ends, number.new_tensor([-1, apertures]).reshape(2, 1, 1, 1, 1), number)
+        number = torch.where(ends, number.new_tensor([-1, 0]).reshape(2, 1, 1, 1, 1), number + 1)
         traced = arms * (_SCAN + 1) + arms * count * 2 * _ZOOMS * (_SECTIONS + 1)
     return passes, number, slope, here.any(0), traced
+
+
+def _reach(unit: Tensor, origin: Tensor) -> Tensor:
+    """Lengths (D, F, W, B) of arms from the origin to the edge of the pupil."""
+    along = (origin[..., None] * unit).sum(0)
+    return torch.sqrt(along * along + 1 - (origin * origin).sum(0)[..., None]) - along
 
 
 def _clearances(scene: Scene, radii: Tensor, unit: Tensor, origin: Tensor) -> Tensor:
@@ -297,9 +337,8 @@ def _clearances(scene: Scene, radii: Tensor, unit: Tensor, origin: Tensor) -> Te
 
 
 def _clearances_at(scene: Scene, points: Tensor) -> Tensor:
-    """Clearances (C + 2, D, F, W, P) at pupil points (2, D, F, W, P); the last but one that of the pupil's edge."""
-    *apertures, arrives = _traced(scene, points)
-    return torch.stack([*apertures, 1 - (points * points).sum(0), arrives])
+    """Clearances (C + 2, D, F, W, P) at pupil points (2, D, F, W, P), that of the pupil's edge first."""
+    return torch.cat([(1 - (points * points).sum(0))[None], _traced(scene, points)])
 
 
 def _traced(scene: Scene, points: Tensor) -> Tensor:

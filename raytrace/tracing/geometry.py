@@ -3,6 +3,11 @@
 A surface whose conic closes before its semi-diameter h, |c| h √(1+k) ≥ 1; a negative gap, or surfaces that cross,
 between two surfaces that refract, reflect or diffract, along the light; glass whose edge thickness is negative.
 
+The edge of glass is at the rim that both of its faces reach, the larger of their clear heights; that of air is at the
+smaller of the rims of the two elements (`rims`). There the thickness is t + z′ - z (`edge_thickness`), for checks,
+boundaries of merit functions and training. OpticStudio takes z and z′ each at the clear height of its own surface, and
+both at that of the first one in a solve: operands and solves of files give these heights.
+
 Frames: position and rotation of every surface in the axes that rays start in.
 """
 
@@ -10,6 +15,7 @@ import dataclasses
 import math
 import warnings
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +26,7 @@ from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import lens_steps
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Points of the pupil whose rays are highest on a surface.
 _ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
@@ -29,7 +35,7 @@ _HEIGHTS = 65  # at which two surfaces are compared
 _LEAST = 1e-6  # mm: an overlap that counts
 
 
-class Unbuildable(UserWarning):
+class Unbuildable(RaytraceWarning):
     """A lens that cannot be made as its numbers say."""
 
 
@@ -62,8 +68,14 @@ def defects(lens: Lens) -> tuple[Defect, ...]:
                 f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
             )
             found.append(Defect(k, "reach", height - edge, words))
-    for k, end, side in _gaps(lens):
-        found += _of_gap(lens, k, end, side, heights)
+    spaces, is_glass = gaps(lens), np.array([abs(float(index)) > 1.01 for index in media(lens, lens.primary)])
+    ends = np.arange(len(heights))
+    for k, end, _ in spaces:
+        ends[k] = end
+    each = rims(np.array(heights), ends, is_glass & (ends > np.arange(len(ends))))
+    for k, end, side in spaces:
+        medium, clear = ("glass", min(heights[k], heights[end])) if is_glass[k] else ("air", float(each[k]))
+        found += _of_gap(lens, k, end, side, medium, clear, float(each[k]))
     return tuple(found)
 
 
@@ -89,6 +101,25 @@ def semi_diameters(lens: Lens) -> list[float]:
             found[k] = reach if bare else (1 + percent / 100) * reach + length
     stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
     return [own if math.isnan(reach) else reach for reach, own in zip(found, stored, strict=True)]
+
+
+def rims(heights, ends: np.ndarray, is_glass: np.ndarray):
+    """mm (S,), of the edge of the gap behind every surface: of glass the larger of the clear heights of its two faces,
+    of air the smaller of the rims of the elements on both sides; a surface in air is its own rim.
+
+    heights: (S,) mm, clear heights of the surfaces, plain or dual; ends: (S,) the surface that ends each gap.
+    """
+    of_glass = np.maximum(heights, heights[ends])
+    start = np.arange(len(ends))
+    start[ends[is_glass]] = np.flatnonzero(is_glass)  # the front face of the glass in front of a surface
+    front = np.where(is_glass[start] & (start != np.arange(len(ends))), of_glass[start], heights)
+    of_element = np.maximum(front, np.where(is_glass, of_glass, heights))
+    return np.where(is_glass, of_glass, np.minimum(of_element, of_element[ends]))
+
+
+def edge_thickness(thickness, front, back):
+    """mm between two surfaces where their sags are `front` and `back`; of any number type."""
+    return thickness + (back - front)
 
 
 def _reaches(lens: Lens) -> list[float]:
@@ -126,46 +157,43 @@ def _edge_radius(surface: Surface) -> float:
     return min(float(end) if end < far else math.inf for end in ends)
 
 
-def _gaps(lens: Lens) -> list[tuple[int, int, float]]:
+def gaps(lens: Lens) -> list[tuple[int, int, float]]:
     """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
     indices = media(lens, lens.primary)
-    gaps, before, side = [], None, 1.0
+    pairs, before, side = [], None, 1.0
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
         if surface.is_break or surface.before is not None:
             before = None
         if surface.is_mirror or surface.phase is not None or not torch.equal(indices[k], indices[k - 1]):
             if before is not None:
-                gaps.append((before, k, side))
+                pairs.append((before, k, side))
             before = k
         side = -side if surface.is_mirror else side
         if surface.after is not None:
             before = None
-    return gaps
+    return pairs
 
 
-def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> list[Defect]:
-    """The defects of the gap between two surfaces."""
+def _of_gap(lens: Lens, k: int, end: int, side: float, medium: str, clear: float, rim: float) -> list[Defect]:
+    """The defects of the gap between two surfaces; clear, rim: mm, up to where light passes and where its edge is."""
     front, back = lens.surfaces[k], lens.surfaces[end]
     gap = side * sum(float(surface.thickness) for surface in lens.surfaces[k:end])
-    index = abs(float(media(lens, lens.primary)[k]))
-    medium = "glass" if index > 1.01 else "air"
     if gap < -_LEAST:
         return [Defect(k, "gap", gap, f"the {medium} between surfaces {k} and {end} is {gap:.6g} mm thick: negative")]
-    common = min(heights[k], heights[end])
-    if math.isnan(common) or not math.isfinite(gap):
+    if math.isnan(rim) or not math.isfinite(gap):
         return []
     for x, y in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)):
-        r = torch.linspace(0.0, common, _HEIGHTS, dtype=torch.float64)
-        left = gap + side * (_sag(back, x * r, y * r) - _sag(front, x * r, y * r))
-        if left.min() < -_LEAST:
-            at, least = float(r[left < 0][0]), float(left.min())
+        r = torch.linspace(0.0, rim, _HEIGHTS, dtype=torch.float64)
+        left = edge_thickness(gap, side * _sag(front, x * r, y * r), side * _sag(back, x * r, y * r))
+        within = left[r <= clear]
+        if within.min() < -_LEAST:
+            at, least = float(r[left < 0][0]), float(within.min())
             words = (
                 f"surfaces {k} and {end} cross {at:.4g} mm from the axis: {medium} of {least:.4g} mm within the edge"
             )
             return [Defect(k, "crossing", least, words)]
-        h, h_end = r.new_tensor(heights[k]), r.new_tensor(heights[end])
-        edge = gap + side * float(_sag(back, x * h_end, y * h_end) - _sag(front, x * h, y * h))
-        if medium == "glass" and edge < -_LEAST:
+        if left[-1] < -_LEAST:
+            edge = float(left[-1])
             words = f"the glass between surfaces {k} and {end} is {edge:.4g} mm thick at its edge: negative"
             return [Defect(k, "edge", edge, words)]
     return []
@@ -205,7 +233,7 @@ def frames(lens: Lens) -> list[Frame]:
     distance = lens.surfaces[0].thickness
     axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
     here = Frame(torch.zeros_like(axes[0]), axes)
-    found = [Frame(-distance * axes[2], axes)]
+    found = [_posed(Frame(-distance * axes[2], axes), lens.surfaces[0].before)]
     for surface in lens.surfaces[1:]:
         here = _posed(here, surface.before)
         found.append(here)

@@ -5,10 +5,12 @@ away loses no precision. With ray aiming they fill the stop, whose radius is tha
 marginal ray; where the axis bends they start towards the image of the stop about the base ray.
 
 Vignetting factors make an affine map of the pupil, p' = V + M p. Between the fields of a lens maps are interpolated,
-exact at its fields, continuous, and constant beyond the last one:
+exact at its fields, continuous, and constant beyond the last one; where the derivatives on both sides of a field
+differ, their mean is the derivative:
 
 - fields on one half-line from the axis (0, 14, 20 degrees along y): linearly in the distance from the axis, where the
-  pupil is whole if no field is listed there, and the ellipse turns with the field, as in a lens of revolution;
+  pupil is whole if no field is listed there; the change of the ellipse turns with the field, as in a lens of
+  revolution;
 - fields on both sides of the axis on one line: linearly along that line, at the foot of the perpendicular;
 - others: by weights 1/distance² of all fields (Shepard, 1968).
 
@@ -48,16 +50,17 @@ from raytrace.system.lens import (
     shared,
     wavelengths_of,
 )
+from raytrace.system.poses import point_out
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
-from raytrace.words import calling_level, named_value
+from raytrace.words import RaytraceWarning, calling_level, named_value
 
 
-class MarginalRayLost(UserWarning):
+class MarginalRayLost(RaytraceWarning):
     """The real marginal ray does not reach the stop, so that it cannot define its radius."""
 
 
@@ -222,6 +225,14 @@ def field_of_object(lens: Lens, extent: Tensor, paraxial: FirstOrder) -> Tensor:
     return torch.rad2deg(torch.atan(extent)) if kind == "angle" else extent
 
 
+def object_point(lens: Lens, height: Tensor) -> Tensor:
+    """The points (3, ...) mm of object heights (2, ...) mm along the object's axes, in the frame of surface 1."""
+    source = lens.surfaces[0]
+    point = [height[0], height[1], sag(source, dot_2(height, height))]
+    x, y, z = point if source.before is None else point_out(source.before, point)
+    return torch.stack(torch.broadcast_tensors(x, y, z - source.thickness))
+
+
 def _paraxial_scale(lens: Lens, paraxial: FirstOrder) -> Tensor | float:
     """`field_scale` of the kind of field of a lens."""
     return field_scale(
@@ -317,8 +328,7 @@ def _through_entrance_pupil(
     lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor, entrance: Entrance | None
 ) -> Rays:
     """Rays from a slope or object height (2, ...) to fractions (2, ...) of the entrance pupil, by default paraxial."""
-    distance = lens.surfaces[0].thickness
-    at_infinity = is_at_infinity(lens)
+    point = None if is_at_infinity(lens) else object_point(lens, field)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
     if lens.fields.telecentric:
         # The pupil is at infinity: equal cones about chief rays parallel to the axis.
@@ -327,19 +337,21 @@ def _through_entrance_pupil(
                 "object space is telecentric, which needs an aperture given as object NA or cone angle, not "
                 f"{lens.aperture.kind}"
             )
-        radius, depth = distance * torch.tan(cone_angle(lens, index)), torch.zeros_like(distance)
-        aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
+        radius, depth = -point[2] * torch.tan(cone_angle(lens, index)), torch.zeros_like(depth)
+        aim_x, aim_y = point[0] + radius * pupil[0], point[1] + radius * pupil[1]
     elif entrance is not None:
         aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
         depth = entrance.position
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
     # Not the index: all wavelengths start alike, and only their paths differ.
-    x, y, aim_x, aim_y, depth, distance = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
-    aim = torch.stack([aim_x, aim_y, depth])
-    if at_infinity:
+    if point is None:
+        distance = lens.surfaces[0].thickness
+        x, y, aim_x, aim_y, depth, _ = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
+        aim = torch.stack([aim_x, aim_y, depth])
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
-    point = torch.stack([x, y, sag(lens.surfaces[0], x * x + y * y) - distance])
+    *point, aim_x, aim_y, depth = torch.broadcast_tensors(*point, aim_x, aim_y, depth)
+    point, aim = torch.stack(point), torch.stack([aim_x, aim_y, depth])
     # Rays travel towards +z and start at the nearer of object point O and pupil point A. A virtual object lies behind
     # surface 1, and an entrance pupil may lie before the object: then light runs from A to O on the same line.
     rays = rays_from_point(point, aim, index=index)
@@ -389,18 +401,19 @@ def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
 
 @shared
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
-    """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...)."""
-    listed = torch.stack([lens.fields.x, lens.fields.y]).reshape(2, -1, *(1,) * (field.dim() - 1))
+    """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...), with the derivatives of the interpolation everywhere."""
+    listed = torch.stack([lens.fields.x, lens.fields.y])
     vdx, vdy, vcx, vcy, angle = lens.fields.vignetting
     angle = torch.deg2rad(angle)
     maps = torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy])
-    maps = _rotated(maps, torch.cos(angle), torch.sin(angle)).reshape(5, *listed.shape[1:])
+    first = (listed[:, :, None] == listed[:, None]).all(0).to(torch.int64).argmax(1)  # of equal fields it alone counts
+    maps = _rotated(maps, torch.cos(angle), torch.sin(angle))[:, first]
+    axes = (1,) * (field.dim() - 1)
+    listed, is_first = listed.reshape(2, -1, *axes), (first.diff(prepend=first[:1] - 1) > 0).reshape(-1, *axes)
+    between = _between(listed, maps.reshape(5, -1, *axes), is_first, field[:, None])
     same = (listed == field[:, None]).all(0)
-    first = same & (same.to(torch.int64).cumsum(0) == 1)
-    listed_ones, known = torch.where(first, maps, 0.0).sum(1), same.any(0)
-    if not is_any(~known):
-        return listed_ones
-    return torch.where(known, listed_ones, _between(listed, maps, field[:, None]))
+    rounding = maps[:, same.to(torch.int64).argmax(0)] - between
+    return between + torch.where(same.any(0), rounding, 0.0).detach()
 
 
 def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
@@ -417,8 +430,11 @@ def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
     )
 
 
-def _between(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
-    """Maps (5, ...) by the rule that applies; listed: (2, F, ...), maps: (5, F, ...), field: (2, 1, ...)."""
+def _between(listed: Tensor, maps: Tensor, is_first: Tensor, field: Tensor) -> Tensor:
+    """Maps (5, ...) by the rule that applies; listed: (2, F, ...), maps: (5, F, ...), field: (2, 1, ...).
+
+    is_first: (F, ...), whether no equal field is listed before.
+    """
     radius = safe_sqrt(dot_2(listed, listed))
     largest, place = radius.max(0, keepdim=True)
     x, y = (safe_divide(torch.gather(part, 0, place), largest) for part in listed)
@@ -427,40 +443,53 @@ def _between(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
     on_line = (across.abs() <= _OFF_LINE * largest).all(0)
     one_sided = (along >= -_OFF_LINE * largest).all(0)
     by_radius = _by_radius(radius, maps, line, field)
-    by_line = _linear(along, maps, dot_2(line, field))
-    # Weights 1/distance², relative to the nearest so that none overflows.
+    by_line = _at_least(maps, along)[:, 0] + _rise(along, maps, dot_2(line, field))
+    # Weights 1/distance², relative to the nearest, which has 1: smooth, and level at the fields.
     distance = dot_2(listed - field, listed - field)
-    weight = safe_divide(distance.amin(0).expand_as(distance), distance)
-    by_distance = safe_divide((weight * maps).sum(1), weight.sum(0))
+    nearest, place = distance.min(0, keepdim=True)
+    weight = is_first * safe_divide(nearest, distance).scatter(0, place, 1.0)
+    by_distance = (weight * maps).sum(1) / weight.sum(0)
     return torch.where(on_line, torch.where(one_sided, by_radius, by_line), by_distance)
 
 
 def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Tensor:
-    """Linear in the distance from the axis, turned with the field; an axis that is not listed has the whole pupil."""
-    axis = torch.where((radius == 0).any(0, keepdim=True), -1.0, 0.0).to(radius.dtype)
+    """Linear in the distance r from the axis, the change from the axis turned by R from the line to the field:
+
+        V = V₀ + R (V(r) - V₀),   M = M₀ + R (M(r) - M₀) Rᵀ
+
+    An axis that is not listed has the whole pupil.
+    """
     whole = maps.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0]).reshape(5, *(1,) * (maps.dim() - 1))
+    axis = torch.where(radius.amin(0, keepdim=True) == 0, _at_least(maps, radius), whole)
     size = safe_sqrt(dot_2(field, field))
-    interpolated = _linear(torch.cat([axis, radius]), torch.cat([whole.expand(5, *axis.shape), maps], 1), size)
-    cosine = torch.where(size > 0, safe_divide(dot_2(line, field), size), 1.0)
-    return _rotated(interpolated, cosine[0], safe_divide(_cross(line, field), size)[0])
+    # Up to the nearest field the change is proportional to r, on the axis too.
+    r = torch.where(size > 0, size, torch.where(radius > 0, radius, torch.inf).amin(0, keepdim=True))
+    rise = _rise(torch.cat([torch.zeros_like(radius[:1]), radius]), torch.cat([axis, maps], 1), r)
+    x, y, *matrix = _rotated(rise / r[0], dot_2(line, field)[0], _cross(line, field)[0])
+    return axis[:, 0] + torch.stack([x, y, *(safe_divide(part, size[0]) for part in matrix)])
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     return a[0] * b[1] - a[1] * b[0]
 
 
-def _linear(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
-    """Maps (5, ...) linear between knots (F, ...) in any order, constant outside; at: (1, ...)."""
-    at = torch.minimum(torch.maximum(at, knots.amin(0)), knots.amax(0))
-    low, below = torch.where(knots <= at, knots, -torch.inf).max(0, keepdim=True)
-    high, above = torch.where(knots >= at, knots, torch.inf).min(0, keepdim=True)
-    share = safe_divide(at - low, high - low)
-    shape = (5, *below.shape)
-    first, last = (
-        torch.gather(maps.expand(5, maps.shape[1], *below.shape[1:]), 1, index.expand(shape))
-        for index in (below, above)
-    )
-    return ((1 - share) * first + share * last)[:, 0]
+def _at_least(maps: Tensor, knots: Tensor) -> Tensor:
+    """The map (5, 1, ...) of the smallest of knots (F, ...)."""
+    place = knots.argmin(0, keepdim=True)
+    return torch.gather(maps, 1, place.expand(5, *place.shape))
+
+
+def _rise(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
+    """Maps (5, ...) at (1, ...), less that of the smallest knot; linear between knots (F, ...), constant outside.
+
+    The derivative at a knot is the mean of those on both sides.
+    """
+    knots, order = knots.sort(0)
+    maps = torch.gather(maps, 1, order.expand_as(maps))
+    width = knots.diff(dim=0)
+    # Equal arguments of maximum and minimum have half of the derivative each.
+    beyond = torch.minimum(torch.maximum(at - knots[:-1], torch.zeros_like(at)), width)
+    return (safe_divide(beyond, width) * maps.diff(dim=1)).sum(1)
 
 
 #: Deviation of the beam from the stop without a warning, as a fraction of its semi-diameter.
@@ -469,7 +498,7 @@ TOLERANCE = 0.02
 MOST_FIELDS = 64  # measured per call: a map of the field has thousands
 
 
-class UnfilledStop(UserWarning):
+class UnfilledStop(RaytraceWarning):
     """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
 
     of_result = True  # about a result: not printed with an error that ends the command
@@ -508,7 +537,13 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
-    """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
+    """Warn UnfilledStop by the words of `unfilled`, if there are any."""
+    if words := unfilled(lens, fields, ray_aiming=ray_aiming):
+        warnings.warn(words, UnfilledStop, stacklevel=calling_level())
+
+
+def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> str:
+    """Words for the field of (2, F) that misses the stop most, if it does by more than TOLERANCE; else empty.
 
     Of more than MOST_FIELDS fields so many are measured, and the largest one. Fields without rays at the stop are left
     to LostRays. Nothing is traced if rays are aimed, if object space is telecentric, and where a derivative by numbers
@@ -516,10 +551,12 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
     """
     lens = with_ray_aiming(lens, ray_aiming)
     if any(map(varies, pytree.tree_leaves((lens, fields)))) or lens.fields.telecentric or aiming_of(lens) != "off":
-        return
+        return ""
     if fields.shape[1] > MOST_FIELDS:
         spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
         fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
+    if lens.count == 0:
+        return
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most
@@ -527,16 +564,14 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         radius = beams.radius.expand(len(worst), 1, 1, 1)[at, 0, 0, 0]
         beams, worst = Filling(beams.chief[at], beams.marginal[at], beams.lost[at], radius), worst[at]
     if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
-        return
+        return ""
     at = int(worst.argmax())
     named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
     many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
-    warnings.warn(
+    return (
         f"field {named}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
         f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
-        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
-        UnfilledStop,
-        stacklevel=calling_level(),
+        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')"
     )
 
 

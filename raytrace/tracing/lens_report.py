@@ -9,10 +9,10 @@ from torch import Tensor
 
 from raytrace.materials.environment import in_words
 from raytrace.materials.glass import label
-from raytrace.maths.numerics import detached, value
+from raytrace.maths.numerics import detached, summary, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, is_round_about_axis, media
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
 from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
@@ -21,7 +21,7 @@ from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import LINES, first_order
 from raytrace.tracing.trace import aiming_of
 
 #: Descriptions of phases and sag terms with their numbers; others are described by their class alone.
@@ -101,26 +101,10 @@ def _fields(part) -> dict:
     return document
 
 
-#: Lines of `raytrace info`: text, entry of FirstOrder (or the real working F/#), unit.
+#: Lines of `raytrace info`: those of first-order data, with the real working F/#.
 FIRST_ORDER_LINES = (
-    ("effective focal length", "effective_focal_length", "mm"),
-    ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
-    ("front focal distance", "front_focal_distance", "mm, from surface 1"),
-    ("F/#", "f_number", "focal length / entrance pupil diameter"),
-    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
-    ("working F/#", "working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
-    ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
-    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
-    ("exit pupil position", "exit_pupil_position", "mm, from the image"),
-    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
-    ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
-    ("magnification", "magnification", ""),
-    ("angular magnification", "angular_magnification", "u'/u of the chief ray"),
-    ("optical invariant", "optical_invariant", "mm, of the largest field"),
-    ("object NA", "object_na", ""),
-    ("image NA", "image_na", ""),
-    ("Petzval radius", "petzval_radius", "mm"),
-)
+    *LINES[:5], ("working F/#", "working_f_number", "1/(2 n' sin θ') of the real marginal ray"), *LINES[5:]
+)  # fmt: skip
 
 #: Lines of a lens whose axis bends, or whose sections differ: text, entry of BaseRay, unit.
 BASE_RAY_LINES = (
@@ -173,6 +157,7 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
+            "telecentric": _telecentric(lens),
             "ray_aiming": lens.ray_aiming,
             "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
@@ -220,6 +205,7 @@ class Info(Result):
         lines += [
             f"  {'wavelengths':<24} {', '.join(shown)} µm"
             + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
+            *([f"  {'telecentric':<24} in {' and '.join(spaces)} space"] if (spaces := _telecentric(lens)) else []),
             f"  {'ray aiming':<24} {aiming}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
@@ -242,7 +228,7 @@ def text(lens: Lens) -> str:
     try:
         return str(Info(lens))
     except (ValueError, RuntimeError):
-        return repr(lens)
+        return summary(lens)
 
 
 def _configuration(lens: Lens) -> dict[str, int]:
@@ -279,6 +265,15 @@ def _figures(lens: Lens) -> list[float]:
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 
+def _telecentric(lens: Lens) -> list[str]:
+    """The spaces in which chief rays are parallel: where the pupil is a thousand lengths of the lens away, and more."""
+    data = first_order(lens)
+    far = 1e3 * max(sum(abs(float(surface.thickness)) for surface in lens.surfaces[1:-1]), 1.0)
+    object_space = lens.fields.telecentric or abs(float(data.entrance_pupil_position)) > far
+    image_space = abs(float(data.exit_pupil_position)) > far
+    return [*["object"] * object_space, *["image"] * image_space]
+
+
 def _base_ray_document(lens: Lens) -> dict:
     """(tangential, sagittal) of every figure, null for those that do not exist."""
     if is_round_about_axis(lens):  # the sections agree with the straightened lens
@@ -308,6 +303,8 @@ def _remarks(lens: Lens, k: int) -> str:
     if surface.conic is not None:
         parts.append(f"conic {float(surface.conic):g}")
     parts += remarks(surface)
+    if k == len(lens.surfaces) - 1 and (unused := glass_on_image(lens)):
+        parts.append(f"light does not enter {unused}")
     if surface.environment is not None:
         parts.append(f"in {in_words(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]

@@ -11,13 +11,39 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import quotient, select, value, value_of
-from raytrace.maths.result import flat
+from raytrace.maths.result import Column, Result, Table, flat
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, shared
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
+#: Lines of a report: text, entry of FirstOrder, unit; further ones are printed of first-order data alone.
+LINES = (
+    ("effective focal length", "effective_focal_length", "mm"),
+    ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
+    ("front focal distance", "front_focal_distance", "mm, from surface 1"),
+    ("F/#", "f_number", "focal length / entrance pupil diameter"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
+    ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
+    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
+    ("exit pupil position", "exit_pupil_position", "mm, from the image"),
+    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
+    ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
+    ("magnification", "magnification", ""),
+    ("angular magnification", "angular_magnification", "u'/u of the chief ray"),
+    ("optical invariant", "optical_invariant", "mm, of the largest field"),
+    ("object NA", "object_na", ""),
+    ("image NA", "image_na", ""),
+    ("Petzval radius", "petzval_radius", "mm"),
+)
+FURTHER_LINES = (
+    ("power", "power", "1/mm"),
+    ("height at the stop", "stop_height", "mm, of the marginal ray"),
+    ("front principal plane", "front_principal_plane", "mm, from surface 1"),
+    ("rear principal plane", "rear_principal_plane", "mm, from the last surface before the image"),
+)
+
 
 @value
-class FirstOrder:
+class FirstOrder(Result):
     """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
 
     power: -ω′/y₁ in 1/mm.
@@ -59,11 +85,24 @@ class FirstOrder:
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
 
-    def to_frame(self):
-        """The data for pandas, a row for each wavelength; lengths in mm."""
-        import pandas
+    def columns(self) -> dict[str, Tensor]:
+        """A row for each wavelength and lens."""
+        return {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
 
-        return pandas.DataFrame(flat({entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}))
+    def column(self, name: str) -> Column:
+        unit = next(unit for _, entry, unit in (*LINES, *FURTHER_LINES) if entry == name)
+        return Column(name, next((length for length in ("1/mm", "mm") if unit.startswith(length)), ""))
+
+    def tables(self) -> list[Table]:
+        """A line for each quantity: its number, of several lenses or wavelengths the least and the largest."""
+        figures = flat(self.columns())
+        lines, count = (*LINES, *FURTHER_LINES), len(figures["power"])
+        ends = {"": min} if count == 1 else {"least": min, "largest": max}
+        printed: dict = {Column("quantity", form="<", heading=" "): [words for words, *_ in lines]}
+        for name, end in ends.items():
+            printed[Column(name, form=".9g")] = [end(figures[entry]) for _, entry, _ in lines]
+        printed[Column("unit", form="<", heading=" ")] = [unit for *_, unit in lines]
+        return [Table(printed, [f"first-order data of {count} lenses or wavelengths"] if count > 1 else ())]
 
 
 def brackets(powers: Sequence, gaps: Sequence) -> tuple:
@@ -251,6 +290,10 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     else:
         at_object = lens.fields.kind == "object_height"
         invariant = (n_object * slope_object if at_object else n_image * slope_image) * largest
+    # Of an entrance pupil at infinity the exit pupil is as large as the axial beam there.
+    finite, exit_distance = torch.isfinite(diameter), data.exit_pupil_distance
+    beam = 2 * (scale * (A + data.B * vergence) + slope_image * exit_distance).abs()
+    exit_diameter = torch.where(finite, torch.where(finite, diameter, 1.0) * data.pupil_magnification, beam)
     petzval = petzval_sum([vertex_curvature(s) for s in surfaces], n) * torch.ones_like(n_object)
     return FirstOrder(
         power=-C,
@@ -259,8 +302,8 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         front_focal_distance=n_object * D / C,
         entrance_pupil_position=data.entrance_pupil_position,
         entrance_pupil_diameter=diameter,
-        exit_pupil_position=data.exit_pupil_distance - surfaces[-1].thickness,
-        exit_pupil_diameter=diameter * data.pupil_magnification,
+        exit_pupil_position=exit_distance - surfaces[-1].thickness,
+        exit_pupil_diameter=exit_diameter,
         stop_height=0.5 * diameter * data.front[0],
         f_number=focal_length.abs() / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),

@@ -14,7 +14,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import Crossing, lens_steps
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 #: Status of a ray, and its wording at a surface.
 FATES = {
@@ -31,7 +31,7 @@ LOST = ("miss", "tir", "vignetted")
 _RINGS = 8  # of the rays that try a field
 
 
-class LostRays(UserWarning):
+class LostRays(RaytraceWarning):
     """Rays do not reach the sensor; the message says which, where they end and what helps."""
 
 
@@ -145,7 +145,7 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
     primary = lens.primary[None]
     F, P = tried.shape[1], pupil.shape[1]
-    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
+    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer `fields`")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of aiming: the failures are reported below
         found = ray_failures(lens, pupil, fields=tried, wavelengths=primary)

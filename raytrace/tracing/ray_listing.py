@@ -25,14 +25,14 @@ from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import STATUS, LostRays
 from raytrace.tracing.trace import axial_path, sequence_of, steps, trace_lens
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))
 _LOST = {_MISS: "missed", _TIR: "were totally reflected at", _VIGNETTED: "were vignetted at"}
 _BATCH = 20_000  # rays whose table is held at a time
 
 
-class ChangesNothing(UserWarning):
+class ChangesNothing(RaytraceWarning):
     """An option has no effect on the result."""
 
 

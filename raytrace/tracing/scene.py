@@ -365,7 +365,7 @@ def symmetry(scene: Scene) -> str:
     other. Fields, vignetting factors and aperture centres that are differentiated break it; a surface of a kind that is
     not round has none, whatever its numbers.
     """
-    return _FOLDS[int(scene.largest(torch.tensor(_FOLDS.index(_symmetry(scene)))))]
+    return _FOLDS[int(scene.largest(torch.tensor(_FOLDS.index(_symmetry(scene)), device="cpu")))]
 
 
 def _symmetry(scene: Scene) -> str:

@@ -11,12 +11,11 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford, afford_rays
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
-from raytrace.system.lens import Lens, field_points, media
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
-from raytrace.tracing.trace import is_bent, sequence_of, trace_surfaces, without_apertures
+from raytrace.tracing.trace import is_bent, trace_lens, without_apertures
 
 
 @value
@@ -110,25 +109,15 @@ def _power_of_two(vectors: Tensor) -> Tensor:
 
 
 def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
-    """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
+    """Rays (3, F, W, P) on the sensor; arguments as for `launch`.
 
-    The image surface does not refract: the sensor may touch glass. Raises budget.OverBudget for
-    more rays than memory holds.
+    Raises budget.OverBudget for more rays than memory holds.
     """
-    surfaces, rays, arguments = to_image(lens, pupil, fields=fields, wavelengths=wavelengths)
-    return trace_surfaces(surfaces, rays, **arguments)
-
-
-def to_image(
-    lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None
-) -> tuple[Sequence[Surface], Rays, dict]:
-    """The surfaces to the sensor, the launched rays, and the other arguments of `trace_surfaces`, of `image_rays`."""
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     count = lens.fields.y.numel() if fields is None else fields.shape[1]
     afford_rays(pupil.shape[-1], fields=count, wavelengths=len(wavelengths))
-    indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    return sequence_of(lens), rays, {"indices": [*indices[:-1], indices[-2]], "wavelength": wavelengths[:, None]}
+    return trace_lens(lens, rays, wavelengths[:, None])
 
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status
@@ -192,11 +181,14 @@ def arrivals(
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
     each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
     for field in progress(fields.unbind(1)):
-        rays = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
-        reached = rays.valid
-        for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
-            reached = reached & ~crossing.missed & ~crossing.totally_reflected
-            on_sensor = crossing.rays, status, reached
+        launched = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
+        rays = trace_lens(lens, launched, lens.wavelengths[:, None])
+        on_sensor = rays, torch.zeros_like(rays.valid, dtype=torch.int64), rays.valid
+        if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails
+            reached = launched.valid
+            for crossing, status in ray_status(lens, launched, lens.wavelengths[:, None]):
+                reached = reached & ~crossing.missed & ~crossing.totally_reflected
+                on_sensor = crossing.rays, status, reached
         each.append(on_sensor)
     joined = Rays(
         torch.cat([rays.position for rays, *_ in each], -3),

@@ -238,15 +238,20 @@ def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]
     return steps(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
 
 
+def lens_task(lens: Lens, rays: Rays, wavelength: Tensor) -> Task | None:
+    """The surfaces and rays of `trace_lens` as the compiled trace takes them; None where it does not carry them."""
+    surfaces = sequence_of(lens)
+    if not all(map(is_expressible, surfaces)):
+        return None
+    return task_of(surfaces, rays, indices=media(lens, wavelength), wavelength=wavelength)
+
+
 def points_on_surfaces(lens: Lens, rays: Rays, wavelength: Tensor) -> Tensor | None:
     """Points (3, K, ...) mm of rays before surface 1 on the K surfaces after the object, each in its own axes.
 
     By the compiled trace, without gradients; None where it does not carry these rays, or where one is lost.
     """
-    surfaces = sequence_of(lens)
-    if not all(map(is_expressible, surfaces)):
-        return None
-    task = task_of(surfaces, rays, indices=media(lens, wavelength), wavelength=wavelength)
+    surfaces, task = sequence_of(lens), lens_task(lens, rays, wavelength)
     if task is None or not _is_compiled(surfaces, task):
         return None
     no_changes = task.inputs[3].new_empty(0, *task.inputs[3].shape)
@@ -317,8 +322,11 @@ def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ..
 
 
 def is_bent(lens: Lens) -> bool:
-    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
-    return _bends(lens, lens.surfaces)
+    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray.
+
+    A tilted object counts, whose image along the axis depends on the field.
+    """
+    return is_posed(lens.surfaces[0]) or _bends(lens, lens.surfaces)
 
 
 def aiming_of(lens: Lens) -> str:
@@ -336,7 +344,7 @@ def aiming_of(lens: Lens) -> str:
 
 def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
     """Whether the first surfaces of a lens, which these are, bend its axis."""
-    if any(map(is_posed, surfaces)):
+    if any(map(is_posed, surfaces[1:])):
         return True
     if all(map(is_round, surfaces)):
         return False

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from raytrace.maths import zernike
 from raytrace.maths.numerics import dot, root, safe_divide, safe_sqrt, unit, value
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays
 from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.clear_pupil import arms_of, is_clipped
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, beam_share, trace_scene
 from raytrace.tracing.spot import where_lit
@@ -99,7 +101,8 @@ def wavefront_of(
         centre, radius = _reference_sphere(scene, rays, usable)
     else:
         alone = dataclasses.replace(scene, wavelengths=reference.reshape(1), memo=None)
-        centre, radius = _reference_sphere(alone, *_on_sensor(alone, with_chief))
+        common = with_chief if pupil.dim() == 2 else with_chief[:, :, :, :1]
+        centre, radius = _reference_sphere(alone, *_on_sensor(alone, common))
     index = media(scene.lens, scene.wavelengths)[-2]
     path = path_to_reference_sphere(rays, centre, 1 / radius, index[:, None])
     opd = torch.where(rays.valid, path - _at_chief(path, rays.valid, usable), 0.0)
@@ -120,6 +123,20 @@ def wavefront_of(
         wavelength=scene.wavelengths,
         index=index,
     )
+
+
+def clear_wavefront(scene: Scene, rings: int, arms: int, *, reference: Tensor | None = None) -> Wavefront:
+    """The wavefront at points that integrate over the clear pupil: `rms` of it is that of all light that arrives.
+
+    Gauss rings and arms where every ray of the scene arrives, else nodes on the clear parts of the arms, see
+    `tracing.clear_pupil`, whose edges move with the lens: derivatives are those of the integral. reference: as for
+    `wavefront_of`.
+    """
+    points, weights = gauss_rings(rings, arms, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
+    front = wavefront_of(scene, points, weights, reference=reference)
+    if scene.everywhere(front.valid.all()) and not is_clipped(scene, points[:, -1:]):
+        return front
+    return wavefront_of(scene, *arms_of(scene, arms).rule(rings), reference=reference)
 
 
 def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:

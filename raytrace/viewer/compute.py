@@ -6,7 +6,6 @@ the warnings of the analyses, `remarks`.
 
 import dataclasses
 import math
-import warnings
 from contextlib import suppress
 
 import numpy as np
@@ -28,16 +27,16 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, computed_once, field_label, field_points, shared
 from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
-from raytrace.tracing.geometry import warn_of_defects
-from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.geometry import defects
+from raytrace.tracing.launch import unfilled
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
-from raytrace.viewer.state import State, shown_fields, word_of
+from raytrace.viewer.state import State, shown_fields, slider_ends, word_of
 
 _detached = shared(detached)
 
 #: Rays of a fan and of a field in the layout, rings of dots, fields of a curve, frequencies of the MTF.
-FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 21
+FAN, RAYS, RINGS, FIELDS, FREQUENCIES = 33, 7, 8, 17, 81
 _DIGITS = 5  # of the cross section
 
 
@@ -177,8 +176,7 @@ def first_order_of(lens: Lens) -> list[dict]:
 
 def refresh(state: State) -> dict:
     """All numbers that follow an edit. Analyses that the lens does not have are None, with reasons in `problems`."""
-    with torch.no_grad(), computed_once(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # `remarks` has them
+    with torch.no_grad(), computed_once():
         analyses, problems = _analyses(state.lens, state.frequency)
         stored = _analyses(state.stored, state.frequency)[0] if state.compare else None
         shown = {"prescription": prescription(state), "analyses": analyses, "stored": stored}
@@ -215,7 +213,7 @@ def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
     }.items():
         try:
             found[name] = analysis()
-        except (ValueError, RuntimeError) as error:
+        except (ValueError, RuntimeError, ArithmeticError) as error:
             found[name] = None
             problems.append(str(error))
     dark = [f for f, radius in enumerate(found["spots"]["rms"] if found["spots"] else ()) if radius is None]
@@ -232,13 +230,7 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 def mtf_of_field(state: State, field: int) -> dict:
     """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
     found = {"field": field, "mtf": None}
-    with (
-        torch.no_grad(),
-        computed_once(),
-        warnings.catch_warnings(),
-        suppress(ValueError, RuntimeError),
-    ):  # as `refresh` reports
-        warnings.simplefilter("ignore")
+    with torch.no_grad(), computed_once(), suppress(ValueError, RuntimeError, ArithmeticError):  # as `refresh` reports
         lens = _simple(state.lens)
         fields = shown_fields(lens)
         radius = field_spots(lens, fields=fields, rings=1)[0].geometric_radius.nan_to_num(0.0).max()
@@ -248,13 +240,10 @@ def mtf_of_field(state: State, field: int) -> dict:
 
 
 def remarks(state: State) -> list[str]:
-    """The warnings of the analyses: rays that miss the stop, surfaces and gaps that cannot be made."""
+    """Rays that miss the stop, surfaces and gaps that cannot be made."""
     lens = _detached(state.lens)
-    with torch.no_grad(), computed_once(), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warn_of_filling(lens, field_points(None, like=lens))
-        warn_of_defects(lens)
-    return [*dict.fromkeys(str(one.message) for one in caught)]
+    with torch.no_grad(), computed_once():
+        return [*filter(None, [unfilled(lens, field_points(None, like=lens))]), *(one.words for one in defects(lens))]
 
 
 # -- the prescription
@@ -273,11 +262,15 @@ def prescription(state: State) -> dict:
             numbers |= {name: number_at(surface, path) for name, path in paths}
         if surface.is_break:
             numbers = {name: one for name, one in numbers.items() if name not in ("curvature", "conic")}
+        numbers = {name: 0.0 if one is None else float(one) for name, one in numbers.items()}
         here = [{word.split(":")[0] for word in words if word.endswith(f":{k}")} for words in (state.vary, follows)]
         rows.append(
             {
                 "surface": k,
-                "cells": {name: plain(0.0 if one is None else float(one)) for name, one in numbers.items()},
+                "cells": {name: plain(one) for name, one in numbers.items()},
+                "sliders": {
+                    name: slider_ends(lens, k, name, one) for name, one in numbers.items() if math.isfinite(one)
+                },
                 "glass": None if k == last or surface.is_break else label(surface.glass),
                 "semi_diameter": surface.semi_diameter,
                 "comment": surface.comment,
@@ -295,6 +288,7 @@ def prescription(state: State) -> dict:
         "aperture": {
             "kind": lens.aperture.kind,
             "value": float(lens.aperture.value),
+            "slider": [0.4 * float(lens.aperture.value), 1.6 * float(lens.aperture.value)],
             "kinds": [*dict.fromkeys((lens.aperture.kind, "image_f_number", "entrance_pupil_diameter"))],
         },
         "configuration": lens.current_configuration,

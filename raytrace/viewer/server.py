@@ -10,6 +10,7 @@ import json
 import secrets
 import socket
 import sys
+import warnings
 import webbrowser
 from collections import OrderedDict
 from pathlib import Path
@@ -21,7 +22,7 @@ from raytrace.viewer.session import Session
 
 STATIC = Path(__file__).parent / "static"
 _TYPES = {"viewer.js": "text/javascript", "viewer.css": "text/css"}
-_MOST_SESSIONS, _MOST_BYTES = 32, 1_000_000
+_MOST_SESSIONS, _MOST_BYTES, _LONGEST_NAME = 32, 1_000_000, 64
 
 
 class MissingExtra(ImportError):
@@ -85,10 +86,13 @@ def application(lens: Lens, file: Path | None, token: str, port: int):
             if len(body) > _MOST_BYTES:
                 return Response("refused: the event is too long", 413)
         try:
-            message = json.loads(body)
-            name, happened = str(message["session"])[:64], dict(message["event"])
-        except (ValueError, KeyError, TypeError):
-            return Response("refused: expected an event as JSON", 400)
+            match json.loads(body):
+                case {"session": str(name), "event": dict(happened)} if len(name) <= _LONGEST_NAME:
+                    pass
+                case _:
+                    raise ValueError
+        except (ValueError, RecursionError):
+            return Response("refused: expected a session and an event as JSON", 400)
         if name not in sessions:
             sessions[name] = Session(lens, file)
         sessions.move_to_end(name)
@@ -123,6 +127,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
     print(json.dumps({"address": address}) if as_json else f"{address}\nCtrl-C ends the viewer", flush=True)
     if browser:
         webbrowser.open(address)
+    warnings.simplefilter("ignore")  # the page lists them as remarks, and sessions share the filters
     torch.set_num_threads(1)  # of small batches of rays more threads wait for each other: measured in docs/viewer.md
     settings = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1)
     with contextlib.suppress(KeyboardInterrupt):

@@ -1,24 +1,50 @@
 """Session of the viewer: a state with its file and its optimisation. An event of the page gives a reply for it."""
 
 import dataclasses
+import os
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from raytrace.io import write_lens
+from raytrace.io import WRITTEN, write_lens
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.optimize import Optimized, optimize
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 from raytrace.viewer.compute import mtf_of_field, refresh, remarks
-from raytrace.viewer.state import State, edited, initial, merit_of, reduce, variables
+from raytrace.viewer.state import (
+    EVENTS,
+    FIELD,
+    FLAG,
+    TEXT,
+    WHOLE,
+    Event,
+    State,
+    edited,
+    in_words,
+    initial,
+    merit_of,
+    reduce,
+    refusal,
+    requirements,
+    variables,
+)
 
-#: Analyses change the filters of warnings, which all threads share: one event is answered at a time.
-_ONE_AT_A_TIME = threading.Lock()
+#: All events: those of a session, beside those of its state.
+SESSION_EVENTS = {
+    "open": Event({}),
+    "save": Event({"path": TEXT, "overwrite": FLAG}),
+    "settle": Event({"field": FIELD}),
+    "optimise": Event({}),
+    "progress": Event({"cycles": WHOLE}),
+    "stop": Event({}),
+    **EVENTS,
+}
 #: Events that change what is shown but not the lens: they are answered while an optimisation runs.
 _VIEWS = ("open", "compare", "frequency")
+_SHOWN = 4  # requirements of the file that are listed
 
 
 class Optimisation:
@@ -26,6 +52,8 @@ class Optimisation:
 
     def __init__(self, state: State):
         self.lens, self.merits, self.is_stopped = state.lens, [], False
+        rows = [row for row in requirements(state.lens) if row.weight != 0]
+        self.required = [*dict.fromkeys(map(in_words, rows))]
         self.result: Optimized | None = None
         self.failure = ""
         self.thread = threading.Thread(target=self._run, args=(state,), daemon=True)
@@ -50,8 +78,15 @@ class Optimisation:
             missed = [str(one) for one in self.result.conditions if not one.met]
             before, after = self.result.merit_before, self.result.merit_after
             reason = STOPPED[self.result.stopped]
-            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *missed])
-        return f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
+            return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *self._of_file, *missed])
+        running = f"{count}, merit {self.merits[-1]:.6g}" if self.merits else "before the first cycle"
+        return "; ".join([running, *self._of_file])
+
+    @property
+    def _of_file(self) -> list[str]:
+        """The requirements of the file, in words."""
+        more = f", and {len(self.required) - _SHOWN} more" if len(self.required) > _SHOWN else ""
+        return [f"with {', '.join(self.required[:_SHOWN])}{more} of the file"] if self.required else []
 
 
 class Session:
@@ -60,11 +95,12 @@ class Session:
     def __init__(self, lens: Lens, file: Path | None = None):
         prepare()
         self.state, self.file, self.optimisation = initial(lens), file, None
+        self._lock = threading.Lock()
 
     def answer(self, event: Mapping) -> dict:
-        """The reply to an event: `message`, and what changed."""
-        started = time.perf_counter()
-        with _ONE_AT_A_TIME:
+        """The reply to an event: `message`, and what changed. Sessions answer at the same time, each in its thread."""
+        with self._lock:
+            started = time.perf_counter()
             reply = self._answer(event)
         return {"message": "", **reply, "milliseconds": 1e3 * (time.perf_counter() - started)}
 
@@ -74,14 +110,16 @@ class Session:
         return self.state if self.optimisation is None else dataclasses.replace(self.state, lens=self.optimisation.lens)
 
     def _answer(self, event: Mapping) -> dict:
-        kind = event.get("type")
+        if words := refusal(event, SESSION_EVENTS):
+            return {"message": words}
+        kind = event["type"]
         if kind == "save":
-            return {"message": self.save(str(event.get("path") or ""), overwrite=bool(event.get("overwrite")))}
+            return {"message": self.save(event.get("path", ""), overwrite=event.get("overwrite", False))}
         if kind == "settle":  # field by field, so that no drag waits for long
             field = event.get("field")
-            return {"remarks": remarks(self.state)} if field is None else mtf_of_field(self.state, int(field))
+            return {"remarks": remarks(self.state)} if field is None else mtf_of_field(self.state, field)
         if kind in ("progress", "stop"):
-            return self._progress(int(event.get("cycles") or 0), stop=kind == "stop")
+            return self._progress(event.get("cycles", 0), stop=kind == "stop")
         if self.optimisation is not None and kind not in _VIEWS:
             return {"message": "an optimisation is running: stop it, or wait for its end"}
         if kind == "optimise":
@@ -91,7 +129,7 @@ class Session:
             return self._progress(0)
         if kind == "open":
             path = str(self.file.with_stem(f"{self.file.stem}_edited")) if self.file else "lens.zmx"
-            return {**refresh(self.shown), "path": path, **self._progress(0)}
+            return {**refresh(self.shown), "path": path, "formats": WRITTEN, **self._progress(0)}
         self.state = reduce(self.state, event)
         return {**refresh(self.shown), **({"refused": True} if self.state.message else {})}
 
@@ -114,7 +152,7 @@ class Session:
 
     def save(self, path: str, *, overwrite: bool = False) -> str:
         """Write the lens in the format of the suffix; a file that exists is replaced if `overwrite`. In words."""
-        target = Path(path).expanduser()
+        target = Path(os.path.expanduser(path))  # which leaves the home of an unknown user as it is
         if not path.strip():
             return "save: give the name of a file, as lens.zmx"
         if target.is_file() and not overwrite:

@@ -1,7 +1,8 @@
 """State of the viewer: a lens that is edited, and the function from a state and an event to the next state.
 
-An event is a mapping with a `type`, a key of EVENTS, as the page sends it. Numbers are named as in the variable syntax:
-a surface and a quantity of `parameter_paths`. An event that cannot be carried out changes nothing but `message`.
+An event is a mapping with a `type`, a key of EVENTS, as the page sends it; `refusal` checks its parts by their kinds.
+Numbers are named as in the variable syntax: a surface and a quantity of `parameter_paths`. An event that cannot be
+carried out changes nothing but `message`.
 """
 
 import dataclasses
@@ -9,24 +10,40 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.analysis.mtf import frequency_range
-from raytrace.optimization.merit import KINDS, DefaultMerit
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, arguments, merit_for
+from raytrace.optimization.operands.mtf import MODULATION
+from raytrace.optimization.operands.rays import RAYS
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.operands.wavefront import PATH, QUALITY
 from raytrace.optimization.variables import Model, freedom, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
-from raytrace.system.optimization_data import Vary
+from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
+from raytrace.tracing.geometry import gaps
 from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
+from raytrace.words import named_value
+
+#: Operands of the quality of the image, which a chosen merit function replaces.
+OF_IMAGE = {
+    *(name for name in RAYS if name[:3] in ("TRA", "TRC", "ANA", "ANC")),
+    *(name for table in (PATH, QUALITY, MODULATION) for name in table),
+}
 
 #: Steps of undo that are kept.
 DEPTH = 500
+#: Fields and wavelengths of a lens, as many as OpticStudio admits; cycles/mm of an MTF; mm of a gap.
+MOST_FIELDS, MOST_WAVELENGTHS, HIGHEST, FARTHEST = 200, 24, 1e5, 1e6
+_LONGEST = 4096  # characters of a text
 
 
 @dataclass(frozen=True)
@@ -59,7 +76,8 @@ def initial(lens: Lens) -> State:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
         highest = 100.0
-    return State(lens, lens, tuple(words), "" if data and data.merit else "spot", frequency=highest)
+    has_merit = data is not None and any(row.weight > 0 for row in data.merit)  # and not conditions alone
+    return State(lens, lens, tuple(words), "" if has_merit else "spot", frequency=highest)
 
 
 def shown_fields(lens: Lens) -> Tensor:
@@ -71,14 +89,61 @@ def shown_fields(lens: Lens) -> Tensor:
 
 def reduce(state: State, event: Mapping) -> State:
     """The state behind an event; the same one with a message where the event cannot be carried out."""
-    change = EVENTS.get(event.get("type"))
-    if change is None:
-        return dataclasses.replace(state, message=f"unknown event {event.get('type')!r}")
+    if words := refusal(event, EVENTS):
+        return dataclasses.replace(state, message=words)
     try:
-        return change(dataclasses.replace(state, message=""), event)
-    except (ValueError, TypeError, RuntimeError, LookupError) as error:
+        return EVENTS[event["type"]].change(dataclasses.replace(state, message=""), event)
+    except (ValueError, TypeError, RuntimeError, LookupError, ArithmeticError) as error:
         words = f"{error.args[0]!r} is missing" if type(error) is KeyError else str(error)
         return dataclasses.replace(state, message=words)
+
+
+class Part(NamedTuple):
+    """A kind of value in an event: which values it admits, and its words for a message."""
+
+    admits: Callable[[object], bool]
+    words: str
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) or _is_text(value)
+
+
+WHOLE = Part(lambda value: type(value) is int, "a whole number")
+FLAG = Part(lambda value: isinstance(value, bool), "true or false")
+TEXT = Part(_is_text, f"a text of at most {_LONGEST} characters")
+NUMBER = Part(_is_number, "a number, or its text")
+NUMBERS = Part(
+    lambda value: _is_text(value) or (isinstance(value, list) and all(map(_is_number, value))),
+    f"numbers, or their text of at most {_LONGEST} characters",
+)
+AXIS = Part(lambda value: value in ("x", "y"), "x or y")
+FIELD = Part(lambda value: value is None or WHOLE.admits(value), "a whole number or null")
+
+
+class Event(NamedTuple):
+    """A kind of event. parts: those that it may have, by their names; change: the state behind it."""
+
+    parts: Mapping[str, Part]
+    change: Callable[[State, Mapping], State] | None = None
+
+
+def refusal(event: Mapping, known: Mapping[str, Event]) -> str:
+    """Why an event is none of the known kinds, or which of its parts is none; empty if it is one."""
+    kind = event.get("type")
+    if not isinstance(kind, str) or kind not in known:
+        return f"unknown event {named_value(kind)}; expected one of {', '.join(known)}"
+    for name, value in event.items():
+        part = known[kind].parts.get(name)
+        if name != "type" and part is None:
+            return f"{kind} has no part {named_value(name)}; it has {', '.join(known[kind].parts) or 'none'}"
+        if part and not part.admits(value):
+            return f"{kind}: {name} is {named_value(value)}; expected {part.words}"
+    return ""
 
 
 def word_of(one: Vary) -> str:
@@ -98,12 +163,31 @@ def variables(state: State) -> list[str | Vary]:
     return [*of_file, *(word for word in state.vary if word not in map(word_of, of_file))]
 
 
-def merit_of(state: State) -> DefaultMerit | None:
-    """The merit function for `optimize`; None: the file's. The MTF is that at 1/4 and 1/2 of the highest frequency."""
+def merit_of(state: State) -> Merit | None:
+    """The merit function for `optimize`; None: the file's. The MTF is that at 1/4 and 1/2 of the highest frequency.
+
+    A chosen one replaces what the file says of the image; conditions, boundaries and other rows of the file remain.
+    """
     if not state.merit:
         return None
     frequencies = (state.frequency / 4, state.frequency / 2) if state.merit == "mtf" else ()
-    return DefaultMerit(state.merit, frequencies=frequencies)
+    chosen = merit_for(state.lens, DefaultMerit(state.merit, frequencies=frequencies))
+    return dataclasses.replace(chosen, skip_unknown=True) + requirements(state.lens)
+
+
+def requirements(lens: Lens) -> Merit:
+    """The merit function of the file in which rows of the image, unless they are conditions, have no weight."""
+    data = lens.optimization_data
+    rows = data.merit if data else ()
+    of_image = [row.operand in OF_IMAGE and row.weight > 0 for row in rows]
+    free = (dataclasses.replace(row, weight=0.0) if image else row for row, image in zip(rows, of_image, strict=True))
+    return Merit(tuple(free), data.unit if data else 1.0)
+
+
+def in_words(row: Row) -> str:
+    """A row and its target, as "EFFL = 50"."""
+    relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
+    return " ".join(filter(None, (row.name, arguments(row), relation, f"{row.target:.6g}")))
 
 
 # -- numbers
@@ -120,12 +204,50 @@ def number(text: object, what: str) -> float:
     return found
 
 
-def numbers(texts: object, what: str) -> list[float]:
-    """Several numbers, a list or a text like "0, 14 20". Raises ValueError."""
+def numbers(texts: str | Sequence, what: str, most: int) -> list[float]:
+    """Several numbers, a list or a text like "0, 14 20", at most so many. Raises ValueError."""
     words = re.split(r"[,;\s]+", texts.strip()) if isinstance(texts, str) else texts
-    if not isinstance(words, Sequence) or not [word for word in words if word != ""]:
-        raise ValueError(f"{what}: expected at least one number; nothing was changed")
-    return [number(word, what) for word in words if word != ""]
+    words = [word for word in words if word != ""]
+    if not 0 < len(words) <= most:
+        raise ValueError(f"{what}: found {len(words)} numbers; expected 1 to {most}; nothing was changed")
+    return [number(word, what) for word in words]
+
+
+def limits(lens: Lens, surface: int, quantity: str) -> tuple[float, float]:
+    """Least and largest number of a surface. A gap between powered surfaces is not negative along the light."""
+    if quantity != "thickness" or surface == 0:
+        return -math.inf, math.inf
+    for front, end, side in gaps(lens):
+        if front <= surface < end:
+            others = sum(float(lens.surfaces[k].thickness) for k in range(front, end) if k != surface)
+            return (-others, FARTHEST) if side > 0 else (-FARTHEST, -others)
+    return -FARTHEST, FARTHEST
+
+
+def slider_ends(lens: Lens, surface: int, quantity: str, value: float) -> tuple[float, float]:
+    """The ends of the slider of a number, about its value and within its limits.
+
+    The sensor's is 100 depths of focus 2 λ F² long; a curvature ends at a hemisphere of the semi-diameter.
+    """
+    size = lens.surfaces[surface].semi_diameter or 10.0
+    low, high = limits(lens, surface, quantity)
+    power = re.fullmatch(r"a(\d+)", quantity)
+    if quantity == "curvature":
+        reach, low, high = max(0.15 / size, 0.3 * abs(value)), -1 / size, 1 / size
+    elif quantity == "thickness" and surface == len(lens.surfaces) - 2 and (depth := _depth_of_focus(lens)):
+        reach = 50 * depth
+    elif quantity in ("thickness", "conic"):
+        reach = max(1.0, 0.5 * abs(value))
+    else:
+        least = 0.02 * size ** (1 - int(power[1])) if power else 5.0 if "tilt" in quantity else 1.0
+        reach = max(least, 0.5 * abs(value))
+    return min(value, max(value - reach, low)), max(value, min(value + reach, high))
+
+
+def _depth_of_focus(lens: Lens) -> float:
+    """2 λ F² in mm at the primary wavelength and the paraxial working F/#; 0 of an afocal image space."""
+    depth = 2e-3 * float(lens.primary * first_order(lens).paraxial_working_f_number ** 2)
+    return depth if math.isfinite(depth) else 0.0
 
 
 def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
@@ -148,6 +270,9 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
             quantity, given = "curvature", 1 / given
         if not math.isfinite(given) and (surface, quantity) != (0, "thickness"):
             raise ValueError(f"{what}: found {given:g}; expected a finite number")
+        low, high = limits(lens, surface, quantity)
+        if not low <= given <= high:
+            raise ValueError(f"{what}: found {given:.6g} mm; expected {low + 0.0:.6g} to {high + 0.0:.6g} mm")
         whole = modelled(lens.surfaces[surface], quantity)
         place = path_of(whole, quantity, f"surface {surface}: ")
         changed = with_number(whole, place, lens.surfaces[-2].thickness.new_tensor(given))
@@ -190,14 +315,14 @@ def _dragged(state: State, event: Mapping, lens: Lens, key: str) -> State:
 
 
 def _edit(state: State, event: Mapping) -> State:
-    surface, quantity = int(event["surface"]), str(event["quantity"])
+    surface, quantity = event["surface"], event["quantity"]
     named = "curvature" if quantity == "radius" else quantity
     lens = with_value(state.lens, surface, quantity, event["value"])
     return _dragged(state, event, lens, f"{named}:{surface}")
 
 
 def _vary(state: State, event: Mapping) -> State:
-    word = f"{event['quantity']}:{int(event['surface'])}"
+    word = f"{event['quantity']}:{event['surface']}"
     chosen = tuple(one for one in state.vary if one != word)
     if event.get("on"):
         freedom(state.lens, word)
@@ -208,7 +333,7 @@ def _vary(state: State, event: Mapping) -> State:
 def _fields(state: State, event: Mapping) -> State:
     """Fields by their y, or with `axis` "x" by their x. All else of them stays; of fewer or more y, those that the lens
     does not have take x and vignetting factors between their neighbours."""
-    lens, axis, values = state.lens, event.get("axis", "y"), numbers(event["values"], "fields")
+    lens, axis, values = state.lens, event.get("axis", "y"), numbers(event["values"], "fields", MOST_FIELDS)
     old = lens.fields
     if len(values) == len(old.y):
         fields = dataclasses.replace(old, **{axis: old.y.new_tensor(values)})
@@ -233,27 +358,33 @@ def _fields_at(lens: Lens, values: Sequence[float]) -> Fields:
 
 
 def _wavelengths(state: State, event: Mapping) -> State:
-    """The primary wavelength and weights stay where the new list has them."""
-    lens, values = state.lens, numbers(event["values"], "wavelengths")
-    weights = dict(zip(lens.wavelengths.tolist(), lens.wavelength_weights.tolist(), strict=True))
-    primary = float(lens.primary)
+    """A wavelength of the old list keeps its weight, and is primary if it was. Of a list of the same length those that
+    are new take the place of the old ones; else weights are 1, and the wavelength nearest to the old primary is."""
+    lens, values = state.lens, numbers(event["values"], "wavelengths", MOST_WAVELENGTHS)
+    old, weights, primary = lens.wavelengths.tolist(), lens.wavelength_weights.tolist(), float(lens.primary)
+    same = len(values) == len(old)
+    places = [old.index(one) if one in old else k if same else None for k, one in enumerate(values)]
+    if primary in values or not same:
+        number = min(range(len(values)), key=lambda k: abs(values[k] - primary))
+    else:
+        number = lens.primary_wavelength - 1
     lens = lens.at(
         wavelengths=values,
-        wavelength_weights=[weights.get(one, 1.0) for one in values],
-        primary_wavelength=1 + values.index(primary) if primary in values else 1,
+        wavelength_weights=[1.0 if k is None else weights[k] for k in places],
+        primary_wavelength=1 + number,
     )
     return edited(state, solved(lens))
 
 
 def _primary(state: State, event: Mapping) -> State:
-    return edited(state, solved(state.lens.at(primary_wavelength=int(event["number"]))))
+    return edited(state, solved(state.lens.at(primary_wavelength=event["number"])))
 
 
 def _aperture(state: State, event: Mapping) -> State:
-    kind, sizes = str(event.get("kind") or state.lens.aperture.kind), aperture_sizes(state.lens)
+    kind, sizes = event.get("kind") or state.lens.aperture.kind, aperture_sizes(state.lens)
     if kind not in sizes:
         raise ValueError(f"aperture {kind!r}: expected one of {', '.join(sizes)}")
-    size = sizes[kind] if event.get("value") is None else number(event["value"], "aperture")
+    size = number(event["value"], "aperture") if "value" in event else sizes[kind]
     lens = freed(state.lens, f_number=size)
     lens = dataclasses.replace(lens, aperture=SystemAperture(kind, lens.wavelengths.new_tensor(size)))
     check(lens)
@@ -262,8 +393,8 @@ def _aperture(state: State, event: Mapping) -> State:
 
 def _frequency(state: State, event: Mapping) -> State:
     highest = number(event["value"], "highest frequency")
-    if not 0 < highest < math.inf:
-        raise ValueError(f"highest frequency: found {highest:g}; expected cycles/mm, more than 0")
+    if not 0 < highest <= HIGHEST:
+        raise ValueError(f"highest frequency: found {highest:g}; expected cycles/mm, more than 0, at most {HIGHEST:g}")
     return dataclasses.replace(state, frequency=highest)
 
 
@@ -278,26 +409,29 @@ def _step(state: State, source: str) -> State:
 
 
 def _merit(state: State, event: Mapping) -> State:
-    kind = str(event["kind"])
-    data = state.lens.optimization_data
+    kind, data = event["kind"], state.lens.optimization_data
     if kind not in KINDS and not (kind == "" and data and data.merit):
         raise ValueError(f"merit {kind!r}: expected one of {', '.join(KINDS)}")
     return dataclasses.replace(state, merit=kind)
 
 
+_EDIT = {"surface": WHOLE, "quantity": TEXT, "value": NUMBER, "drag": FLAG}
+
 #: Events by their type.
-EVENTS: dict[str, Callable[[State, Mapping], State]] = {
-    "edit": _edit,
-    "vary": _vary,
-    "fields": _fields,
-    "wavelengths": _wavelengths,
-    "primary": _primary,
-    "aperture": _aperture,
-    "configuration": lambda state, event: edited(state, state.lens.configuration(int(event["number"]))),
-    "frequency": _frequency,
-    "merit": _merit,
-    "compare": lambda state, event: dataclasses.replace(state, compare=bool(event.get("on"))),
-    "undo": lambda state, event: _step(state, "past"),
-    "redo": lambda state, event: _step(state, "future"),
-    "restore": lambda state, event: edited(state, state.stored, initial(state.stored).vary),
+EVENTS = {
+    "edit": Event(_EDIT, _edit),
+    "vary": Event({"surface": WHOLE, "quantity": TEXT, "on": FLAG}, _vary),
+    "fields": Event({"values": NUMBERS, "axis": AXIS}, _fields),
+    "wavelengths": Event({"values": NUMBERS}, _wavelengths),
+    "primary": Event({"number": WHOLE}, _primary),
+    "aperture": Event({"kind": TEXT, "value": NUMBER, "drag": FLAG}, _aperture),
+    "configuration": Event(
+        {"number": WHOLE}, lambda state, event: edited(state, state.lens.configuration(event["number"]))
+    ),
+    "frequency": Event({"value": NUMBER}, _frequency),
+    "merit": Event({"kind": TEXT}, _merit),
+    "compare": Event({"on": FLAG}, lambda state, event: dataclasses.replace(state, compare=event["on"])),
+    "undo": Event({}, lambda state, event: _step(state, "past")),
+    "redo": Event({}, lambda state, event: _step(state, "future")),
+    "restore": Event({}, lambda state, event: edited(state, state.stored, initial(state.stored).vary)),
 }

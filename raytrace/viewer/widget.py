@@ -1,6 +1,7 @@
 """`rt.view`: the viewer of a lens as a widget of a notebook or, outside of one, behind a local address."""
 
 import sys
+import warnings
 from typing import Any
 
 from raytrace.system.lens import Lens
@@ -46,7 +47,8 @@ def widget_of(lens: Lens):
             self.on_msg(self._answer)
 
         def _answer(self, widget, content: dict, buffers: list) -> None:
-            self.send({"number": content["number"], "reply": self.session.answer(dict(content["event"]))})
+            with warnings.catch_warnings(action="ignore"):  # the page lists them as remarks
+                self.send({"number": content["number"], "reply": self.session.answer(dict(content["event"]))})
 
         @property
         def state(self):

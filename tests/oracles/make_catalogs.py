@@ -1,15 +1,31 @@
-"""Write glass_catalogs/*.AGF from a table of dispersion coefficients (provenance of the shipped catalogs).
+"""Write glass_catalogs/*.AGF from tables of public figures (provenance of the shipped catalogs).
 
-    python tests/oracles/make_catalogs.py coefficients.csv glass_catalogs
+    python tests/oracles/make_catalogs.py TABLES glass_catalogs
 
-The table has one row a glass: catalog, glass, formula (AGF number), coefficients, nd_listed, Vd_listed, wl_min_um,
-wl_max_um, thermal figures, status, nd_Vd_consistency, confidence, sources_agreeing, sources_deviating. A row is in the
-table only if two sources agree on the coefficients; sources that deviate are listed with their largest |Δn|. Rules:
+TABLES is a folder of four tables:
+
+coefficients.csv    one row a glass: catalog, glass, formula (AGF number), coefficients, nd_listed, Vd_listed,
+                    wl_min_um, wl_max_um, thermal figures, status, nd_Vd_consistency, confidence, sources_agreeing,
+                    sources_deviating; a row is there only if two sources agree on the coefficients, and sources that
+                    deviate are listed with their largest |Δn|
+additional.csv      further glasses, also of a single source: coefficients, nd, Vd, range, sources, files
+properties.csv      expansion, density and relative cost, each with the number of sources that agree
+transmittance.csv   internal transmittance of 10 mm at wavelengths, each with the number of sources that agree
+
+Rules:
 
 * One row a name and catalog. Two rows of one name (capitals ignored) stop this script: no edition is chosen silently.
 * Coefficients are cut or padded with zeros to what the formula takes; a coefficient beyond that, not zero, stops it.
-* Figures the table does not have are written as AGF writes "not known": expansion and density 0, cost and
-  resistances -1. ΔP_gF is computed from the coefficients where g, F, d and C lie in range, else 0.
+* Figures the tables do not have are written as AGF writes "not known": expansion and density 0, cost and resistances
+  -1, no IT record. ΔP_gF is computed from the coefficients where g, F, d and C lie in range, else 0.
+* The catalog of an additional glass is that of its files (FILES), the first of them in SHIPPED. A glass whose
+  coefficients contradict its listed nd or Vd (CONTRADICTION) is left out, and so is a name of ALIASES.csv; both are
+  printed. nd and Vd are listed only where the d line is in range.
+* Expansions from 20 to 300 °C that some makers state in 1e-7/K (48 of HOYA, 5 of RPO: ten times that to 70 °C) are
+  divided by ten. A density of exactly 1 is the default of catalog files, and left out.
+* A transmittance beyond 0 to 1 is left out, and that of a glass for which all sources list 1 everywhere, or 0: it is
+  not measured.
+* The comment has the number of sources of every figure.
 * "alternatives" of an obsolete glass: up to three standard or preferred glasses of the same catalog with
   |Δn_d| < 5e-4 and |ΔV_d| < 0.5 %, the nearest first. They are hints for a reader, never used in a lookup.
 * "caution" where the curve is not that of a transparent medium over all of its listed range: the stretches in which n
@@ -19,18 +35,30 @@ table only if two sources agree on the coefficients; sources that deviate are li
 import csv
 import sys
 from collections import defaultdict
-from itertools import pairwise
+from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from raytrace.materials.agf import Catalog, write_agf
-from raytrace.materials.glass import BY_NUMBER, FORMULAS, LINES, Glass, normal_line_deviation, refractive_index
+from raytrace.materials.catalogs import SHIPPED, aliases
+from raytrace.materials.glass import (
+    BY_NUMBER,
+    FORMULAS,
+    LINES,
+    Glass,
+    abbe_number,
+    nd,
+    normal_line_deviation,
+    refractive_index,
+)
 
-TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
+TITLE = "{name}: figures of public sources, which each glass names in its comment"
 
 
-def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
+def glass(row: dict[str, str], alternatives: list[str], figures: "Figures") -> Glass:
     formula = BY_NUMBER[int(row["formula"])]
     numbers = [float(word) for word in row["coefficients"].split()]
     count = FORMULAS[formula].count
@@ -39,8 +67,6 @@ def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
     numbers = (numbers + [0.0] * count)[:count]
     span = float(row["wl_min_um"]), float(row["wl_max_um"])
     bare = Glass(row["glass"], formula, torch.tensor(numbers, dtype=torch.float64), wavelength_range=span)
-    visible = span[0] <= LINES["g"] and span[1] >= LINES["C"]
-    deviation = round(float(normal_line_deviation(bare)), 6) if visible else 0.0
     thermal = tuple(float(word) for word in row["thermal_D0_D1_D2_E0_E1_Ltk_T"].split())
     agreeing, deviating = (
         row[column].split(";") if row[column] else [] for column in ("sources_agreeing", "sources_deviating(max|dn|)")
@@ -51,21 +77,115 @@ def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
     comment += [f"{len(agreeing)} sources agree: {', '.join(agreeing)}"]
     comment += [f"{len(deviating)} deviate by max |dn|: {', '.join(deviating)}"] if deviating else []
     unlisted = row["nd_listed"] == "1.0" and row["Vd_listed"] == "0.0"
-    return Glass(
-        name=row["glass"],
-        formula=formula,
-        coefficients=bare.coefficients,
-        wavelength_range=span,
-        status="" if row["status"] == "-1" else row["status"],
-        nd_listed=None if unlisted else float(row["nd_listed"]),
-        abbe_listed=None if unlisted else float(row["Vd_listed"]),
+    return filled(
+        Glass(
+            name=row["glass"],
+            formula=formula,
+            coefficients=bare.coefficients,
+            catalog=row["catalog"],
+            wavelength_range=span,
+            status="" if row["status"] == "-1" else row["status"],
+            nd_listed=None if unlisted else float(row["nd_listed"]),
+            abbe_listed=None if unlisted else float(row["Vd_listed"]),
+            comment="; ".join(comment),
+            records=(("TD", thermal),) if thermal else (),
+        ),
+        figures,
+    )
+
+
+def filled(glass: Glass, figures: "Figures") -> Glass:
+    """The glass with its figures, or what AGF writes for unknown ones, and their numbers of sources."""
+    span, key = glass.wavelength_range, (glass.catalog, glass.name)
+    visible = span and span[0] <= LINES["g"] and span[1] >= LINES["C"]
+    deviation = round(float(normal_line_deviation(glass)), 6) if visible else 0.0
+    known = figures.properties.get(key, {})
+    expansion, expansion_to_300, density = (known.get(name, (0.0, 0))[0] for name in NAMES[:3])
+    cost = known.get("relative cost", (-1.0, 0))[0]
+    lines = figures.transmittance.get(key, [])
+    sources = [f"{name} by {known[name][1]}" for name in NAMES if name in known]
+    if lines:
+        counts = sorted({count for *_, count in lines})
+        sources.append(f"internal transmittance by {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}")
+    comment = [glass.comment, *([f"sources of figures: {', '.join(sources)}"] if sources else [])]
+    return replace(
+        glass,
+        catalog="",
         comment="; ".join(comment),
         records=(
-            ("ED", (0.0, 0.0, 0.0, deviation, 0.0)),
-            *([("TD", thermal)] if thermal else []),
-            ("OD", (-1.0,) * 6),
+            ("ED", (expansion, expansion_to_300, density, deviation, 0.0)),
+            *glass.records,
+            ("OD", (cost, *(-1.0,) * 5)),
+            *(("IT", (wavelength, transmittance, 10.0)) for wavelength, transmittance, _ in lines),
         ),
     )
+
+
+class Figures(NamedTuple):
+    """By (catalog, glass): figures and numbers of sources by name, and rows (µm, internal transmittance, sources)."""
+
+    properties: dict[tuple[str, str], dict[str, tuple[float, int]]]
+    transmittance: dict[tuple[str, str], list[tuple[float, float, int]]]
+
+
+#: An expansion above this, in 1e-6/K, and of five times that to 70 °C, is in 1e-7/K; a figure that states nothing.
+TENFOLD, BLANK = 20.0, {"density": 1.0}
+NAMES = "expansion from -30 to 70 C", "expansion from 20 to 300 C", "density", "relative cost"
+
+
+def figures_of(folder: Path) -> Figures:
+    properties, transmittance = {}, defaultdict(list)
+    with open(folder / "properties.csv", encoding="utf-8", newline="") as file:
+        for catalog, name, *numbers in islice(csv.reader(file), 1, None):
+            pairs = zip(NAMES, numbers[::2], numbers[1::2], strict=True)
+            known = {title: (float(n), int(count)) for title, n, count in pairs if n}
+            (near, _), (far, count) = (known.get(title, (0.0, 0)) for title in NAMES[:2])
+            if far > max(TENFOLD, 5 * near):
+                known[NAMES[1]] = round(far / 10, 6), count
+            properties[catalog, name] = {title: entry for title, entry in known.items() if entry[0] != BLANK.get(title)}
+    with open(folder / "transmittance.csv", encoding="utf-8", newline="") as file:
+        for catalog, name, *numbers, count in islice(csv.reader(file), 1, None):
+            if 0 <= float(numbers[1]) <= 1:
+                transmittance[catalog, name].append((*map(float, numbers), int(count)))
+    measured = {key: sorted(lines) for key, lines in transmittance.items() if any(0 < τ < 1 for _, τ, _ in lines)}
+    return Figures(properties, measured)
+
+
+#: The catalog of the glasses of a file, by the beginning of its name.
+FILES = {
+    "angstromlink": "PLASTIC", "cdgm": "CDGM", "corning": "CORNING", "hoya": "HOYA", "infrared": "INFRARED",
+    "irphotonics": "INFRARED", "lightpath": "LIGHTPATH", "lzos": "LZOS", "nhg": "NHG", "nikon": "HIKARI",
+    "ohara": "OHARA", "pilkington": "PILKINGTON", "plastic": "PLASTIC", "schott_ig": "INFRARED", "schott": "SCHOTT",
+    "sumita": "SUMITA", "zeon": "ZEON", "": "MISC",
+}  # fmt: skip
+#: Differences of nd and Vd between coefficients and listing, beyond which a glass of a single listing is not trusted.
+CONTRADICTION = 1e-4, 0.3
+
+
+def additional(row: dict[str, str], figures: Figures) -> tuple[str, Glass | None]:
+    """The catalog of a further glass, and the glass; None for one that contradicts its own listing."""
+    files = [file.split(":")[1].lower() for file in row["files"].split(";")]
+    catalog = min((next(FILES[stem] for stem in FILES if file.startswith(stem)) for file in files), key=SHIPPED.index)
+    formula, numbers = BY_NUMBER[int(row["agf_formula"])], [float(word) for word in row["coefficients"].split()]
+    count, (shortest, longest) = FORMULAS[formula].count, map(float, row["range_um"].split())
+    if any(numbers[count:]):
+        raise SystemExit(f"{row['glass']}: more coefficients than formula {formula} takes")
+    coefficients = torch.tensor((numbers + [0.0] * count)[:count], dtype=torch.float64)
+    span = (shortest, longest) if longest else None
+    glass = Glass(row["glass"], formula, coefficients, catalog, span)
+    listed = float(row["nd"]), float(row["Vd"])
+    if listed == (1.0, 0.0) or not (span and span[0] <= LINES["d"] <= span[1]):
+        listed = None, None
+    else:
+        off = abs(float(nd(glass)) - listed[0]), abs(float(abbe_number(glass)) - listed[1])
+        if off[0] > CONTRADICTION[0] or off[1] > CONTRADICTION[1]:
+            return catalog, None
+    count, others = int(row["independent_sources"]), int(row["other_versions"])
+    comment = caution(glass) if span else []
+    comment.append(f"{count} source{'s agree' if count > 1 else ' alone'}: {row['files'].replace(';', ', ')}")
+    comment += [f"{others} of other coefficients deviate by some |dn|"] if others else []
+    made = replace(glass, nd_listed=listed[0], abbe_listed=listed[1], comment="; ".join(comment))
+    return catalog, filled(made, figures)
 
 
 def caution(glass: Glass) -> list[str]:
@@ -96,17 +216,27 @@ def alternatives(row: dict[str, str], rows: list[dict[str, str]]) -> list[str]:
     return [name for _, name in sorted(near)[:3]]
 
 
-def main(table: str, folder: str) -> None:
-    with open(table, encoding="utf-8", newline="") as file:
-        catalogs = defaultdict(list)
+def main(tables: str, folder: str) -> None:
+    catalogs, figures = {name: [] for name in SHIPPED}, figures_of(Path(tables))
+    further = {name: [] for name in SHIPPED}
+    with open(Path(tables) / "coefficients.csv", encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             catalogs[row["catalog"]].append(row)
+    with open(Path(tables) / "additional.csv", encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            catalog, made = additional(row, figures)
+            if row["glass"].upper() in aliases():
+                print(f"{catalog} {row['glass']}: left out; it is an alias of a glass of more sources")
+                continue
+            further[catalog] += [made] if made else []
+            if made is None:
+                print(f"{catalog} {row['glass']}: left out; its coefficients contradict nd {row['nd']}, Vd {row['Vd']}")
     for name, rows in catalogs.items():
         glasses = {}
-        for row in rows:
-            if row["glass"].upper() in {listed.upper() for listed in glasses}:
-                raise SystemExit(f"{name} {row['glass']}: two rows of one name; choose an edition in the table")
-            glasses[row["glass"]] = glass(row, alternatives(row, rows))
+        for made in (*(glass(row, alternatives(row, rows), figures) for row in rows), *further[name]):
+            if made.name.upper() in {listed.upper() for listed in glasses}:
+                raise SystemExit(f"{name} {made.name}: two rows of one name; choose an edition in the table")
+            glasses[made.name] = made
         write_agf(Catalog(name, glasses, (TITLE.format(name=name),)), Path(folder) / f"{name}.AGF")
         print(f"{name}: {len(glasses)}")
 

@@ -154,7 +154,7 @@ def _unit(system: Block, report: Draft) -> float:
 def _at_paraxial_image(surfaces: list[Surface], wavelength: Tensor, place: Place, report: Draft) -> list[Surface]:
     """The image at its paraxial distance (PIM): the stored one, or the one of an axial ray where they differ."""
     first, *others, image = surfaces
-    n = signed(others, [refractive_index(surfaces[k].glass, wavelength) for k in medium_surfaces(surfaces[:-1])])
+    n = signed(others, [refractive_index(surfaces[k].glass, wavelength) for k in medium_surfaces(surfaces)[:-1]])
     powers = [power(s, before, behind, wavelength) for s, before, behind in zip(others, n[:-1], n[1:], strict=True)]
     gaps = [surface.thickness / index for surface, index in zip(others[:-1], n[1:-1], strict=True)]
     y, omega = ynu(torch.ones_like(wavelength), n[0] / first.thickness, powers, gaps)[-1]

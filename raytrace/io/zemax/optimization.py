@@ -22,6 +22,7 @@ before the target.
 """
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -356,6 +357,7 @@ def read(
         merit,
         unit=millimetres if merit or tolerances or configured else 1.0,
         tolerances=tuple(tolerances),
+        distributions=tuple(_distributions(lines)),
         semi_diameters=tuple(
             k for k, typed in enumerate(surfaces) if typed.surface.semi_diameter and typed.code("DIAM") == _FIXED
         ),
@@ -397,6 +399,22 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
         if path is not None and part(changed[number], path) is None:
             changed[number] = with_part(changed[number], path, double(0.0), like=like)
     return dataclasses.replace(lens, surfaces=tuple(changed))
+
+
+def _distributions(lines: Sequence[Record]) -> Iterator[tuple[str, tuple[tuple[float, float], ...]]]:
+    """The tables of errors (x, density) in files beside that of the lens, which comments of STAT 3 name."""
+    for line, comment in itertools.pairwise(lines):
+        name = comment.text.strip()
+        path = Path(line.place.file).parent / name
+        if line.words[:2] == ("STAT", "3") and comment.keyword == "TCMM" and name == path.name and path.is_file():
+            try:
+                points = [tuple(map(float, row.split()[:2])) for row in read_text(path).splitlines() if row.strip()]
+            except ValueError:
+                points = [()]
+            if not all(len(point) == 2 for point in points):
+                message = f"{name}: expected two numbers a line, the fraction of the limits and the density there"
+                raise LensFileError(f"STAT: {message}", line.place)
+            yield name, tuple(points)
 
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------

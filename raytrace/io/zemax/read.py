@@ -76,7 +76,12 @@ def read(
     lens = _lens(parts, surfaces, unit, report, file)
     for keyword, position, quantity, message in (
         ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
-        ("FTYP", 6, "afocal", "afocal image space (FTYP, seventh value); the image is taken as a plane"),
+        (
+            "FTYP",
+            6,
+            "afocal",
+            "afocal image space (FTYP, seventh value); spots and wavefronts are those on the image surface",
+        ),
     ):
         if parts.system.integer(keyword, quantity, 0, position):
             report.warn(message, parts.system.last(keyword).place)
@@ -114,6 +119,7 @@ def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
         notes=_notes(system),
         catalogs=tuple(name for record in system.all("GCAT") for name in record.words),
         ray_aiming=AIMINGS[kind] if aiming else "auto",
+        afocal=bool(system.integer("FTYP", "afocal", 0, 6)),
         environment=environment,
     )
     draft.sources |= {

@@ -961,13 +961,18 @@ def _unsupported(block: Block, at_end: bool) -> str:
 
 
 def type_name(block: Block) -> str:
-    """The TYPE of a surface, STANDARD where it has none."""
+    """The TYPE of a surface, STANDARD where it has none.
+
+    Some programs write the terms of an XASPHERE as those of an EVENASPH, which it then is.
+    """
     record = block.last("TYPE")
     if record is None:
         return "STANDARD"
     if not record.words:
         raise LensFileError(f"TYPE without a name; expected {_modelled()}", record.place)
-    return record.words[0].upper()
+    kind = record.words[0].upper()
+    held = {keyword: any(entry.number(1, "value") for entry in block.all(keyword)) for keyword in ("PARM", "XDAT")}
+    return "EVENASPH" if kind == "XASPHERE" and held["PARM"] and not held["XDAT"] else kind
 
 
 def _modelled() -> str:
@@ -1016,6 +1021,8 @@ def build(
         fields["glass"] = _medium(block, blocks, catalogs, user, report)
         fields["apertures"] = _apertures(block, millimetres, report)
     numbers, marked = numbers_of(block, row, millimetres), block.last("TYPE", "SURF")
+    if marked and marked.words[0].upper() == "XASPHERE" and kind == "EVENASPH":
+        report.warn("an XASPHERE without XDAT: PARM 1 to 8 are taken as its terms of r², r⁴, …", marked.place)
     try:
         fields |= poses(block, millimetres) | row.fields(numbers)
     except ValueError as error:

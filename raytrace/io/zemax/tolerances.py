@@ -9,13 +9,23 @@ As OpticStudio's help has them, in the unit of length of the file, degrees and f
     CPAR surface parameter  compensator: PARM of a surface; CMCO row configuration: an operand of configurations
     TWAV 0 0 µm             wavelength of fringes
     TTHI surface adjuster   the adjuster's thickness changes by the opposite; none if it is the surface itself
-    TEDX first last         of an element; TETX … about the vertex of its first surface
+    TEDX first last         of an element; TETX … about the vertex of its first surface, or the pivot of MPVT
+    TSDR surface            decentre in a random direction; TEDR first last: of an element
+    TARX first last seat    roll of an element about the centre of curvature of its seat, the first surface where it is
+                            0: TARX, TARY by an angle about x, y; TRLX, TRLY by a decentre of the vertex of the seat
+                            along x, y; TARR, TRLR in a random direction
     TEZI surface most - … least   Noll's terms from the third whole number (2 where it is 0) to the second; their RMS is
                             the maximum, and each has the share RMS/√terms
+    TEXI surface most - … least   fringe terms likewise; the root of the sum of their squares at the rim is the maximum,
+                            in fringes
     TIRR surface            and an angle of its astigmatism, which is uniform
-    STAT n sigmas           distribution of the lines below: 0 normal, 1 uniform, 2 parabolic
+    MPVT code               pivot of the tilts of elements below: 0, 1 the vertex of the first, the last surface, 2, 3
+                            their edges, 4 the middle between the vertices
+    STAT n sigmas           distribution of the lines below: 0 normal, 1 uniform, 2 parabolic, 3 a table, whose file the
+                            comment names: x from 0 to 1 between the limits, and the density there
     SAVE number             the lens of the line above is saved under that number
 
+Components of a radial decentre and the terms of one irregularity are a group: at its limits, all are at once.
 Every other operand is listed with the reason why it is not read.
 """
 
@@ -30,14 +40,20 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN
 from raytrace.system.shapes import KINDS as KINDS_OF_SAG
-from raytrace.system.surface import is_even
-from raytrace.system.tolerance_data import KINDS, TEST_WAVELENGTH, Compensator, Tolerance
+from raytrace.system.surface import is_even, sag_at
+from raytrace.system.tolerance_data import KINDS, MOST_TERM, TEST_WAVELENGTH, Compensator, Tolerance
 
 #: Kinds by their operands; those with further rules are read by functions.
 _KINDS = {operand: name for name, kind in KINDS.items() for operand in kind.operand.split()}
-_DISTRIBUTIONS = {0: "normal", 1: "uniform", 2: "parabolic"}
+_DISTRIBUTIONS = {0: "normal", 1: "uniform", 2: "parabolic", 3: "table"}
 _COMPENSATORS = {0: "thickness", 1: "curvature", 2: "conic"}
 _BREAKS = {"TUDX": "x", "TUDY": "y", "TUTX": "tilt_x", "TUTY": "tilt_y", "TUTZ": "tilt_z"}
+#: Rolls of an element: the axis of the angle, or of the decentre, and whether the limits are an angle.
+_ROLLS = {"TARX": ("x", True), "TARY": ("y", True), "TRLX": ("x", False), "TRLY": ("y", False)}
+#: Components of the operands whose direction is random.
+_RADIAL = {"TSDR": ("TSDX", "TSDY"), "TEDR": ("TEDX", "TEDY"), "TRLR": ("TRLX", "TRLY"), "TARR": ("TARX", "TARY")}
+#: Terms of irregularity: the kind of a row, and the power of length of its limits.
+_TERMS = {"TEZI": ("zernike", 1), "TEXI": ("fringe", 0)}
 _SIGMAS = 2.0
 
 #: Operands that are known and not read, with the reason.
@@ -45,13 +61,7 @@ _UNREAD = {
     "TOFF": "off",
     "NOP": "off",
     "TSDI": "a semi-diameter clips no ray by itself",
-    "TSDR": "a radial decentre, at a random angle; TSDX and TSDY are read",
-    "TEDR": "a radial decentre, at a random angle; TEDX and TEDY are read",
-    "TARX": "a roll at a random angle; TETX and TETY are read",
-    "TRLX": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
-    "TRLY": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
-    "TRLR": "a roll of an element; TETX, TETY and TEDX, TEDY are read",
-    "TEXI": "irregularity by random fringe terms; TEZI is read",
+    **dict.fromkeys(("ISOA", "ISOB", "ISOC", "ISOD"), "figure by ISO 10110-5; TFRN, TIRR and TEZI are read"),
     "TPAI": "the inverse of a parameter",
     "TEDV": "an extra datum",
     "TNPA": "a parameter of non-sequential objects",
@@ -65,7 +75,6 @@ _UNREAD = {
     "CNPA": "a parameter of non-sequential objects",
     "CNPS": "a position of a non-sequential object",
     "SEED": "the seed is an option of the Monte Carlo analysis",
-    "MPVT": "the pivot of a tilt other than the vertex of the first surface",
 }
 
 
@@ -90,7 +99,8 @@ def read_lines(lens: Lens, lines: Sequence[str], file: str = "", numbers: Sequen
         if keyword != "TOL" or not words:
             continue  # a comment on the line above
         place = Place(file or "tolerance line", numbers[k] if k < len(numbers) else k + 1)
-        reader.read(Record(words[0], tuple(words[1:]), line, place))
+        comment, _, text = (*lines[k + 1 : k + 2], "")[0].partition(" ")
+        reader.read(Record(words[0], tuple(words[1:]), line, place), text.strip() if comment == "TCMM" else "")
     return reader.result()
 
 
@@ -100,12 +110,13 @@ def _source(record: Record) -> str:
 
 
 class _Reader:
-    """The rows while lines are read; `distribution` and `sigmas` are those of the last STAT."""
+    """The rows while lines are read; drawn: the distribution of the last STAT; pivot: the code of the last MPVT."""
 
     def __init__(self, lens: Lens):
         self.lens, self.data = lens, lens.optimization_data
         self.unit = 1.0 if self.data is None else self.data.unit
-        self.distribution, self.sigmas, self.wavelength = "normal", _SIGMAS, TEST_WAVELENGTH
+        self.drawn: dict[str, object] = {"distribution": "normal", "sigmas": _SIGMAS}
+        self.wavelength, self.pivot = TEST_WAVELENGTH, 0
         self.rows: list[Tolerance] = []
         self.compensators: list[Compensator] = []
         self.saves: list[tuple[int, int]] = []
@@ -115,12 +126,12 @@ class _Reader:
         rows = tuple(self.rows)
         return ToleranceLines(rows, tuple(self.compensators), self.wavelength, tuple(self.saves), tuple(self.unread))
 
-    def read(self, record: Record) -> None:
+    def read(self, record: Record, comment: str = "") -> None:
         name = record.keyword
         if name == "TWAV":
             self.wavelength = self._positive(record, 2, "test wavelength in µm")
         elif name == "STAT":
-            self._statistics(record)
+            self._statistics(record, comment)
         elif name == "SAVE":
             if self.rows:
                 self.saves.append((len(self.rows) - 1, record.integer(0, "number of the file", 0)))
@@ -128,12 +139,19 @@ class _Reader:
             self._compensator(record)
         elif name == "TMCO":
             self._operand(record)
-        elif name == "TEZI":
-            self._zernike(record)
+        elif name == "MPVT":
+            self.pivot = record.integer(0, "pivot", 0)
+            if self.pivot not in range(5):
+                raise LensFileError(f"MPVT: pivot {self.pivot}, expected 0 to 4", record.place)
+        elif name in _RADIAL:
+            for component in _RADIAL[name]:
+                self._motion(record, component, math.sqrt(0.5), group=_source(record))
+        elif name in _TERMS:
+            self._terms(record, *_TERMS[name])
         elif name == "TPAR" or name in _BREAKS:
             self._parameter(record)
-        elif name in _KINDS:
-            self._row(record, _KINDS[name])
+        elif name in _KINDS or name in _ROLLS:
+            self._motion(record, name)
         else:
             self._leave(record, _UNREAD.get(name, "an operand that is not known"))
 
@@ -143,8 +161,7 @@ class _Reader:
     def _add(self, record: Record, kind: str, surfaces: tuple[int, ...], low: float, high: float, **more) -> None:
         if low > high:
             raise LensFileError(f"{record.keyword}: minimum {low:g} above maximum {high:g}", record.place)
-        given = {"distribution": self.distribution, "sigmas": self.sigmas, "source": _source(record)}
-        self.rows.append(Tolerance(kind, surfaces, low, high, **(given | more)))
+        self.rows.append(Tolerance(kind, surfaces, low, high, **({**self.drawn, "source": _source(record)} | more)))
 
     def _limits(self, record: Record, power: int = 0) -> tuple[float, float]:
         low, high = record.number(2, "minimum"), record.number(3, "maximum")
@@ -163,33 +180,95 @@ class _Reader:
             raise LensFileError(f"{record.keyword}: {quantity} is {number:g}, expected more than 0", record.place)
         return number
 
-    def _row(self, record: Record, kind: str) -> None:
-        low, high = self._limits(record, KINDS[kind].length)
-        more, first = {}, self._surface(record, 0)
+    def _motion(self, record: Record, operand: str, part: float = 1.0, **more) -> None:
+        """A row by the rule of an operand, with a part of the limits."""
+        if operand in _ROLLS:
+            self._roll(record, *_ROLLS[operand], part, **more)
+        else:
+            self._row(record, _KINDS[operand], part, **more)
+
+    def _element(self, record: Record) -> tuple[int, int]:
+        first = self._surface(record, 0)
+        last = self._surface(record, 1) or first
+        if last < first:
+            raise LensFileError(f"{record.keyword}: last surface {last} before {first}", record.place)
+        return first, last
+
+    def _depth(self, first: int, k: int) -> float:
+        """How far the vertex of a surface lies behind that of the first, mm."""
+        return sum(float(surface.thickness) for surface in self.lens.surfaces[first:k])
+
+    def _pivot(self, record: Record, first: int, last: int) -> float:
+        """How far the pivot of the last MPVT lies behind the vertex of the first surface, mm."""
+        whole = self._depth(first, last)
+        if self.pivot in (0, 1, 4):
+            return {0: 0.0, 1: whole, 4: 0.5 * whole}[self.pivot]
+        k, vertex = (first, 0.0) if self.pivot == 2 else (last, whole)
+        h = self.lens.surfaces[k].semi_diameter
+        if h is None:
+            raise LensFileError(f"MPVT: surface {k} has no semi-diameter (DIAM), and no edge", record.place)
+        h = self.lens.wavelengths.new_tensor(h)
+        return vertex + float(sag_at(self.lens.surfaces[k], 0 * h, h))
+
+    def _roll(self, record: Record, axis: str, is_angle: bool, part: float, **more) -> None:
+        """A roll on a spherical seat is a tilt about its centre of curvature; on a plane it is a decentre."""
+        first, last = self._element(record)
+        seat = record.integer(4, "seat", 0) or first
+        if not first <= seat <= last:
+            message = f"{record.keyword}: the seat, surface {seat}, is not one of the element {first} to {last}"
+            raise LensFileError(message, record.place)
+        limits = [part * limit for limit in self._limits(record, 0 if is_angle else 1)]
+        surface, kind = self.lens.surfaces[seat], f"element_tilt_{axis}"
+        radius = math.inf if surface.is_plane else float(surface.radius)
+        if math.isinf(radius):
+            if is_angle:
+                return self._leave(record, f"a roll by an angle on the plane surface {seat}")
+            kind = f"element_decenter_{axis}"
+        else:
+            more["pivot"] = self._depth(first, seat) + radius
+            if not is_angle:
+                if max(map(abs, limits)) > abs(radius):
+                    message = f"{record.keyword}: a decentre beyond the radius {radius:g} mm of surface {seat}"
+                    raise LensFileError(message, record.place)
+                kind, sign = ("element_tilt_y", -1) if axis == "x" else ("element_tilt_x", 1)
+                limits = sorted(sign * math.degrees(math.asin(limit / radius)) for limit in limits)
+        self._add(record, kind, (first, last), *limits, **more)
+
+    def _row(self, record: Record, kind: str, part: float, **more) -> None:
+        low, high = (part * limit for limit in self._limits(record, KINDS[kind].length))
+        first = self._surface(record, 0)
         surfaces = (first,)
         if KINDS[kind].elements:
-            surfaces = (first, self._surface(record, 1) or first)
-            if surfaces[1] < first:
-                raise LensFileError(f"{record.keyword}: last surface {surfaces[1]} before {first}", record.place)
+            surfaces = self._element(record)
+            if kind.startswith("element_tilt") and (pivot := self._pivot(record, *surfaces)):
+                more["pivot"] = pivot
         elif kind == "thickness":
             adjuster = self._surface(record, 1, len(self.lens.surfaces) - 2)
-            more = {} if adjuster == first else {"adjust": adjuster}
+            more |= {} if adjuster == first else {"adjust": adjuster}
         elif kind == "radius" and record.integer(1, "unit", 0) == 1:  # in % of the radius
-            (low, high), more = self._limits(record), {"unit": "%"}
+            (low, high), more["unit"] = self._limits(record), "%"
         if kind == "irregularity_angle":
             kind = "irregularity"
         self._add(record, kind, surfaces, low, high, **more)
         if kind == "irregularity":
             self._add(record, "irregularity_angle", surfaces, -90.0, 90.0, distribution="uniform")
 
-    def _statistics(self, record: Record) -> None:
+    def _statistics(self, record: Record, comment: str) -> None:
         code, sigmas = record.integer(0, "distribution", 0), record.number(1, "standard deviations", 0.0)
         if code not in _DISTRIBUTIONS:
-            self._leave(record, f"distribution {code}, of a table of the user; {self.distribution} is kept")
-            return
+            raise LensFileError(f"STAT: distribution {code}, expected 0 to 3", record.place)
         if sigmas < 0:
             raise LensFileError(f"STAT: {sigmas:g} standard deviations, expected more than 0", record.place)
-        self.distribution, self.sigmas = _DISTRIBUTIONS[code], sigmas or _SIGMAS
+        tables = dict(self.data.distributions) if self.data else {}
+        if _DISTRIBUTIONS[code] == "table" and comment not in tables:
+            kept = self.drawn["distribution"]
+            self._leave(
+                record, f"the table {comment or '(no comment names it)'} is not beside the file; {kept} is kept"
+            )
+            return
+        self.drawn = {"distribution": _DISTRIBUTIONS[code], "sigmas": sigmas or _SIGMAS}
+        if _DISTRIBUTIONS[code] == "table":
+            self.drawn["density"] = tables[comment]
 
     def _compensator(self, record: Record) -> None:
         limits = {"minimum": record.number(2, "minimum", 0.0), "maximum": record.number(3, "maximum", 0.0)}
@@ -241,18 +320,18 @@ class _Reader:
         surfaces = (held.number,) if held.number else ()
         self._add(record, "operand", surfaces, low, high, operand=operand, configuration=configuration)
 
-    def _zernike(self, record: Record) -> None:
+    def _terms(self, record: Record, kind: str, length: int) -> None:
         k, most = self._surface(record, 0), record.integer(1, "highest term")
-        rms, least = self._limits(record, 1)[1], record.integer(4, "lowest term", 0) or 2
-        if not 2 <= least <= most <= 231:
-            message = f"terms {least} to {most}, expected numbers of Noll's from 2 to 231"
-            raise LensFileError(f"TEZI: {message}", record.place)
-        if rms < 0:
-            raise LensFileError(f"TEZI: an RMS of {rms:g}, expected 0 or more", record.place)
-        share = rms / math.sqrt(most - least + 1)
+        size, least = self._limits(record, length)[1], record.integer(4, "lowest term", 0) or 2
+        if not 2 <= least <= most <= MOST_TERM[kind]:
+            message = f"terms {least} to {most}, expected numbers from 2 to {MOST_TERM[kind]}"
+            raise LensFileError(f"{record.keyword}: {message}", record.place)
+        if size < 0:
+            raise LensFileError(f"{record.keyword}: a maximum of {size:g}, expected 0 or more", record.place)
+        share = size / math.sqrt(most - least + 1)
+        more = {"distribution": "end_points", "group": _source(record) if most > least else ""}
         for term in range(least, most + 1):
-            group = _source(record) if most > least else ""
-            self._add(record, "zernike", (k,), -share, share, term=term, group=group)
+            self._add(record, kind, (k,), -share, share, term=term, **more)
 
     def _parameter(self, record: Record) -> None:
         if record.keyword in _BREAKS:

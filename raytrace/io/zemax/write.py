@@ -140,7 +140,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         *([] if aiming == "auto" else [f"RAIM 0 {AIMINGS.index(aiming)} 1 1 0 0 0 0 0"]),
         "PUSH 0 0 0 0 0 0",
         margin_line(lens.optimization_data),
-        f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
+        f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 {int(lens.afocal)}",
         "ROPD 2",
         "PICB 1",
         *_fields((fields.x, fields.y, fields.weight, *vignetting), place),

@@ -9,8 +9,16 @@ from functools import partial
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from raytrace.analysis.chief import NEAR_AXIS, NEAR_CHIEF, focus_of_close_rays, relative_error
+from raytrace.analysis.chief import (
+    NEAR_AXIS,
+    NEAR_CHIEF,
+    distortion_of,
+    focus_of_close_rays,
+    lateral_colour_of,
+    relative_error,
+)
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
 from raytrace.maths.numerics import dot_2, value_of
 from raytrace.optimization.lens_state import LensState, largest_field, listed
@@ -31,6 +39,7 @@ from raytrace.optimization.operands.paraxial import (
     field_of,
     paraxial_image_distance,
 )
+from raytrace.system.lens import Lens
 from raytrace.system.surface import is_even, ynu
 from raytrace.tracing.launch import vignette
 from raytrace.tracing.trace import is_bent
@@ -40,9 +49,8 @@ _FIELDS = 30  # of the fit of f θ
 # -- rays of the whole pupil, without vignetting -----------------------------------------------------------------------
 
 
-def unvignetted(planner: Planner, field: tuple[float, float], pupil: tuple[float, float]) -> tuple[float, float]:
-    """The pupil point that vignetting factors take to a point of the whole pupil."""
-    lens = planner.lens
+def unvignetted(lens: Lens, field: tuple[float, float], pupil: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+    """The pupil point that vignetting factors take to a point of the whole pupil, by default its centre."""
     if lens.fields.vignetting is None:
         return pupil
     at = largest_field(lens) * torch.tensor(field, dtype=torch.float64)[:, None]
@@ -53,15 +61,15 @@ def unvignetted(planner: Planner, field: tuple[float, float], pupil: tuple[float
 
 
 def _chief(line: Line, planner: Planner, field: tuple[float, float], wavelength: int) -> int:
-    return planner.ray(line, field=field, pupil=unvignetted(planner, field, (0.0, 0.0)), wavelength=wavelength)
+    return planner.ray(line, field=field, pupil=unvignetted(planner.lens, field), wavelength=wavelength)
 
 
 # -- colours -----------------------------------------------------------------------------------------------------------
 
 
 def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """The axial crossing of one wavelength less that of another."""
-    side = _side(planner)
+    """The axial crossing of one wavelength less that of another, along the light."""
+    side = _side(planner) * float(np.sign(planner.view.indices[0][-2]))
 
     def row(line: Line) -> Callable[[EvaluationContext], object]:
         zone, (first, second) = line.row.numbers[0], _two_wavelengths(line, planner)
@@ -83,19 +91,40 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
 
 def _lateral_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """y of the chief ray of the largest field of one wavelength, less that of another."""
+    """Height of the chief ray of the largest field of one wavelength, less that of another."""
     side, field = _side(planner), field_of(planner, 0)
     waves = [_two_wavelengths(line, planner) for line in lines]
+    if is_bent(planner.lens):
+        fields, (first, second) = _points(planner, [field]), np.array(waves).T
+
+        def shifts(lens: Lens) -> list[Tensor]:
+            colour = lateral_colour_of(lens, fields)
+            shift = torch.where(colour.valid, colour.shift, torch.nan)[0]
+            return [*(side * (shift[first] - shift[second]))]
+
+        return _by_analysis(shifts)
     first, second = (
         np.array([_chief(line, planner, field, pair[k]) for line, pair in zip(lines, waves, strict=True)])
         for k in range(2)
     )
+    x, y = along(field)
 
     def evaluate(context: EvaluationContext) -> RowValues:
         a, b = context.hits(first), context.hits(second)
-        return RowValues(known(a.valid & b.valid, side * (a.position[1] - b.position[1])))
+        apart = x * (a.position[0] - b.position[0]) + y * (a.position[1] - b.position[1])
+        return RowValues(known(a.valid & b.valid, side * apart))
 
     return evaluate
+
+
+def _by_analysis(numbers: Callable[[Lens], Sequence[Tensor]]) -> Evaluate:
+    """Rows of numbers () that an analysis computes from the lens."""
+    return lambda context: RowValues(listed(context.state.through_torch(numbers), context.state.count))
+
+
+def _points(planner: Planner, fields: Sequence[tuple[float, float]]) -> Tensor:
+    """Fields (2, F) in the lens's own kind of field, of parts of the largest radius."""
+    return largest_field(planner.lens) * torch.tensor(fields, dtype=torch.float64).T
 
 
 def _side(planner: Planner) -> float:
@@ -169,10 +198,26 @@ def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
 def _distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """100 (h/h₀ - 1) in %, or h - h₀ where the number in the column of Hx is not 0; h₀ by a ray near the axis."""
-    fields = [field_of(planner, line.row.integers[0]) for line in lines]
+    return _distortion_of(lines, planner, [field_of(planner, line.row.integers[0]) for line in lines])
+
+
+def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tuple[float, float]]) -> Evaluate:
+    """The distortion of a field of each row, by rays; of bent axes and fields that are images by the analysis."""
     for line, field in zip(lines, fields, strict=True):
         if not any(field) or not largest_field(planner.lens):
             raise BadRow(line, f"names field {line.row.integers[0]}, on the axis, where nothing is distorted")
+    absolute = np.array([bool(line.row.numbers[0]) for line in lines])
+    if is_bent(planner.lens) or planner.lens.fields.kind == "real_image_height":
+        points, waves = _points(planner, fields), [line.wavelength for line in lines]
+
+        def errors(lens: Lens) -> list[Tensor]:
+            curve = distortion_of(lens, points)
+            relative, height = (part[range(len(waves)), waves] for part in (curve.f_tan, curve.height))
+            lengths = height * relative / (1 + relative) / planner.unit
+            error = torch.where(torch.from_numpy(absolute), lengths, 100 * relative)
+            return [*torch.where(curve.valid[range(len(waves)), waves], error, torch.nan)]
+
+        return _by_analysis(errors)
     close = [tuple(NEAR_AXIS * part for part in field) for field in fields]
     far, near = (
         np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, at, strict=True)])
@@ -180,7 +225,6 @@ def _distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     )
     meridian = np.array([along(field) for field in fields]).T
     extent, close_extent = (np.array([_extent(planner, field) for field in at]) for at in (fields, close))
-    absolute = np.array([bool(line.row.numbers[0]) for line in lines])
 
     def evaluate(context: EvaluationContext) -> RowValues:
         hits, close_hits = context.hits(far), context.hits(near)
@@ -199,9 +243,26 @@ def _extent(planner: Planner, field: tuple[float, float]) -> float:
 
 
 def _largest_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """|distortion|, or the target where that is met."""
-    distortion, targets = _distortion(lines, planner), np.array([line.row.target for line in lines])
-    return lambda context: RowValues(np.maximum(np.abs(distortion(context).values), targets))
+    """The largest |distortion| of the fields of each row, or the target where that is met."""
+    each = [(row, field) for row, line in enumerate(lines) for field in _fields_of(line, planner)]
+    rows, targets = np.array([row for row, _ in each]), np.array([line.row.target for line in lines])
+    distortion = _distortion_of([lines[row] for row in rows], planner, [field for _, field in each])
+    no_surface = np.zeros(len(rows), dtype=int)
+
+    def evaluate(context: EvaluationContext) -> RowValues:
+        sizes = np.abs(distortion(context).values)
+        values = value_of(sizes)
+        largest = [int(np.flatnonzero(rows == row)[np.argmax(values[rows == row])]) for row in range(len(lines))]
+        return RowValues(np.maximum(sizes[largest], targets), sides=(rows, sizes - targets[rows], no_surface))
+
+    return evaluate
+
+
+def _fields_of(line: Line, planner: Planner) -> list[tuple[float, float]]:
+    """The field of a row, or as many up to it as the number in the column of Hy counts with the axis."""
+    x, y = field_of(planner, line.row.integers[0])
+    last = max(round(line.row.numbers[1]) - 1, 1)
+    return [(k / last * x, k / last * y) for k in range(1, last + 1)]
 
 
 def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -239,7 +300,8 @@ def _field_curvature(lines: Sequence[Line], planner: Planner, *, across: bool) -
 
     def rays(side: float) -> np.ndarray:
         points = [
-            unvignetted(planner, line.field, (side * x, side * y)) for line, (x, y) in zip(lines, sections, strict=True)
+            unvignetted(planner.lens, line.field, (side * x, side * y))
+            for line, (x, y) in zip(lines, sections, strict=True)
         ]
         return np.array([planner.ray(line, pupil=point) for line, point in zip(lines, points, strict=True)])
 
@@ -301,8 +363,10 @@ ABERRATIONS = {
         _largest_distortion,
         "|distortion| of a field (0: the largest) at a wavelength is meant to be below the target: its value in %, or "
         f"{_OR_LENGTHS}, or the target itself where that is met",
-        convention="of the largest field alone where the field is 0; the ideal height by a chief ray near the axis",
+        convention="of that field alone; where the number in the column of Hy is above 1, the largest of so many "
+        "fields from the axis to it; the ideal height by a chief ray near the axis",
         takes=("field", "wavelength"),
+        bounds="<=",
     ),
     "DISC": Operand(
         _calibrated_distortion,

@@ -4,6 +4,9 @@ A row over several surfaces is its target if all of them comply, else less, or m
 error is 0, with zero derivatives, where the boundary is kept, and grows continuously where it is passed. Coordinate
 breaks are no surfaces here: a gap ends at the next surface that is none. A surface that closes before its semi-diameter
 has no edge: the difference is a violation of every row of edges, least or largest.
+
+The edge of a row is where OpticStudio has it, each surface at its own semi-diameter; where the last of its four numbers
+(Py) is not 0 it is at the common rim (`tracing.geometry.rims`), as in the boundaries of default merit functions.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -29,6 +32,7 @@ from raytrace.optimization.operands.operand import (
 from raytrace.system.lens import media
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
+from raytrace.tracing.geometry import edge_thickness, rims
 
 
 class SemiDiameters:
@@ -101,6 +105,9 @@ class SemiDiameters:
 #: The point on the edge of a surface, by the code of a row: +y, +x, -y, -x.
 SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 
+#: What the code of a row at the common rim has in addition, and the numbers of such a row.
+RIM, AT_RIM = len(SIDES), (0.0, 0.0, 0.0, 1.0)
+
 _EDGE = 1e-4  # of 1 - (1+k) c² s²: from where the root of a conic is continued
 
 
@@ -137,28 +144,36 @@ class Gaps:
 
     @once_a_context
     def edge(self, context: EvaluationContext, code: int):
-        """mm at the edge: t + z′ - z, each surface at its own semi-diameter; code: the number of a side in `SIDES`."""
-        z = self.sag(context, code)
-        return self.centre(context) + (z[self.end] - z)
+        """mm at the edge; code: the number of a side in `SIDES`, plus RIM at the common rim."""
+        return edge_thickness(self.centre(context), *self.sags(context, code))
 
     def whole(self, context: EvaluationContext, code: int):
         """mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
-        z = self.sag(context, code)
-        return self.centre(context) + (np.maximum(z[self.end], 0.0) - np.minimum(z, 0.0))
+        front, back = self.sags(context, code)
+        return self.centre(context) + (np.maximum(back, 0.0) - np.minimum(front, 0.0))
 
     @once_a_context
-    def sag(self, context: EvaluationContext, code: int):
-        """mm at the semi-diameters."""
-        state, heights, (x, y) = context.state, self.semi_diameters.at(context), SIDES[code]
-        sag = self._even_sag(state, heights)
-        asked = [k for k in self.others if not np.isnan(value_of(heights)[k])]
-        if not asked:
+    def sags(self, context: EvaluationContext, code: int) -> tuple:
+        """mm (S,) of the surfaces on both sides of every gap, each at its own semi-diameter or both at the rim."""
+        sizes, every = self.semi_diameters.at(context), np.arange(len(self.end))
+        if code < RIM:
+            own = self._sag(context, code, every, sizes)
+            return own, own[self.end]
+        rim = rims(sizes, self.end, ~self.is_air & (self.end > every))
+        return tuple(self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
+
+    def _sag(self, context: EvaluationContext, code: int, surfaces: np.ndarray, heights):
+        """mm (S,) of surfaces at heights (S,)."""
+        state, (x, y) = context.state, SIDES[code]
+        sag = self._even_sag(state, surfaces, heights)
+        asked = np.flatnonzero(np.isin(surfaces, self.others) & ~np.isnan(value_of(heights)))
+        if not asked.size:
             return sag
         values, slopes = value_of(sag).copy(), slope_of(sag, state.count).copy()
-        for k in asked:
-            sag_of_k = lambda lens, s, k=k: sag_at(lens.surfaces[k], x * s, y * s)  # noqa: E731
-            z = state.each_through_torch(sag_of_k, [heights[k : k + 1]])
-            values[k], slopes[:, k] = value_of(z)[0], slope_of(z, state.count)[:, 0]
+        for place in asked:
+            sag_of = lambda lens, s, k=surfaces[place]: sag_at(lens.surfaces[k], x * s, y * s)  # noqa: E731
+            z = state.each_through_torch(sag_of, [heights[place : place + 1]])
+            values[place], slopes[:, place] = value_of(z)[0], slope_of(z, state.count)[:, 0]
         return Dual(values, slopes) if state.count else values
 
     @once_a_context
@@ -168,21 +183,22 @@ class Gaps:
         q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
         """
         heights = self.semi_diameters.at(context)
-        return 0.5 * heights * (self._closing(context.state, heights * heights) - 1.0)
+        every = np.arange(len(self.end))
+        return 0.5 * heights * (self._closing(context.state, every, heights * heights) - 1.0)
 
-    def _closing(self, state: LensState, u):
+    def _closing(self, state: LensState, surfaces: np.ndarray, u):
         """(1+k) c² u, which is 1 at the edge of a closed conic."""
-        c = state.of_surfaces("curvature")
-        return (1 + state.of_surfaces("conic")) * (c * c) * u
+        c = state.of_surfaces("curvature")[surfaces]
+        return (1 + state.of_surfaces("conic")[surfaces]) * (c * c) * u
 
-    def _even_sag(self, state: LensState, heights):
+    def _even_sag(self, state: LensState, surfaces: np.ndarray, heights):
         """c u/(1 + √(1 - q)) + Σ a_j u^j, u = s², q = (1+k) c² u.
 
         Of a conic that closes within s, from 1 - q = ε on, 1 - q is ε/(1 + τ + τ²), τ = 1 - (1 - q)/ε: above 0, with
         two continuous derivatives.
         """
-        u, c = heights * heights, state.of_surfaces("curvature")
-        left = 1 - self._closing(state, u)
+        u, c = heights * heights, state.of_surfaces("curvature")[surfaces]
+        left = 1 - self._closing(state, surfaces, u)
         closed = value_of(left) < _EDGE
         if closed.any():
             over = np.where(closed, 1 - left / _EDGE, 0.0)
@@ -190,7 +206,7 @@ class Gaps:
         sag = c * u / (1 + np.sqrt(left))
         power = u
         for name in self.terms:
-            sag = sag + power * state.of_surfaces(name)
+            sag = sag + power * state.of_surfaces(name)[surfaces]
             power = power * u
         return sag
 
@@ -240,7 +256,11 @@ Chosen = Callable[[Line, Planner], list[tuple[int, int]]]
 def _single(line: Line, planner: Planner) -> list[tuple[int, int]]:
     """The surface of a row, and the side of its edge. Raises BadRow."""
     surface, code = planner.checked(line, line.row.integers[0]), line.row.integers[1]
-    return [(surface, code if 0 <= code < len(SIDES) else 0)]
+    return [(surface, (code if 0 <= code < len(SIDES) else 0) + _rim_of(line))]
+
+
+def _rim_of(line: Line) -> int:
+    return RIM if line.pupil[1] else 0
 
 
 def _range(line: Line, planner: Planner, *, air: bool | None = None) -> list[tuple[int, int]]:
@@ -251,7 +271,8 @@ def _range(line: Line, planner: Planner, *, air: bool | None = None) -> list[tup
     first, last = line.row.integers
     surfaces = range(max(first, 1), min(last, planner.image - 1) + 1)
     is_air = planner.shared(Gaps).is_air
-    return [(k, 0) for k in surfaces if not planner.lens.surfaces[k].is_break and air in (None, is_air[k])]
+    chosen = (k for k in surfaces if not planner.lens.surfaces[k].is_break and air in (None, is_air[k]))
+    return [(k, _rim_of(line)) for k in chosen]
 
 
 _in_glass, _in_air = partial(_range, air=False), partial(_range, air=True)
@@ -276,6 +297,8 @@ class _Places:
         if amount.needs:
             ends = self.gaps.end[self.surfaces] if amount.needs == "edges" else self.surfaces
             self.gaps.semi_diameters.ask([*self.surfaces.tolist(), *ends.tolist()])
+            if amount.needs == "edges" and max(self.each, default=0) >= RIM:  # of the elements on both sides
+                self.gaps.semi_diameters.ask(range(1, len(self.gaps.end)))
 
     def values(self, context: EvaluationContext) -> np.ndarray:
         """Without derivatives."""
@@ -354,7 +377,7 @@ _SIDE = "thickness at the edge behind surface int1; int2: 0 +y, 1 +x, 2 -y, 3 -x
 _WHOLE = "thickness behind surface int1 between the extreme points of both surfaces"
 
 _CENTRE_ALONG = Amount(lambda gaps, context, code: gaps.side * gaps.centre(context), 1)
-_EDGE_ALONG = Amount(lambda gaps, context, code: gaps.side * gaps.edge(context, 0), 1, "edges")
+_EDGE_ALONG = Amount(lambda gaps, context, code: gaps.side * gaps.edge(context, code), 1, "edges")
 _SEMI_DIAMETER = Amount(lambda gaps, context, code: gaps.semi_diameters.at(context), 1, "semi-diameters")
 _SLENDERNESS = Amount(lambda gaps, context, code: gaps.slenderness(context), needs="semi-diameters")
 _INDEX = Amount(lambda gaps, context, code: gaps.of_glass(context, lambda d, F, C: d))

@@ -31,7 +31,7 @@ from raytrace.optimization.operands.operand import (
 )
 from raytrace.optimization.operands.paraxial import image_index
 from raytrace.optimization.operands.wavefront import beam_of, colours_of, rings, sphere_of
-from raytrace.psf_models.wave import strehl
+from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.trace import is_bent

@@ -19,6 +19,7 @@ from raytrace.optimization.variables import View
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import joined
+from raytrace.system.surface import is_flat
 from raytrace.tracing.launch import is_at_infinity
 from raytrace.words import did_you_mean
 
@@ -187,6 +188,8 @@ class Planner:
             have = len(self.view.wavelengths)
             raise BadRow(line, f"names wavelength {number + 1}: this lens has wavelengths 1 to {have}")
         last = self.image if surface is None else self.checked(line, surface)
+        if last == 0 and not is_flat(self.lens.surfaces[0]):
+            raise BadRow(line, "names surface 0, a curved or tilted object, on which rays are not evaluated")
         of, at = line.field if field is None else field, line.pupil if pupil is None else pupil
         return self.ask(number, of, at, surface=last)
 

@@ -23,6 +23,7 @@ from raytrace.optimization.operands.operand import (
     per_row,
 )
 from raytrace.tracing.paraxial import chief_ray, petzval_sum
+from raytrace.tracing.paraxial import largest_field as outermost_field
 
 _RIM = 32  # rays of the outline of a cone
 
@@ -115,11 +116,12 @@ def image_index(context: EvaluationContext, wavelengths: Sequence[int]):
 
 
 def field_of(planner: Planner, number: int) -> tuple[float, float]:
-    """A field of the lens by its number, as a part of the largest radius; 0: the largest, along y."""
+    """A field of the lens by its number, as a part of the largest radius; 0: the largest, `paraxial.largest_field`."""
     fields, largest = planner.lens.fields, largest_field(planner.lens)
-    if number == 0 or largest == 0:
+    if largest == 0:
         return 0.0, float(number == 0)
-    return float(fields.x[number - 1]) / largest, float(fields.y[number - 1]) / largest
+    x, y = outermost_field(planner.lens)[:, 0] if number == 0 else (fields.x[number - 1], fields.y[number - 1])
+    return float(x) / largest, float(y) / largest
 
 
 def along(field: tuple[float, float]) -> tuple[float, float]:

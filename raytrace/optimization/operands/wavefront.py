@@ -28,6 +28,7 @@ from raytrace.optimization.operands.operand import (
     per_row,
 )
 from raytrace.optimization.operands.paraxial import image_index
+from raytrace.system.surface import is_flat
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import path_to_reference_sphere
@@ -198,8 +199,8 @@ def _path_of(
     first, last = sorted((first, last))
     source = planner.lens.surfaces[0]
     from_object = first == 0 and bool(source.thickness.isfinite())
-    if from_object and not source.is_plane:
-        raise BadRow(line, "measures from a curved object, which it cannot; name another surface")
+    if from_object and not is_flat(source):
+        raise BadRow(line, "measures from a curved or tilted object, which it cannot; name another surface")
     first = max(first, 1)
     start, end = (np.array([planner.ray(line, surface=s, wavelength=wavelength)]) for s in (first, max(last, 1)))
 

@@ -44,6 +44,16 @@ function words(value, digits = 4) {
 const unitOf = (lens) => lens.fields.unit.replace("degrees", "°");
 const typed = (value) => (value === null ? "∞" : String(+value.toPrecision(9)));
 
+// Whether a number is between the ends of a slider, which a drag to an end may miss by a rounding.
+const within = (value, ends) => Boolean(ends) && Math.abs(2 * value - ends.low - ends.high) <= (1 + 1e-9) * (ends.high - ends.low);
+
+// The number of a curve at x; null outside of the curve and where a number is missing.
+function between(xs, ys, x) {
+  const k = xs.findIndex((one, i) => i > 0 && (one - x) * (xs[i - 1] - x) <= 0);
+  if (k < 1 || ys[k] === null || ys[k - 1] === null) return null;
+  return xs[k] === xs[k - 1] ? ys[k] : ys[k - 1] + ((ys[k] - ys[k - 1]) * (x - xs[k - 1])) / (xs[k] - xs[k - 1]);
+}
+
 function ticks(low, high, count) {
   const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= raw * 0.999);
@@ -86,7 +96,9 @@ function axes(target, width, height, { x, y, left = 40, bottom = 26, top = 6, ri
   target.append(frame);
   const curves = svg("g", { class: "data" });
   target.append(curves);
-  return { at, up, curves };
+  const atOf = (px) => x[0] + ((px - left) / (width - left - right)) * (x[1] - x[0]);
+  const upOf = (py) => y[0] + ((height - bottom - py) / (height - bottom - top)) * (y[1] - y[0]);
+  return { at, up, atOf, upOf, curves };
 }
 
 // The path of a curve, broken where a number is missing.
@@ -101,6 +113,7 @@ function curve(xs, ys, at, up) {
 
 const line = (path, colour, more = {}) => svg("path", { d: path, stroke: colour, fill: "none", ...more });
 
+// A figure; its `read(px, py)` is the read-out under the pointer, lines of text.
 function figure(name, title, width, height, label) {
   const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img", "aria-label": label, "data-figure": name });
   return picture;
@@ -115,8 +128,9 @@ function drawLayout(target, now, stored) {
     limits[axis] = [Math.min(limits[axis][0], stored.layout[axis][0]), Math.max(limits[axis][1], stored.layout[axis][1])];
   }
   const scale = Math.min(width / (limits.x[1] - limits.x[0]), height / (limits.y[1] - limits.y[0]));
-  const at = (v) => width / 2 + (v - (limits.x[0] + limits.x[1]) / 2) * scale;
-  const up = (v) => height / 2 - (v - (limits.y[0] + limits.y[1]) / 2) * scale;
+  const middle = (axis) => (limits[axis][0] + limits[axis][1]) / 2;
+  const at = (v) => width / 2 + (v - middle("x")) * scale;
+  const up = (v) => height / 2 - (v - middle("y")) * scale;
   const picture = figure("layout", "", width, height, `Cross section with the rays of fields ${now.fields.join(", ")}`);
   const draw = (shape, faint) => {
     const d = curve(shape.points[0], shape.points[1], at, up);
@@ -132,6 +146,7 @@ function drawLayout(target, now, stored) {
     const ray = /ray/.test(shape.id);
     return svg("path", { d, class: ray ? "data" : "", fill: "none", stroke: INKS[shape.stroke] || shape.stroke, "stroke-width": shape.width, ...(shape.dashed ? { "stroke-dasharray": ray ? "4 2" : "9 3 2 3", opacity: ray ? 0.5 : 1 } : {}) });
   };
+  picture.read = (px, py) => [`z ${words(middle("x") + (px - width / 2) / scale)} mm`, `y ${words(middle("y") - (py - height / 2) / scale)} mm`];
   if (stored && stored.layout) for (const shape of stored.layout.shapes) if (shape.kind === "area" && /glass/.test(shape.id)) picture.append(draw(shape, true));
   for (const kind of ["area", "line", "mark", "text"]) for (const shape of shapes) if (shape.kind === kind) picture.append(draw(shape, false));
   target.replaceChildren(picture);
@@ -153,6 +168,7 @@ function drawSpots(target, now, stored) {
     const text = rms === null ? "no ray arrives" : `RMS ${words(rms)} µm`;
     const picture = figure(`spot-${f}`, "", size, size, `Spot of field ${field}: ${text}`);
     const scale = size / (2 * half);
+    picture.read = (px, py) => [`x ${words((px - size / 2) / scale, 3)} µm`, `y ${words((size / 2 - py) / scale, 3)} µm`, "from the centroid"];
     picture.append(svg("rect", { x: 0.5, y: 0.5, width: size - 1, height: size - 1, class: "frame" }));
     if (spots.airy) picture.append(svg("circle", { cx: size / 2, cy: size / 2, r: spots.airy * scale, class: "airy" }));
     const data = svg("g", { class: "data" });
@@ -187,13 +203,21 @@ function drawFans(target, now, stored) {
   target.replaceChildren();
   now.fields.forEach((field, f) => {
     const picture = figure(`fan-${f}`, "", width, height, `Ray fans of field ${field}, within ±${words(top, 3)} µm`);
+    const pupils = [];
+    picture.read = (px) => {
+      const s = px > LEFT + (width - LEFT) / 2 ? 1 : 0, pupil = pupils[s](px);
+      if (Math.abs(pupil) > 1) return [];
+      const values = fans[s ? "sagittal" : "tangential"][f].map((one, w) => `${words(now.wavelengths[w])} µm: ${words(between(fans.pupil, one, pupil), 3)} µm`);
+      return [`pupil ${s ? "x" : "y"} ${words(pupil, 3)}`, ...values];
+    };
     ["tangential", "sagittal"].forEach((section, s) => {
       const part = svg("g", { transform: `translate(${s ? LEFT + (width - LEFT) / 2 : 0} 0)` });
       const last = f === rows - 1;
-      const { at, up, curves } = axes(part, s ? (width - LEFT) / 2 : LEFT + (width - LEFT) / 2, height, {
+      const { at, up, atOf, curves } = axes(part, s ? (width - LEFT) / 2 : LEFT + (width - LEFT) / 2, height, {
         x: [-1, 1], y: [-top, top], left: s ? 10 : LEFT, right: 8, top: 14, bottom: last ? 24 : 6,
         ticksX: last ? 2 : 0, ticksY: s ? 0 : 5, xlabel: last ? (s ? "pupil x" : "pupil y") : "",
       });
+      pupils.push((px) => atOf(s ? px - LEFT - (width - LEFT) / 2 : px));
       part.append(svg("line", { x1: at(0), x2: at(0), y1: 14, y2: height - (last ? 24 : 6), class: "zero" }), svg("line", { x1: at(-1), x2: at(1), y1: up(0), y2: up(0), class: "zero" }));
       if (stored && stored.fans && stored.fans[section][f]) stored.fans[section][f].forEach((values) => curves.append(line(curve(stored.fans.pupil, values, at, up), "var(--grey)", { "stroke-dasharray": "2 2" })));
       fans[section][f].forEach((values, w) => curves.append(line(curve(fans.pupil, values, at, up), now.wavelength_colours[w], { "stroke-width": 1.3, "data-curve": `${section}-${f}-${w}` })));
@@ -211,7 +235,12 @@ function drawMtf(target, now, stored, highest) {
   if (!found) return empty(target, "mtf", "no MTF");
   const width = target.clientWidth || 300, height = target.clientHeight || 200;
   const picture = figure("mtf", "", width, height, `MTF (${found.transfer}) to ${words(found.frequency.at(-1))} cycles per mm`);
-  const { at, up, curves } = axes(picture, width, height, { x: [0, highest], y: [0, 1], left: 30, xlabel: "cycles/mm", ticksY: 5 });
+  const { at, up, atOf, curves } = axes(picture, width, height, { x: [0, highest], y: [0, 1], left: 30, xlabel: "cycles/mm", ticksY: 5 });
+  picture.read = (px) => {
+    const frequency = atOf(px), value = (values) => words(between(found.frequency, values, frequency), 3);
+    if (frequency < 0 || frequency > found.frequency.at(-1)) return [];
+    return [`${words(frequency, 3)}/mm`, ...now.fields.map((field, f) => `${field}: T ${value(found.tangential[f])}, S ${value(found.sagittal[f])}`)];
+  };
   if (found.limit) curves.append(line(curve(found.frequency, found.limit, at, up), "var(--grey)", { "stroke-dasharray": "1 3" }));
   for (const [source, was] of [[stored && stored.mtf, true], [found, false]]) if (source) {
     ["tangential", "sagittal"].forEach((section, s) => source[section].forEach((values, f) => {
@@ -231,7 +260,12 @@ function drawCurvature(target, now, stored, unit) {
   const all = sources.flatMap((one) => [one.tangential, one.sagittal].flat(2)).filter((one) => one !== null).map(Math.abs);
   const top = 1.05 * (Math.max(0, ...all) || 1), largest = found.field.at(-1);
   const picture = figure("curvature", "", width, height, `Field curvature within ±${words(top, 3)} mm`);
-  const { at, up, curves } = axes(picture, width, height, { x: [-top, top], y: [Math.min(0, largest), Math.max(0, largest)], left: 40, xlabel: "focus from the sensor, mm", ylabel: `field, ${unit}`, ticksX: 4 });
+  const { at, up, upOf, curves } = axes(picture, width, height, { x: [-top, top], y: [Math.min(0, largest), Math.max(0, largest)], left: 40, xlabel: "focus from the sensor, mm", ylabel: `field, ${unit}`, ticksX: 4 });
+  picture.read = (px, py) => {
+    const field = upOf(py), value = (values) => words(between(found.field, values, field), 3);
+    if (between(found.field, found.field, field) === null) return [];
+    return [`field ${words(field, 3)} ${unit}`, ...now.wavelengths.map((one, w) => `${words(one)} µm: T ${value(found.tangential[w])}, S ${value(found.sagittal[w])} mm`)];
+  };
   picture.append(svg("line", { x1: at(0), x2: at(0), y1: up(0), y2: up(largest), class: "zero" }));
   for (const [source, was] of [[stored && stored.curvature, true], [found, false]]) if (source) {
     ["tangential", "sagittal"].forEach((section, s) => source[section].forEach((values, w) => {
@@ -254,9 +288,11 @@ function drawMerit(target, merits) {
 // -- the viewer -------------------------------------------------------------------------------------------------------
 
 class Viewer {
-  constructor(root, send) {
+  constructor(root, send, keys) {
     this.root = root;
     this.transport = send;
+    this.keys = keys; // whose keys are the viewer's: all of a page, else those of the cell
+    root.tabIndex = -1; // a click beside the controls gives the keys to the cell
     this.waiting = null;
     this.busy = false;
     this.signature = "";
@@ -279,7 +315,7 @@ class Viewer {
     this.path = make("input", { type: "text", "aria-label": "file to write", className: "path", spellcheck: false, onkeydown: (e) => e.key === "Enter" && this.save() });
     this.replace = make("input", { type: "checkbox" });
     this.message = make("div", { className: "message", role: "status", "aria-live": "polite" });
-    this.latency = make("span", { className: "latency", title: "from event to new numbers" });
+    this.latency = make("span", { className: "latency", title: "the last event: computing its numbers, and from request to reply" });
     this.title = make("h1", { textContent: "Lens" });
     this.conditions = make("div", { className: "conditions" });
     this.table = make("div", { className: "table" });
@@ -295,6 +331,7 @@ class Viewer {
     this.transfer = make("span", { className: "grey" });
     this.wavelengthKey = make("span", { className: "key" });
     this.fieldKey = make("span", { className: "key" });
+    this.readout = make("div", { className: "readout", hidden: true });
     this.problems = make("ul", { className: "problems", "aria-label": "remarks" });
     this.root.classList.add("raytrace-viewer");
     const system = matchMedia("(prefers-color-scheme: dark)"), { body } = document;
@@ -307,7 +344,7 @@ class Viewer {
         make("span", { className: "group" }, this.undo, this.redo, this.restore),
         make("label", {}, this.compare, " compare"),
         make("span", { className: "group" }, this.merit, this.optimise, this.meritCurve),
-        make("span", { className: "group save" }, this.path, button("Save", "Write the lens; the suffix selects the format: .zmx .seq .len .csv …", () => this.save()), make("label", { title: "write over a file that exists" }, this.replace, " replace"))),
+        make("span", { className: "group save" }, this.path, this.saving = button("Save", "", () => this.save()), make("label", { title: "write over a file that exists" }, this.replace, " replace"))),
       this.message,
       make("div", { className: "columns" },
         this.left = make("div", { className: "left" }, this.conditions, this.table, this.problems),
@@ -317,10 +354,24 @@ class Viewer {
           make("div", { className: "panels" },
             panel("spots", "Spots"), panel("fans", "Ray fans, µm", this.wavelengthKey),
             make("div", { className: "stack" }, panel("mtf", "MTF", lines(), this.transfer, make("label", { className: "grey" }, "to", this.frequency, "/mm")), panel("curvature", "Field curves", lines()))))),
-      make("footer", {}, make("span", { textContent: "☑ variable, S solved · Tab moves, arrows turn a slider or step a number · Ctrl+Z undo · Ctrl+Enter optimise" }), this.latency));
-    this.root.addEventListener("keydown", (e) => this.key(e));
+      make("footer", {}, make("span", { textContent: "☑ variable, S solved · Tab moves, arrows turn a slider or step a number · Ctrl+Z undo · Ctrl+Enter optimise" }), this.latency),
+      this.readout);
+    this.root.addEventListener("pointermove", (e) => this.read(e));
+    this.root.addEventListener("pointerleave", () => (this.readout.hidden = true));
+    this.keys.addEventListener("keydown", (e) => this.key(e));
     const observer = new ResizeObserver(() => this.last && this.draw());
     for (const one of Object.values(this.figures)) observer.observe(one);
+  }
+
+  // The numbers of the figure under the pointer, beside it.
+  read(e) {
+    const picture = e.target.closest(".figure svg"), box = picture && picture.getBoundingClientRect();
+    const lines = picture && picture.read ? picture.read(e.clientX - box.left, e.clientY - box.top) : [];
+    this.readout.hidden = lines.length === 0;
+    this.readout.textContent = lines.join("\n");
+    const { width, height } = this.readout.getBoundingClientRect();
+    this.readout.style.left = `${e.clientX + (e.clientX + width + 20 > innerWidth ? -width - 12 : 14)}px`;
+    this.readout.style.top = `${e.clientY + (e.clientY + height + 20 > innerHeight ? -height - 12 : 14)}px`;
   }
 
   key(e) {
@@ -370,12 +421,15 @@ class Viewer {
 
   receive(reply, event, waited) {
     if (reply.message || !["settle", "progress"].includes(event.type)) this.say(reply.message, !/^written/.test(reply.message));
-    if (reply.path) this.path.value = this.path.title = reply.path;
+    if (reply.path) {
+      this.path.value = this.path.title = reply.path;
+      this.saving.title = `Write the lens; the suffix selects the format: ${reply.formats.join(" ")}`;
+    }
     if (reply.analyses) {
       this.last = reply;
       this.prescription(reply.prescription, reply.refused);
       this.draw();
-      this.latency.textContent = `${reply.milliseconds.toFixed(0)} ms numbers, ${waited.toFixed(0)} ms with the way there`;
+      this.latency.textContent = `computed in ${reply.milliseconds.toFixed(0)} ms, replied after ${waited.toFixed(0)} ms`;
       this.root.dataset.milliseconds = reply.milliseconds;
       this.unsettled = 0; // the next field whose slower analyses are missing, null for the remarks
       this.root.dataset.count = 1 + Number(this.root.dataset.count || 0);
@@ -533,7 +587,7 @@ class Viewer {
     slider.addEventListener("change", () => { delete slider.dataset.held; moved(false); });
     vary.addEventListener("change", () => this.event({ type: "vary", surface, quantity: name, on: vary.checked }));
     this.controls.push((lens, refused) => {
-      const value = lens.rows[surface].cells[name];
+      const value = lens.rows[surface].cells[name], ends = lens.rows[surface].sliders[name];
       this.show(input, shownAs(value), refused);
       const waits = (this.queue || []).some((one) => one.type === "vary" && one.surface === surface && one.quantity === name);
       if (!waits) vary.checked = lens.rows[surface].vary.includes(name);
@@ -541,25 +595,13 @@ class Viewer {
       vary.hidden = value === null || surface === lens.rows.length - 1;
       if (value === null || slider.dataset.held) return;
       let known = range();
-      const margin = known ? 0.02 * (known.high - known.low) : 0;
-      if (!known || value < known.low + margin || value > known.high - margin) {
-        const reach = this.reach(name, value, lens.rows[surface]);
-        this.ranges.set(key, (known = { low: value - reach, high: value + reach }));
-      }
+      if (!within(value, known)) this.ranges.set(key, (known = { low: ends[0], high: ends[1] }));
+      slider.title = `${name.replaceAll("_", " ")} from ${words(known.low)} to ${words(known.high)}`;
       slider.value = Math.round((1000 * (value - known.low)) / (known.high - known.low));
       slider.setAttribute("aria-valuetext", `${shownAs(value)}`);
     });
     const mark = follows ? make("span", { className: "follows", title: "follows by a solve or pickup of the file", textContent: "S" }) : vary;
     return make("td", { className: "number" }, make("div", {}, mark, input), slider);
-  }
-
-  // How far a slider reaches to either side of a number.
-  reach(name, value, row) {
-    const radius = row.semi_diameter || 10;
-    const least = { curvature: 0.15 / radius, thickness: 1, conic: 1 }[name];
-    if (least !== undefined) return Math.max(least, (name === "curvature" ? 0.3 : 0.5) * Math.abs(value));
-    const power = /^a(\d+)$/.exec(name);
-    return Math.max(0.5 * Math.abs(value), power ? 0.02 * radius ** (1 - power[1]) : /tilt/.test(name) ? 5 : 1);
   }
 
   edit(surface, quantity, value, input) {
@@ -584,7 +626,7 @@ class Viewer {
       });
       return input;
     };
-    const slide = (name, send, at) => {
+    const slide = (name, send, at, ends) => {
       const slider = make("input", { type: "range", min: 0, max: 1000, step: 1, "aria-label": `${name}, slider`, "data-slider": name });
       let low, high;
       const moved = (drag) => this.event({ ...send, value: low + ((high - low) * slider.value) / 1000, drag });
@@ -593,7 +635,8 @@ class Viewer {
       this.controls.push((now) => {
         const value = at(now);
         if (slider.dataset.held) return;
-        if (low === undefined || value <= low * 1.02 || value >= high * 0.98) [low, high] = [0.4 * value, 1.6 * value];
+        if (!within(value, { low, high })) [low, high] = ends(now);
+        slider.title = `${name} from ${words(low)} to ${words(high)}`;
         slider.value = Math.round((1000 * (value - low)) / (high - low));
         slider.setAttribute("aria-valuetext", words(value, 5));
       });
@@ -606,7 +649,7 @@ class Viewer {
       [field("wavelengths, µm", "wavelengths", (values) => ({ type: "wavelengths", values }), (now) => listed(now.wavelengths)),
         make("label", {}, make("span", { textContent: "primary" }), select("primary wavelength", (value) => ({ type: "primary", number: Number(value) }), (now) => now.wavelengths.map((one, k) => [k + 1, words(one, 5)]), (now) => now.primary))],
       [select("kind of aperture", (kind) => ({ type: "aperture", kind }), (now) => now.aperture.kinds.map((one) => [one, KINDS[one] || one]), (now) => now.aperture.kind),
-        field("", "aperture", (value) => ({ type: "aperture", value }), (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value)],
+        field("", "aperture", (value) => ({ type: "aperture", value }), (now) => typed(now.aperture.value)), slide("aperture", { type: "aperture" }, (now) => now.aperture.value, (now) => now.aperture.slider)],
       [make("label", { className: "more" }, this.more, " all numbers (conic, asphere, tilt, …)")],
     ];
     if (lens.configurations > 1) rows[3].push(make("label", {}, make("span", { textContent: "configuration" }), select("configuration", (value) => ({ type: "configuration", number: Number(value) }), (now) => numbered(now.configurations), (now) => now.configuration)));
@@ -666,7 +709,7 @@ export function page(root, token) {
     const reply = await fetch(`event?token=${token}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ session: await session, event }) });
     if (!reply.ok) throw new Error(await reply.text());
     return reply.json();
-  });
+  }, document);
 }
 
 // A cell of a notebook.
@@ -682,7 +725,7 @@ function render({ model, el }) {
   new Viewer(el, (event) => new Promise((answer) => {
     open.set(++number, answer);
     model.send({ number, event });
-  }));
+  }), el);
   return () => model.off("msg:custom", receive);
 }
 

@@ -1,0 +1,338 @@
+"""One quantity, one value: what two functions of the package give of one lens agrees, for a zoo of lenses.
+
+Each test is a law between public functions. Lenses differ in what has made such values disagree: the medium in front
+of the sensor, obscurations and apertures that are not round, finite objects, tilts, mirrors, aspheres, configurations,
+and units of length other than mm.
+"""
+
+import dataclasses
+import functools
+import math
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from problems import MICROMETRE, PICOMETRE, own_fields
+
+import raytrace as rt
+from raytrace.analysis.setting import scene_of
+from raytrace.system.lens import Lens, media
+from raytrace.tracing.scene import beam_share
+from raytrace.tracing.spot import chief_reference, image_rays
+from raytrace.tracing.trace import is_bent, without_apertures
+from raytrace.tracing.wavefront import wavefront_of
+from raytrace.viewer.compute import spots_of
+
+CASES = Path(__file__).parent / "cases"
+EXAMPLES = Path(__file__).parents[1] / "lenses" / "examples"
+GLASS = 1.5168
+SINGLE = {"wavelengths": [0.5876]}
+
+
+def _triplet(**conditions) -> Lens:
+    return rt.read_lens("cooke_triplet").at(**{"fields": [0, 8], "ray_aiming": "real", **conditions})
+
+
+def _in_glass() -> Lens:
+    """A singlet whose sensor is cemented to its thick window."""
+    rows = [
+        dict(radius=40.0, thickness=6.0, glass=1.6),
+        dict(radius=-90.0, thickness=30.0),
+        dict(radius=math.inf, thickness=42.0, glass=GLASS),
+    ]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=8.0, fields=[0, 3], **SINGLE)
+
+
+def _with_aperture(aperture: rt.Aperture) -> Lens:
+    rows = [
+        dict(thickness=0.0, apertures=(aperture,)),
+        dict(radius=50.0, thickness=5.0, glass=1.5),
+        dict(radius=-50.0, thickness=48.0),
+    ]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=8.0, fields=[0, 4], **SINGLE)
+
+
+def _tilted() -> Lens:
+    lens = _triplet(wavelengths=[0.5876])
+    return lens.replace(3, tilt_x=0.4, y=0.05, tilt_x_after=-0.4, y_after=-0.05)
+
+
+def _inches() -> Lens:
+    lens = rt.read_lens(CASES / "inches.zmx")
+    assert float(lens.surfaces[-2].thickness) > 25.4
+    return lens
+
+
+def _zoom() -> Lens:
+    return _triplet(wavelengths=[0.5876]).with_configurations(thickness={2: [12.93, 12.8], 7: [77.4, 77.3]})
+
+
+#: Lenses that form an image; every field of each is lit.
+ZOO = {
+    "triplet": _triplet,
+    "finite object": lambda: _triplet(object_distance=400.0, sensor_distance=108.9, fields=[0, 7]),
+    "sensor in glass": _in_glass,
+    "immersed ellipsoid": lambda: rt.read_lens(CASES / "immersed_ellipsoid.zmx"),
+    "obscured": lambda: rt.read_lens("hubble"),
+    "obscured asphere": lambda: rt.read_lens(CASES / "obscured_asphere.zmx"),
+    "annulus": lambda: _with_aperture(rt.Aperture("circular", (2.0, 4.0))),
+    "rectangular stop": lambda: _with_aperture(rt.Aperture("rectangular", (3.5, 1.5))),
+    "vane": lambda: _with_aperture(rt.Aperture("rectangular", (0.5, 6.5), obscures=True)),
+    "tilted element": _tilted,
+    "mirrors off the axis": lambda: rt.read_lens(EXAMPLES / "off_axis_telescope.zmx"),
+    "folded": lambda: rt.read_lens(EXAMPLES / "folded_relay.zmx"),
+    "aspheres": lambda: rt.read_lens("phone"),
+    "vignetting factors": lambda: rt.read_lens("double_gauss_28deg").at(wavelengths=[0.546]),
+    "clipped": lambda: _triplet(**SINGLE).replace(6, apertures=(rt.Aperture("circular", (0.0, 11.0)),)),
+    "one configuration of two": lambda: dataclasses.replace(
+        _zoom().configuration(2), operands=(), current_configuration=1
+    ),
+    "inches": _inches,
+}
+
+
+#: Lenses whose last space above is only near the focus.
+UNFOCUSED = "finite object", "sensor in glass", "annulus", "rectangular stop", "vane", "inches"
+
+
+@functools.cache
+def member(name: str) -> Lens:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lens = ZOO[name]()
+        return rt.focus(lens).lens if name in UNFOCUSED else lens
+
+
+@pytest.fixture(params=ZOO)
+def lens(request) -> Lens:
+    return member(request.param)
+
+
+def relative_fields(lens: Lens) -> list[list[float]]:
+    """Hx, Hy of the lens's fields, as operands take them."""
+    fields = own_fields(lens)
+    largest = torch.hypot(*fields).max()
+    return (fields / torch.where(largest > 0, largest, 1.0)).T.tolist()
+
+
+def operand(lens: Lens, name: str, integers: tuple = (), numbers: tuple = ()) -> float:
+    """The value of one operand, in its unit."""
+    return rt.evaluate(lens, merit=rt.Merit([rt.Row(name, integers, numbers, weight=1.0)])).values.item()
+
+
+def rule_of(lens: Lens) -> float:
+    """The relative error of the default quadratures: 12 rings, whose arms end at edges where the beam is clipped."""
+    return 1e-6 if bool(rt.spot(lens).arrivals.rays.valid.all()) else 1e-3
+
+
+def quiet(law):
+    """A law is checked with warnings off: lost rays and unfilled stops are not its subject."""
+    return pytest.mark.filterwarnings("ignore")(law)
+
+
+def close(value, expected, **tolerance):
+    """Whether tensors agree, compared as lists: `pytest.approx` prints those entry by entry."""
+    return torch.as_tensor(value).flatten().tolist() == pytest.approx(
+        torch.as_tensor(expected).flatten().tolist(), **tolerance
+    )
+
+
+# -- spots ------------------------------------------------------------------------------------------------------------
+
+
+@quiet
+def test_spot_radii(lens):
+    """The radius about the centroid by `spot`, along the field, and in the viewer."""
+    spots = rt.spot(lens)
+    radii, rel = spots.whole.rms_radius, rule_of(lens)
+    curve = rt.rms_over_field(lens, spot=True, fields=own_fields(lens))
+    assert close(curve.polychromatic, radii, rel=rel, abs=PICOMETRE)
+    assert close(curve.rms, spots.each.rms_radius, rel=rel, abs=PICOMETRE)
+    assert close(spots_of(lens, own_fields(lens))["rms"], radii / MICROMETRE, rel=1e-6, abs=1e-6)
+
+
+@quiet
+@pytest.mark.parametrize("model", [rt.Gaussian(order=16), rt.DRT(order=5)], ids=["gaussian", "drt"])
+def test_moments_of_kernels(lens, model):
+    """Centroid and second moments of PSFs are those of spots."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    spots, kernels = rt.spot(lens).whole, rt.psf(lens, model)
+    size = float(spots.geometric_radius.max())
+    covariance = kernels.ray_covariance[:, 0]
+    assert close((covariance[0] + covariance[2]).sqrt(), spots.rms_radius, rel=1e-2, abs=PICOMETRE)
+    assert close(kernels.ray_centroid[:, 0], spots.centroid, abs=2e-3 * size + PICOMETRE)
+
+
+@quiet
+def test_spot_merit(lens):
+    """The default merit function of spots is the root mean square of their radii, where nothing clips."""
+    if not bool(rt.spot(lens).arrivals.rays.valid.all()):
+        pytest.skip("rows of a default merit function do not integrate up to the edge of an aperture")
+    merit = rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=14, arms=24)).merit
+    squares = rt.spot(lens).whole.mean_square_radius
+    weights = lens.fields.weight / lens.fields.weight.sum()
+    assert float(merit) == pytest.approx(float((weights * squares).sum().sqrt()), rel=1e-4, abs=PICOMETRE)
+
+
+@quiet
+def test_spot_of_tolerances(lens):
+    """The nominal lens of a tolerance analysis without compensators has the spots of `rt.spot`."""
+    rows = [rt.Tolerance("surface_tilt_x", (len(lens.surfaces) - 2,), -1e-3, 1e-3)]
+    nominal = rt.tolerance(lens, rt.Tolerances(tuple(rows)), trials=0).nominal
+    squares = rt.spot(lens).whole.mean_square_radius
+    weights = lens.fields.weight / lens.fields.weight.sum()
+    expected = float((weights * squares).sum().sqrt()) / MICROMETRE
+    assert float(nominal) == pytest.approx(expected, rel=1e-4, abs=1e-6)  # by the fewest rings that give 1e-4
+
+
+@quiet
+def test_energy_of_kernels(lens):
+    """The light that reaches the sensor is one share of the entrance pupil, by the rays and by the kernels."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    spots = rt.spot(lens, rings=48)
+    share = torch.where(spots.arrivals.rays.valid, spots.arrivals.weight, 0.0).sum(-1)[:, 0]
+    share = share * beam_share(scene_of(lens, own_fields(lens)))[0, :, 0]
+    window = dict(pixel=2.5 * float(spots.whole.geometric_radius.max()) / 21 + 1e-3, size=21)
+    assert close(rt.psf(lens, rt.DRT(order=5), **window).energy[0], share, abs=2e-2)
+
+
+# -- wavefronts -------------------------------------------------------------------------------------------------------
+
+
+@quiet
+def test_wavefront_rms(lens):
+    """RMS by `wavefront`, by its own map, along the field, and by the operand about the chief ray."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    map_ = rt.wavefront(lens, size=401)
+    light = map_.valid / map_.valid.sum((-2, -1), keepdim=True)
+    mean = (light * map_.opd).sum((-2, -1), keepdim=True)
+    assert close((light * (map_.opd - mean) ** 2).sum((-2, -1)).sqrt(), map_.rms, rel=5e-3, abs=1e-6)
+    curve = rt.rms_over_field(lens, reference="own", fields=own_fields(lens))
+    assert close(curve.rms, map_.rms, rel=rule_of(lens), abs=1e-7)
+
+
+@quiet
+def test_wavefront_along_the_axes_of_the_pupil(lens):
+    """OPD fans are lines of the map; ray fans are the spot's points along them, from the chief ray's."""
+    fan, rays = rt.opd_fan(lens, points=21, reference="own"), rt.ray_fan(lens, points=21)
+    line = torch.linspace(-1, 1, 21, dtype=torch.float64)
+    for section, axis, points in (
+        ("tangential", 1, torch.stack([0 * line, line])),
+        ("sagittal", 0, torch.stack([line, 0 * line])),
+    ):
+        front = wavefront_of(scene_of(lens, own_fields(lens)), points)
+        valid = getattr(fan, f"{section}_valid")
+        assert valid.any() or section == "tangential"  # the vane covers it
+        assert torch.equal(valid, front.valid[0])
+        waves = front.opd[0] / (1e-3 * lens.wavelengths[:, None])
+        assert close(waves[valid], getattr(fan, section)[valid], rel=1e-9, abs=1e-7)
+        places = image_rays(lens, points).position[axis]
+        chief = chief_reference(lens, own_fields(lens))[axis]
+        assert close((places - chief[..., None])[valid], getattr(rays, section)[valid], rel=1e-9, abs=PICOMETRE)
+
+
+@quiet
+def test_strehl_ratio(lens):
+    """By `wavefront` and by the operand, at the primary wavelength."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    ratio = rt.wavefront(lens).strehl[:, 0]
+    assert bool((ratio <= 1 + 1e-9).all())
+    rows = [operand(lens, "STRH", (0, 1), (f + 1,)) for f in range(len(ratio))]
+    assert close(rows, ratio, rel=1e-6)
+
+
+# -- transfer functions and energy ------------------------------------------------------------------------------------
+
+#: Lenses whose diffraction kernels are small enough for a window of a few hundred pixels.
+SHARP = "immersed ellipsoid", "obscured asphere", "mirrors off the axis", "vane", "sensor in glass"
+
+
+@quiet
+def test_geometric_transfer(lens):
+    """The geometric MTF is the transform of the DRT kernel, 1 at frequency 0."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    pitch = float(rt.spot(lens).whole.geometric_radius.max()) / 40 + 1e-4
+    kernel = rt.psf(lens, rt.DRT(order=5), pixel=pitch, size=99, center="chief").kernel[0]
+    frequencies = torch.tensor([0.0, 0.02, 0.06], dtype=torch.float64) / pitch
+    at = pitch * (torch.arange(99) - 49)
+    wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
+    curve = rt.mtf(lens, frequencies, geometric=True)
+    for direction, axis in (("tangential", -1), ("sagittal", -2)):
+        spread = kernel.sum(axis)
+        expected = (spread.to(wave) @ wave.T).abs() / spread.sum(-1, keepdim=True)
+        assert close(getattr(curve, direction), expected, abs=1e-2), direction
+
+
+@quiet
+@pytest.mark.parametrize("name", SHARP)
+def test_diffraction_transfer_and_energy(name):
+    """MTF and encircled energy of diffraction are those of the wave kernel, on the axis at the primary wavelength."""
+    lens = member(name).at(fields=[0], wavelengths=member(name).primary[None])
+    cutoff = _cutoff(lens)
+    pitch, size = 0.25 / cutoff, 301
+    psf = rt.psf(lens, "wave", pixel=pitch, size=size, tol=1e-3)
+    kernel, at = psf.kernel[0, 0], pitch * (torch.arange(size, dtype=torch.float64) - size // 2)
+    frequencies = torch.tensor([0.1, 0.3, 0.6], dtype=torch.float64) * cutoff
+    wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
+    light = float(rt.psf(lens, rt.DRT(order=5), pixel=1.0, size=21).energy)
+    expected = (wave @ kernel.sum(1).to(wave)).abs() / light
+    curve = rt.mtf(lens, [0.0, *frequencies.tolist(), 1.001 * cutoff], geometric=False)
+    assert close(curve.tangential[0, 1:-1], expected, abs=2e-2)
+    assert close(curve.tangential[0, [0, -1]], [1.0, 0.0], abs=1e-6)
+    radius = 20 * pitch
+    inside = torch.hypot(at[:, None], at) <= radius
+    energy = rt.encircled_energy(lens, [radius], geometric=False).share[0]
+    assert close(energy, kernel[inside].sum() / light, abs=1e-2)
+
+
+def _cutoff(lens: Lens) -> float:
+    """Cycles/mm beyond which nothing of the axial field is resolved: the width of the pupil in directions over λ."""
+    line = torch.linspace(-1, 1, 201, dtype=torch.float64)
+    rays = image_rays(without_apertures(lens), torch.stack([0 * line, line]), wavelengths=lens.primary[None])
+    slopes = rays.direction[1].flatten()
+    index = float(media(lens, lens.primary)[-2])
+    return float(slopes.max() - slopes.min()) * index / (1e-3 * float(lens.primary))
+
+
+# -- chief rays, focus and first-order data ---------------------------------------------------------------------------
+
+
+@quiet
+def test_chief_rays(lens):
+    """Distortion and lateral colour are differences of the chief rays that `rays` lands on the sensor."""
+    if is_bent(lens):
+        pytest.skip("distortion is about a straight axis")
+    fields = own_fields(lens)
+    landed = image_rays(lens, fields.new_zeros(2, 1), fields=fields).position[:2, ..., 0]
+    heights = rt.distortion(lens, fields=fields).height
+    assert close(heights.abs(), torch.hypot(*landed), rel=1e-9, abs=PICOMETRE)
+    shift = rt.lateral_colour(lens, fields=fields).shift
+    primary = landed[..., lens.primary_wavelength - 1, None]
+    assert close(shift.abs(), torch.hypot(*(landed - primary)), rel=1e-6, abs=PICOMETRE)
+
+
+@quiet
+def test_focus(lens):
+    """The spot has its least RMS radius at the sensor distance that `focus` reports."""
+    lens = lens.at(fields=own_fields(lens).T[:1], wavelengths=lens.primary[None])
+    best = float(rt.focus(lens).lens.surfaces[-2].thickness)
+    near, middle, far = (float(rt.spot(lens.at(sensor_distance=best + s)).whole.rms_radius) for s in (-0.01, 0, 0.01))
+    assert middle <= min(near, far) + PICOMETRE
+
+
+@quiet
+def test_first_order_data(lens):
+    """Focal length, F-number and magnification: first-order data, operands, and the report of the lens."""
+    if is_bent(lens):
+        pytest.skip("operands of first order are those of a straight axis")
+    data, report = rt.first_order(lens), rt.info(lens).document()
+    for name, row, integers in (
+        ("effective_focal_length", "EFFL", (0, lens.primary_wavelength)),
+        ("f_number", "ISFN", ()),
+        ("magnification", "PMAG", (0, lens.primary_wavelength)),
+        ("image_na", "ISNA", ()),
+    ):
+        value = float(getattr(data, name))
+        assert report[name] == pytest.approx(value, rel=1e-12), name
+        assert operand(lens, row, integers) == pytest.approx(value, rel=1e-9, abs=1e-12), name
