@@ -8,6 +8,7 @@ import torch
 from differences import gradcheck
 from problems import number
 
+from raytrace.budget import OverBudget, within
 from raytrace.maths.sampling import grid
 from raytrace.psf_models.dft import integrate, sub_pixels
 from raytrace.psf_models.radial import energy_of_rings, is_centred, radii_of_waves, unfold
@@ -59,6 +60,11 @@ def test_all_light_inside_the_window_is_kept_and_the_rest_is_not_counted():
     assert float(unfold(window, energy_of_rings(window, *line(500, 0.5))).sum()) == pytest.approx(
         0.105**2 / (math.pi * 0.25), rel=1e-3
     )
+
+
+def test_a_window_that_memory_does_not_hold_is_refused_first():
+    with within(2e7), pytest.raises(OverBudget, match=r"PSF of 399 × 399 pixels.*18,0\d\d radii.*larger pixels"):
+        energy_of_rings(grid(number(0.01), 399), *(number(x)[None] for x in (0.0, 1.0, 1.0)))
 
 
 def test_heights_below_the_axis_are_the_same_rings():

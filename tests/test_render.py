@@ -10,6 +10,7 @@ import torch
 
 import raytrace as rt
 from raytrace.budget import OverBudget, within
+from raytrace.imaging import field_kernels
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge, channel_moments
 from raytrace.imaging.image import blur, blur_layers, depth_masks
 from raytrace.imaging.render import (
@@ -165,9 +166,26 @@ def test_a_kernel_off_the_meridian_is_the_turned_one(triplet):
     assert float((kernels - kernels.flip(-1)).abs().max()) > 1e-3  # coma
 
 
+def test_narrow_gaussians_in_large_windows_are_those_of_every_pixel(triplet, monkeypatch):
+    """Places with little blur are integrated on the pixels that it reaches, 6 σ: 2e-9 of the light is beyond."""
+    weights = FIELD.weights(triplet.wavelengths)
+    like = FieldKernels(triplet, FIELD, "gaussian", 4, 51, torch.tensor([torch.inf]).double(), weights)
+    points = FIELD.on_diagonal((0.0, 0.3, 1.0)).double()
+    kernels, count = like.at(points), []
+
+    def counted(window, *moments):
+        count.append(window.rows)
+        return gaussian_pixels(window, *moments)
+
+    monkeypatch.setattr(field_kernels, "_ALL_LIGHT", 1e3)
+    monkeypatch.setattr(field_kernels, "gaussian_pixels", counted)
+    assert float((like.at(points) - kernels).abs().sum((-2, -1)).max()) < 1e-8
+    assert set(count) == {51}
+
+
 def test_window_that_would_be_too_large_is_refused(triplet):
     fine = rt.Sensor(size=(18.0, 12.0), pixels=(18000, 12000))
-    with pytest.raises(WindowTooLarge, match=r"focus the lens.*larger pixels"):
+    with pytest.raises(WindowTooLarge, match=r"focus the lens.*larger pixels.*--sensor"):
         optics(triplet, fine, model="gaussian")
 
 

@@ -45,6 +45,7 @@ _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the l
 #: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
 #: 2/(π² R) of its light farther away than R λN (Born & Wolf, Principles of Optics, §8.5.2).
 _RINGS = 6.0, 40.0
+_ALL_LIGHT = 6.0  # standard deviations beyond which a Gaussian is left out: 2e-9 of the light along a line
 _LARGEST = 401  # pixels of a window
 _SMALLEST = 21  # pixels of a window of elements
 _TAIL = 1e-2  # of the light that a window 1.5 times as large adds
@@ -218,23 +219,30 @@ class FieldKernels:
         """Kernels (N, D, C, size, size) of `_moments` (D, N, W) at places (2, N)."""
         radius = safe_sqrt((points * points).sum(0))
         unit = torch.where(radius > 0, points / torch.where(radius > 0, radius, 1.0), points.new_tensor([[0.0], [1.0]]))
-        window = make_grid(points.new_tensor(self.sensor.pitch), self.size)
-        narrowest = torch.minimum(*moments[1:3]).amin((0, 2))  # of each place: kernels do not depend on other places
-        order, parts = torch.argsort((narrowest >= self.sensor.pitch**2).to(torch.int8), stable=True), []
-        narrow = int((narrowest < self.sensor.pitch**2).sum())
-        for group, pixels in ((order[:narrow], gaussian_pixels), (order[narrow:], wide_gaussian_pixels)):
-            for some in group.split(_TOGETHER):
-                if not len(some):
-                    continue
-                shift, sagittal, tangential, light = (moment[:, some] for moment in moments)  # (D, N, W)
+        shift, sagittal, tangential, light = moments
+        pitch, variance = self.sensor.pitch, torch.minimum(sagittal, tangential).amin((0, 2))
+        # Of each place alone, so that kernels do not depend on other places: the rule, and the pixels with light.
+        wide = variance >= pitch**2
+        reach = shift.abs() + _ALL_LIGHT * torch.maximum(sagittal, tangential).sqrt()
+        needed = 2 * torch.ceil(reach.amax((0, 2)).detach() / pitch + 0.5) + 1
+        sizes = [self.size]
+        while sizes[-1] > _SMALLEST:
+            sizes.append(sizes[-1] // 4 * 2 + 1)
+        rank = sum((needed <= size).to(torch.int64) for size in sizes[1:])
+        kernels, order = [], []
+        for number in torch.unique(2 * rank + wide).tolist():
+            size, pixels = sizes[number // 2], (gaussian_pixels, wide_gaussian_pixels)[number % 2]
+            window = make_grid(points.new_tensor(pitch), size)
+            for some in torch.nonzero(2 * rank + wide == number)[:, 0].split(_TOGETHER):
                 x, y = -unit[0, some, None], unit[1, some, None]  # columns of the kernel grow towards -x
                 pairs = (y * y, x * x), (-x * y, x * y), (x * x, y * y)
-                covariance = torch.stack([sagittal * a + tangential * b for a, b in pairs])
-                kernels = light[..., None, None] * pixels(window, torch.stack([x * shift, y * shift]), covariance)
-                kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels)
-                parts.append(_of_sum_1(kernels))
-        kernels = torch.cat(parts)
-        return kernels if narrow in (0, len(order)) else kernels[torch.argsort(order)]
+                covariance = torch.stack([sagittal[:, some] * a + tangential[:, some] * b for a, b in pairs])
+                centroid = torch.stack([x * shift[:, some], y * shift[:, some]])
+                part = light[:, some, :, None, None] * pixels(window, centroid, covariance)  # (D, N, W, size, size)
+                part = _of_sum_1(torch.einsum("cw,dfwij->fdcij", self.weights.to(part), part))
+                kernels.append(torch.nn.functional.pad(part, [(self.size - size) // 2] * 4))
+                order.append(some)
+        return torch.cat(kernels)[torch.cat(order).argsort()]
 
     def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Centroid from the origin, mm, sagittal and tangential variance, mm², and 1 where light arrives, else 0,
@@ -439,7 +447,7 @@ def window_size(
     if size > _LARGEST:
         raise WindowTooLarge(
             f"the blur reaches {1e3 * reach:.0f} µm, {size} pixels of {1e3 * sensor.pitch:g} µm across, more than "
-            f"{_LARGEST}: focus the lens, as by rt.focus(lens).lens, or take larger pixels"
+            f"{_LARGEST}: focus the lens, as by rt.focus(lens).lens, take larger pixels, or a smaller sensor (--sensor)"
         )
     if not elements:
         return size

@@ -67,7 +67,8 @@ _RADII = 257  # at which the chief rays of a round lens are traced
 _COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
 _ROUNDS = 4
 _PLANES = 8
-_AZIMUTHS, _BISECTIONS = 64, 20  # at which the edge of the image circle of other lenses is searched
+_AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
+_EDGE = 0.01  # pixels, to which it is known
 _WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
 _WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
 _BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
@@ -487,7 +488,7 @@ def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Ten
         )
         if bool(_has_light(lens, sensor, middle + outside * ray).all()):
             return None
-        for _ in range(_BISECTIONS):
+        for _ in range(math.ceil(math.log2(float(outside.max()) / (_EDGE * sensor.pitch)))):
             radius = 0.5 * (inside + outside)
             arrives = _has_light(lens, sensor, middle + radius * ray)
             inside, outside = torch.where(arrives, radius, inside), torch.where(arrives, outside, radius)
@@ -797,7 +798,8 @@ def render_patches(
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
     change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
-    the `ImageFormation` of the initial lens. elements, model: as for `render`. object_distances: (B,) mm from surface 1
+    the `ImageFormation` of the initial lens by the same model. model: by default "gaussian"; elements: as for `render`,
+    with the model "wave". object_distances: (B,) mm from surface 1
     to the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers
     of the lens, of the elements and in the distances.
     Warns DarkPlaces of points without light, whose kernels are 0. Raises ValueError for numbers of patches, points and

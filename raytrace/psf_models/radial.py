@@ -79,7 +79,7 @@ def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> 
     first, last: (..., C) mm, signed heights a, b of the ends of a piece; energy: (..., C) of the pieces, spread evenly
     over their heights.
     """
-    table = grid.pitch.new_tensor(_ring_table(grid.rows, grid.columns))
+    table = torch.as_tensor(_ring_table(grid.rows, grid.columns)).to(grid.pitch.detach())
     last_step = len(table) - 1
     a, b = first / grid.pitch, last / grid.pitch
     # A caustic has pieces without width: the share of a ring is taken there, over a thousandth of a pixel.
@@ -164,22 +164,27 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     return corner * np.cos(angle), pixels @ series, second @ series
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=4)  # the largest ones have gigabytes
 def _ring_table(rows: int, columns: int) -> np.ndarray:
     """G (K, U): ∫_0^r of the share of rings in each pixel, at r in steps of 1/_STEPS pixel to beyond the corner."""
-    corner = 0.5 * math.hypot(rows, columns)
     fine = 16  # midpoints in a step
-    count = math.ceil(corner * _STEPS) + 1
-    r = (np.arange(count * fine) + 0.5) / (_STEPS * fine)
+    count = math.ceil(0.5 * math.hypot(rows, columns) * _STEPS) + 1
     places = _distinct(rows, columns)[0]
-    # Share of a ring in the quadrant rectangle [0, a] × [0, b]: from acos(a/r) to asin(b/r).
-    edges = np.unique(np.concatenate([places - 0.5, places + 0.5]))
-    arc = {edge: np.arcsin(np.minimum(1.0, abs(edge) / r)) for edge in edges}
+    what = f"the PSF of {rows} × {columns} pixels needs its light at {count:,} radii"
+    afford(10.0 * (count + 1) * len(places), what, helps="ask for a smaller `size`, or larger pixels")
+    (a0, b0), (a1, b1) = ((places + side).T[..., None, None] for side in (-0.5, 0.5))
+    # A pixel has shares of rings between its nearest and its farthest corner only, less than 3/2 pixels apart.
+    nearest = np.hypot(*np.maximum(0.0, places - 0.5).T)
+    step = np.floor(nearest * _STEPS).astype(int)[:, None] + np.arange(math.ceil(1.5 * _STEPS) + 1)
+    r = (step[..., None] * fine + np.arange(fine) + 0.5) / (_STEPS * fine)  # (U, steps, fine)
 
-    def below(a: float, b: float) -> np.ndarray:
-        return np.sign(a) * np.sign(b) * np.maximum(0.0, arc[a] + arc[b] - 0.5 * np.pi) / (2 * np.pi)
+    def below(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Share of a ring in the quadrant rectangle [0, a] × [0, b]: from acos(a/r) to asin(b/r)."""
+        arcs = sum(np.arcsin(np.minimum(1.0, np.abs(edge) / r)) for edge in (a, b))
+        return np.sign(a) * np.sign(b) * np.maximum(0.0, arcs - 0.5 * np.pi) / (2 * np.pi)
 
-    corners = ((a - 0.5, a + 0.5, b - 0.5, b + 0.5) for a, b in places)
-    shares = [below(a1, b1) - below(a0, b1) - below(a1, b0) + below(a0, b0) for a0, a1, b0, b1 in corners]
-    steps = np.stack(shares, -1).reshape(count, fine, -1).mean(1) / _STEPS
-    return np.concatenate([np.zeros((1, len(places))), np.cumsum(steps, 0)])
+    shares = below(a1, b1) - below(a0, b1) - below(a1, b0) + below(a0, b0)
+    table = np.zeros((count + 1, len(places)))
+    inside = step < count
+    table[step[inside] + 1, np.nonzero(inside)[0]] = (shares.mean(-1) / _STEPS)[inside]
+    return np.cumsum(table, 0, out=table)
