@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 from types import ModuleType
 
+import pytest
 import torch
 from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
@@ -127,16 +128,20 @@ def given() -> dict:
     }
 
 
-def test_examples_in_docstrings_run():
+EXAMPLES = {name: codes for name in MODULES if (codes := examples(name))}
+
+
+def test_the_modules_of_cameras_and_pictures_have_examples():
+    assert {"__init__", "imaging.camera", "imaging.render"} <= EXAMPLES.keys()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_in_docstrings_run(name):
     """Sessions print what they show; other examples run on the names of their module and on those of `given`."""
-    run = set()
-    for name in MODULES:
-        for code in examples(name):
-            run.add(name)
-            names = vars(module(name)) | given()
-            if ">>> " in code:
-                session = doctest.DocTestParser().get_doctest(code, names, name, None, 0)
-                assert not doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(session).failed
-            else:
-                exec(compile(code, f"an example of {name}", "exec"), names)
-    assert {"__init__", "imaging.camera", "imaging.render"} <= run
+    for code in EXAMPLES[name]:
+        names = vars(module(name)) | given()
+        if ">>> " in code:
+            session = doctest.DocTestParser().get_doctest(code, names, name, None, 0)
+            assert not doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(session).failed
+        else:
+            exec(compile(code, f"an example of {name}", "exec"), names)

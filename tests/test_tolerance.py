@@ -345,14 +345,14 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
     assert float(found.lost_maximum[1]) == 0
     assert bool(found.maximum[0].isnan())
     failed = found.trials.isnan()
-    assert torch.equal(failed, found.lost > found.loss)
+    assert torch.equal(failed, found.lost > found.light_loss)
     assert 0 < int(failed.sum()) < 40
     text = str(found)
     assert f"{int(failed.sum())} failed, by more than 5 %, and count as worse than all others" in text
     assert "1 tolerances lose more than 5 % of the light at a limit: not in RSS" in text
     assert "no compensator" in text
     assert bool(found.estimated.isfinite())
-    free = rt.tolerance(lens, rows, trials=40, seed=2, loss=1.0)
+    free = rt.tolerance(lens, rows, trials=40, seed=2, light_loss=1.0)
     assert not bool(free.trials.isnan().any())
     torch.testing.assert_close(free.trials[~failed], found.trials[~failed])
 

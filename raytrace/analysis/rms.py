@@ -14,6 +14,7 @@ from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, primary_wavelength, scene_of, setting, wavelength_shares
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Table
+from raytrace.maths.sampling import SAMPLINGS
 from raytrace.plotting.style import GREY, INK, array, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.clear_pupil import clear_pupil
@@ -127,8 +128,8 @@ def rms_over_field(
 def _rms(lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor] | None) -> RmsOverField:
     shares = wavelength_shares(lens)
     if spot:
-        rings, arms = _RINGS
-        points, weights = clear_pupil(lens, fields=fields, rings=rings, arms=arms) if pupil is None else pupil
+        rings = SAMPLINGS["gauss"][2]  # those of `spot`
+        points, weights = clear_pupil(lens, fields=fields, rings=rings, arms=4 * rings) if pupil is None else pupil
         rays = image_rays(lens, points, fields=fields)
         joint = (shares[:, None] * weights).flatten(-2)
         whole = spot_of_points(rays.position[:2].flatten(2), rays.valid.flatten(1), joint).rms_radius

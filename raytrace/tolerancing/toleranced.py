@@ -50,9 +50,10 @@ class Toleranced(Result):
     second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
     second-order model, whose compensators keep their limits. holds: whether that model describes the lens: why not, or
     "". trials: (T,) the criterion of the perturbed and compensated lenses, nan of a lens that failed: no ray of a field
-    arrives, or it loses more than `loss` of the light of the nominal lens; changes: (T, C) of the compensators.
+    arrives, or it loses more than `light_loss` of the light of the nominal lens; changes: (T, C) of the compensators.
     lost: (T,) shares of the light of the nominal lens that the trials lose, in the configuration that loses most;
-    lost_minimum, lost_maximum: (N,) those of lenses with one error at its limit, whose changes are nan beyond `loss`.
+    lost_minimum, lost_maximum: (N,) those of lenses with one error at its limit, whose changes are nan beyond
+    `light_loss`.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
     goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
     before their limits were tightened, or None.
@@ -77,7 +78,7 @@ class Toleranced(Result):
     lost: Tensor
     lost_minimum: Tensor
     lost_maximum: Tensor
-    loss: float = 0.05
+    light_loss: float = 0.05
     holds: str = ""
     configurations: int = 1
     seed: int = 0
@@ -276,7 +277,7 @@ class Toleranced(Result):
             about.append(f"the second order does not hold: {self.holds}; rely on the trials")
         if failing:
             about.append(
-                f"{failing} tolerances lose more than {100 * self.loss:g} % of the light at a limit: not in RSS"
+                f"{failing} tolerances lose more than {100 * self.light_loss:g} % of the light at a limit: not in RSS"
             )
         if self.angle:
             numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
@@ -293,7 +294,7 @@ class Toleranced(Result):
             if found["lost_light"] > 0:
                 about.append(
                     f"light lost in {int((self.lost > 0).sum())} trials, {100 * found['lost_light']:.3g} % at most; "
-                    f"{found['failed']} failed, by more than {100 * self.loss:g} %, and count as worse than all others"
+                    f"{found['failed']} failed, by more than {100 * self.light_loss:g} %, and count as the worst"
                 )
             good = ~self.trials.isnan()
             for k, one in enumerate(self.tolerances.compensators):
@@ -386,7 +387,7 @@ def tolerance(
     fields: Tensor | Sequence | None = None,
     rings: int | None = None,
     arms: int | None = None,
-    loss: float = 0.05,
+    light_loss: float = 0.05,
     model: Literal["gaussian", "drt"] = "gaussian",
     pixel: float | None = None,
     size: int | tuple[int, int] | None = None,
@@ -423,7 +424,8 @@ def tolerance(
         that of its own fields.
     rings: of the pupil, Gaussian quadrature; by default the fewest that give the spots of `spot`.
     arms: of the pupil, 4·rings by default.
-    loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has failed.
+    light_loss: share of the light of the nominal lens that a lens may lose, 0.05 by default; one that loses more has
+        failed.
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
@@ -443,11 +445,11 @@ def tolerance(
     afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer `trials`")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
-    if not 0 <= loss <= 1:
-        raise ValueError(f"loss {loss:g}: expected a share of the light between 0 and 1, as 0.05")
+    if not 0 <= light_loss <= 1:
+        raise ValueError(f"light_loss {light_loss:g}: expected a share of the light between 0 and 1, as 0.05")
     options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
     views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
-    chosen, study, given = views[0].criterion, Study(views, tolerances, loss), tolerances
+    chosen, study, given = views[0].criterion, Study(views, tolerances, light_loss), tolerances
     if study.compensators:
         study.nominal_curvature()  # refuses those without effect
     with torch.no_grad():
@@ -457,14 +459,14 @@ def tolerance(
         nominal = chosen.value(nominal_quantity[0])
         if increment is not None:
             tolerances = limited_to_change(tolerances, lambda errors: study.harm(errors)[0], increment)
-            study = Study(views, tolerances, loss)
+            study = Study(views, tolerances, light_loss)
         second = study.second_order()
         if goal is not None and yield_ is not None:
             tolerances = limited_to_yield(
                 tolerances, second, lambda errors: study.compensated(errors.to(study.half))[0],
                 chosen.quantity_of(goal), yield_, seed + 1,
             )  # fmt: skip
-            study = Study(views, tolerances, loss)
+            study = Study(views, tolerances, light_loss)
         alone = torch.cat([tolerances.alone(each) for each in (tolerances.minimum, tolerances.maximum)]).to(study.half)
         changes, light = study.harm(alone)
         start, slope = second(torch.zeros_like(alone[:1]))
@@ -482,8 +484,8 @@ def tolerance(
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
         slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
         estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
-        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high, loss=loss,
-        holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
+        trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high,
+        light_loss=light_loss, holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
