@@ -54,6 +54,7 @@ from raytrace.system.lens import Lens, check_media, field_points, is_round_about
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
@@ -69,6 +70,7 @@ _ROUNDS = 4
 _PLANES = 8
 _AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
 _EDGE = 0.01  # pixels, to which it is known
+_FAINT = 1e-3  # relative illumination that counts as none: rays hardly find so narrow a beam
 _WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
 _WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
 _BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
@@ -496,7 +498,7 @@ def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Ten
 
 
 def _has_light(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
-    return _illumination_at(lens, sensor, points) > 0
+    return _illumination_at(lens, sensor, points) > _FAINT
 
 
 def _radius(circle: tuple[Tensor, Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
@@ -635,7 +637,10 @@ def _illumination(
 def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     fields = sensor.fields(lens, points)
     arrives = ~fields.isnan().any(0)
-    values = relative_illumination(lens, fields=fields.nan_to_num(0.0)).illumination
+    try:
+        values = relative_illumination(lens, fields=fields.nan_to_num(0.0)).illumination
+    except OutOfReach:  # of all of them
+        values = torch.zeros_like(fields[0])
     return torch.where(arrives & ~values.isnan(), values, 0.0)
 
 
