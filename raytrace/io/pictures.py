@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
 from raytrace.files import read_bytes, write_atomically
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
@@ -33,7 +33,7 @@ class PictureError(ValueError):
     """A file that is not an image, damaged, or too large; one line."""
 
 
-class PictureChanged(UserWarning):
+class PictureChanged(RaytraceWarning):
     """A picture that is not shown as its pixels are stored: turned upright, or with transparent parts."""
 
 
