@@ -347,7 +347,8 @@ def field_spots(
     (2, F) mm, from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
-    points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
+    rule = SAMPLINGS["gauss"][2]
+    points, weights = gauss_rings(rule, dtype=dtype, device=device) if pupil is None else pupil
     points, weights = with_rim(points, weights)
     dots = even_hexapolar(rings, dtype=dtype, device=device)
     shares = shares_of(lens, wavelengths, wavelength_weights)
@@ -361,7 +362,7 @@ def field_spots(
         if pupil is None and not bool(valid.all()):
             lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
             fields, inside = field_points(fields, like=lens), points[:, weights[:drawn] > 0]
-            seen, whole = _of_clear_pupils(lens, fields, inside, SAMPLINGS["gauss"][2], about, seen, whole)
+            seen, whole = _of_clear_pupils(lens, fields, inside, rule, about, seen, whole)
         return whole, seen
 
 
