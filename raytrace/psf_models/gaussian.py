@@ -12,7 +12,6 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.budget import piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import Grid, centres, edges, gauss_rings, sobol
 from raytrace.psf_models.drt import histogram
@@ -33,7 +32,7 @@ _NODES, _WEIGHTS = (x.tolist() for x in legendre.leggauss(28))
 #: it serves; its relative error, of pixels within so many σ of the centroid and of all that are not 0.
 _WIDEST = 1.5
 _CLOSE, _CLOSE_ERROR, _TAIL_ERROR = 6.0, 2e-16, 3e-14
-_PIXEL_BYTES = 2000  # of a pixel in either rule, measured
+_AT_ONCE = 2**16  # pixels of either rule at once, 2 kB each
 _NOTHING = 38.0  # σ beyond which a density is 0
 
 
@@ -181,7 +180,7 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
     def chosen(t: Tensor, some: Tensor) -> Tensor:
         return t.expand(*batch, *t.shape[-2:]).reshape(-1, *t.shape[-2:])[some] if t.dim() else t
 
-    energy, together = xx.new_zeros(len(narrow), rows, columns), piece(_PIXEL_BYTES * rows * columns)
+    energy, together = xx.new_zeros(len(narrow), rows, columns), max(1, _AT_ONCE // (rows * columns))
     for rule, mask in ((_product_rule, narrow), (_rule, ~narrow)):
         for some in torch.nonzero(mask)[:, 0].split(together) if bool(mask.any()) else ():
             arguments = (across, along, xx, xy, yy, det)
