@@ -187,6 +187,23 @@ def test_spot_of_tolerances(lens):
 
 
 @quiet
+def test_angles_behind_an_afocal_lens():
+    """The nominal criterion of tolerances is the default merit function of angles."""
+    rows = [
+        dict(radius=103.36, thickness=4.0, glass=1.5168),
+        dict(radius=-103.36, thickness=147.0),
+        dict(radius=51.68, thickness=4.0, glass=1.5168),
+        dict(radius=-51.68, thickness=20.0),
+    ]
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10.0, fields=[0, 1], **SINGLE)
+    lens = dataclasses.replace(lens, afocal=True)
+    tilt = rt.Tolerance("surface_tilt_x", (2,), -1e-3, 1e-3)
+    nominal = rt.tolerance(lens, rt.Tolerances((tilt,)), trials=0).nominal
+    merit = rt.evaluate(lens, merit=rt.DefaultMerit("angular", rings=8, arms=24)).merit
+    assert 1e-3 * float(nominal) == pytest.approx(float(merit), rel=2e-4)  # q of the criterion to 1e-4
+
+
+@quiet
 def test_energy_of_kernels(lens):
     """The light that reaches the sensor is one share of the entrance pupil, by the rays and by the kernels."""
     lens = lens.at(wavelengths=lens.primary[None])

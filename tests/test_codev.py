@@ -48,6 +48,7 @@ TITLE 'a lens'; INI 'xy'
 !raytrace note "of two words"
 !raytrace catalogs SCHOTT OHARA
 !raytrace aiming real
+AFI NO
 !raytrace unnamed MEDIUM1
 NAO 0.01; DIM I; TEM 20; PRE 760; CA YES; PUI 1; PUX 1; PUY 1; TEL NO
 WL 656.3 587.6 &
@@ -142,6 +143,16 @@ ASPHERE = sequence(
     "S 0 31.09123483490374\nPIM",
     "EPD 25;WL 587.6;XAN 0;YAN 0",
 )  # Edmund Optics 32327, 65564 and 16998
+
+
+def test_an_afocal_image_space_is_read_and_written():
+    surfaces = "S 50 5 NBK7_SCHOTT\nSTO\nS -50 40"
+    for line, afocal in (("AFI", True), ("AFI Y", True), ("AFI NO", False), ("", False)):
+        lens, _ = of(sequence(surfaces, f"EPD 10;WL 587.6;YAN 0;{line}"))
+        assert lens.afocal is afocal
+        assert again(lens).afocal is afocal
+    with pytest.raises(LensFileError, match="AFI MAYBE: expected Y or N"):
+        of(sequence(surfaces, "EPD 10;WL 587.6;YAN 0;AFI MAYBE"))
 
 
 @pytest.mark.parametrize(
