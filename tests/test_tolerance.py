@@ -348,7 +348,7 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
     assert torch.equal(failed, found.lost > found.light_loss)
     assert 0 < int(failed.sum()) < 40
     text = str(found)
-    assert f"{int(failed.sum())} failed, by more than 5 %, and count as worse than all others" in text
+    assert f"{int(failed.sum())} failed, by more than 5 %, and count as the worst" in text
     assert "1 tolerances lose more than 5 % of the light at a limit: not in RSS" in text
     assert "no compensator" in text
     assert bool(found.estimated.isfinite())
