@@ -33,6 +33,7 @@ from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance
 from raytrace.system.rays import Rays
+from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
@@ -411,13 +412,15 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
         raise TooManyPoints(
             f"the blur needs {rings * arms} rays at {float(frequencies.max()):g} cycles/mm: focus the lens"
         )
-    if rays.shape[-1] == rings * arms:
+    is_clipped = lens.count is None and not bool(rays.valid.all())
+    if rays.shape[-1] == rings * arms and not is_clipped:
         return _of_spots(lens, fields, frequencies, rays, pupil[1])
     points, rule = gauss_rings(rings, arms, **like(lens))
-    parts = [
-        _of_spots(lens, some, frequencies, image_rays(lens, points, fields=some), rule)
-        for some in fields.split(_together(lens, (points, rule)), 1)
-    ]
+    parts = []
+    for some in fields.split(_together(lens, (points, rule)), 1):
+        if is_clipped:  # light up to the edges of the apertures
+            points, rule = clear_pupil(lens, fields=some, rings=rings, arms=arms)
+        parts.append(_of_spots(lens, some, frequencies, image_rays(lens, points, fields=some), rule))
     tangential, sagittal = (torch.cat(part) for part in zip(*parts, strict=True))
     return tangential, sagittal
 
