@@ -117,7 +117,7 @@ REFUSED = by_word(
         "birefringent medium": "BIR OAX OAY OAZ",
         "numerical aperture in image space": "NA",
         "telecentric object space": "TEL",
-        "coefficients of an afocal lens": "AFC",
+        "afocal image space": "AFC",
         "glass of one side of a surface": "GL1 GL2",
         "surface deformed by a file": "INT ISF",
         "command that puts in, takes out or turns round surfaces": "INS DEL FLY SCA COP MOV",
