@@ -33,12 +33,13 @@ def test_every_row_and_the_figure(capsys, tmp_path):
     assert figure.stat().st_size > 1000
 
 
-def test_the_error_is_seen():
+def test_the_error_is_seen(monkeypatch):
     """A picture that is wrong by 2 % has that error; one of many kernels has less than 1e-3."""
+    monkeypatch.setattr(camera, "_CROP", 4)
     lens, picture = camera.triplet(), torch.rand(3, 72, 96, generator=torch.Generator().manual_seed(0))
     blur_alone = {"model": "gaussian", "order": 4, "distortion": False, "illumination": False}
     blur_alone |= {"wavelengths": lens.wavelengths}
-    system = camera.optics(lens, SMALL, nodes=(37, 49), tol=1e-3, **blur_alone)
+    system = camera.optics(lens, SMALL, nodes=(19, 25), tol=1e-3, **blur_alone)
     with torch.no_grad():
         image = system(picture, boundary="zero")
     assert camera.error(lens, system, picture, image) < 2e-3
