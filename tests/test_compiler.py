@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -289,3 +290,23 @@ def test_the_compiler_runs_in_a_private_folder(tmp_path, monkeypatch):
     place, path = done.stdout.splitlines()
     assert place == os.path.realpath(tmp_path)
     assert all(map(os.path.isabs, path.split(os.pathsep)))
+
+
+def test_several_at_once_compile_once(tmp_path, monkeypatch):
+    """Four that start together, as the workers of a test run do: one compiles, the others wait for its file."""
+    compiled = []
+
+    def build(folder: Path) -> Path:
+        compiled.append(folder)
+        time.sleep(0.1)  # long enough that the others have asked
+        made = folder / "trace.so"
+        made.touch(0o600)
+        return made
+
+    replaced = {"_file_name": lambda: "trace.so", "cache_folder": lambda: tmp_path / "cache", "_remove_old": str}
+    for name, value in {**replaced, "_build": build, "_loaded": lambda path: path.name}.items():
+        monkeypatch.setattr(library, name, value)
+    with ThreadPoolExecutor(4) as pool:
+        loaded = list(pool.map(lambda _: library.library.__wrapped__(), range(4)))
+    assert loaded == ["trace.so"] * 4
+    assert len(compiled) == 1

@@ -170,11 +170,13 @@ def library() -> ctypes.CDLL:
         folder = cache_folder()
         try:
             os.close(open_folder(folder, make=True))
-            if (folder / _file_name()).exists():
-                _say(f"{folder / _file_name()} can be another user's: compiled anew")
-            with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
-                os.replace(_build(Path(private)), folder / _file_name())
-            _remove_old(folder)
+            with _alone_in(folder):
+                if not _is_kept():  # else another process has compiled it meanwhile
+                    if (folder / _file_name()).exists():
+                        _say(f"{folder / _file_name()} can be another user's: compiled anew")
+                    with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
+                        os.replace(_build(Path(private)), folder / _file_name())
+                    _remove_old(folder)
         except OSError as error:
             reason = _reason(error)
             _say(f"{reason}; compiling in a private folder for this process alone (RAYTRACE_CACHE sets another)")
@@ -187,6 +189,20 @@ def library() -> ctypes.CDLL:
     with suppress(OSError):
         os.utime(path)  # the time of the last use, for `_remove_old`
     return _loaded(path)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Processes that need the same code compile it once: the others wait here for the first."""
+    import fcntl  # of POSIX systems
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # not every file system has locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @functools.cache
