@@ -467,6 +467,7 @@ def test_losses_of_shares_add_up_and_samples_have_places(triplet, pictures):
     assert steps_per_epoch(pictures[0], settings) == 2
 
 
+@pytest.mark.slow  # of one colour by default: test_camera.py
 def test_step_1_in_colour_resumes_bit_identically(triplet, pictures, tmp_path):
     """Stopped after three steps and resumed: variables, network and log of a run that was never stopped."""
 

@@ -129,6 +129,7 @@ def test_a_finished_run_is_reported_without_its_pictures(run, one, monkeypatch):
     assert (code, "one/joint holds another run: noise was 0.1, now 0.2" in err) == (1, True)
 
 
+@pytest.mark.slow  # by the library by default: test_camera.py
 def test_a_stopped_run_resumes_to_the_same_end(run, pictures, monkeypatch):
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "thickness:5")
     assert run(*command, "-o", "whole")[0] == 0
@@ -216,7 +217,7 @@ def test_objects_without_an_image_are_refused(run, pictures):
 
 def test_the_learned_lens_is_a_file_that_traces(run, command, pictures):
     """Of the closed form and of a run; the file holds the sensor that was said, and its spots are small."""
-    options = ("--data", pictures, *SMALL, "--model", "paraxial", "--wavelength", "0.53", "0.62")
+    options = ("--data", pictures, *PARAXIAL, "--crops", "1", "--wavelength", "0.53", "0.62")
     code, out, err = run("double_gauss", *options, "--loss", "spectral", "-o", "learned.zmx", "--json")
     assert code == 0, err
     found, lens = json.loads(out), read_lens("learned.zmx")
@@ -247,7 +248,7 @@ def test_wavelengths_of_the_file_are_an_option(run, pictures):
 
 def test_the_penalty_is_reported_with_the_loss(run, pictures):
     """Elements thinner than 0.3 mm and thicker than 0.9 mm, of glasses without names; on every row of the log."""
-    options = ("--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "--json")
+    options = ("--data", pictures, *PARAXIAL, "--crops", "1", "--vary", "sensor", "--json")
     code, out, err = run("phone", *options, "--glass-thickness", "0.3:0.9", "--edge", "0.1", "-o", "thin")
     assert code == 0, err
     found = json.loads(out)

@@ -10,14 +10,30 @@ import torch
 from PIL import Image
 
 import raytrace as rt
+from raytrace.imaging import render
 from raytrace.imaging.render import default_sensor, encoded
 from raytrace.io.pictures import PictureError, read_channels, read_depth, read_levels
+from raytrace.system.identity import digest
 from raytrace.system.lens import field_points
 
 COLUMNS, ROWS = 60, 40
 LENS = "cemented_achromat"
 #: A coarse grid of kernels on a small sensor.
 QUICK = ("--sensor", "6x4", "--tol", "0.3", "--model", "gaussian")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optics_once():
+    """A lens and a sensor are prepared once for the command and the library: that takes longer than a picture."""
+    prepare, known = render.optics, {}
+
+    def prepared(lens, sensor, **how):
+        key = digest(lens, sensor, sorted(how.items()))
+        return known[key] if key in known else known.setdefault(key, prepare(lens, sensor, **how))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "optics", prepared)
+        yield
 
 
 def levels(*shape, most=256, seed=0):
