@@ -10,6 +10,7 @@ StrictModes, and Tsafrir et al., "Portably solving file TOCTTOU races with hardn
 
 import ctypes
 import errno
+import fcntl
 import functools
 import hashlib
 import os
@@ -194,8 +195,6 @@ def library() -> ctypes.CDLL:
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
     """Processes that need the same code compile it once: the others wait here for the first."""
-    import fcntl  # of POSIX systems
-
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # not every file system has locks
