@@ -17,7 +17,11 @@ from problems import MICROMETRE, PICOMETRE, own_fields
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
+from raytrace.optimization.problem import conditions_of
 from raytrace.system.lens import Lens, media
+from raytrace.tolerancing.criteria import CRITERIA
+from raytrace.tolerancing.study import sampling_of
+from raytrace.tracing.paraxial import largest_field
 from raytrace.tracing.scene import beam_share
 from raytrace.tracing.spot import chief_reference, image_rays
 from raytrace.tracing.trace import is_bent, without_apertures
@@ -186,6 +190,29 @@ def test_spot_of_tolerances(lens):
     assert float(nominal) == pytest.approx(expected, rel=1e-4, abs=1e-6)  # by the fewest rings that give 1e-4
 
 
+def less_mean_and_tilt(map_) -> torch.Tensor:
+    """RMS (F,) in waves of maps of one wavelength less the plane that fits each best."""
+    side = (2 * torch.arange(map_.opd.shape[-1], dtype=torch.float64) + 1) / map_.opd.shape[-1] - 1
+    radii = []
+    for opd, valid in zip(map_.opd[:, 0], map_.valid[:, 0], strict=True):
+        y, x = valid.nonzero().T
+        planes = torch.stack([torch.ones_like(side[x]), side[x], side[y]], 1)
+        fitted = planes @ torch.linalg.lstsq(planes, opd[valid]).solution
+        radii.append((opd[valid] - fitted).square().mean().sqrt())
+    return torch.stack(radii)
+
+
+@quiet
+def test_wavefront_of_tolerances(lens):
+    """The nominal lens of a tolerance analysis has the RMS wavefront of its maps, less mean and tilt."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    sampling = sampling_of(lens)
+    nominal = CRITERIA["wavefront"].quantity(lens, sampling).sqrt()
+    weights = lens.fields.weight / lens.fields.weight.sum()
+    expected = (weights * less_mean_and_tilt(rt.wavefront(lens, size=401)).square()).sum().sqrt()
+    assert close(nominal, expected, rel=5e-3, abs=1e-6)
+
+
 @quiet
 def test_angles_behind_an_afocal_lens():
     """The nominal criterion of tolerances is the default merit function of angles."""
@@ -331,13 +358,42 @@ def test_chief_rays(lens):
 
 
 @quiet
+def test_image_height(lens):
+    """`image_height` of a condition is the height of the largest field that `distortion` lists, of bent axes, too."""
+    if not own_fields(lens).any():
+        pytest.skip("an image height is that of a field off the axis")
+    (condition,) = conditions_of(lens, "image_height=1")
+    height = rt.distortion(lens, fields=largest_field(lens)).height[0, lens.primary_wavelength - 1]
+    assert operand(lens, *dataclasses.astuple(condition.row)[:3]) == pytest.approx(abs(float(height)), rel=1e-9)
+
+
+@quiet
 def test_focus(lens):
     """The spot has its least RMS radius at the sensor distance that `focus` reports."""
     lens = lens.at(fields=own_fields(lens)[:, :1], wavelengths=lens.primary[None])
     best = float(rt.focus(lens).lens.surfaces[-2].thickness)
-    near, middle, far = (float(rt.spot(lens.at(sensor_distance=best + s)).whole.rms_radius) for s in (-0.05, 0, 0.05))
-    # Rays that apertures stop are left out of the rule of focus, whose nodes do not end at their edges.
-    assert middle <= (1 + 1e-4) * min(near, far) + PICOMETRE
+    step = 1e-3 * float(rt.first_order(lens).f_number.abs())  # moves the rim by a micrometre
+    squares = [float(rt.spot(lens.at(sensor_distance=best + s)).whole.mean_square_radius) for s in (-step, 0, step)]
+    vertex = 0.5 * step * (squares[0] - squares[2]) / (squares[0] - 2 * squares[1] + squares[2])
+    assert squares[1] <= min(squares[0], squares[2])
+    assert abs(vertex) < 1e-3 * step
+
+
+@quiet
+def test_derivatives_of_the_focus_of_a_clipped_lens():
+    """The sensor distance has the derivatives of itself, the motion of the clear pupil's edge included."""
+    lens = _with_aperture(rt.Aperture("rectangular", (3.51, 1.49)))
+
+    def distance(curvature):
+        return rt.focus(lens.replace(2, curvature=curvature)).sensor_distance
+
+    here, step = lens.surfaces[2].curvature.detach().clone().requires_grad_(), 1e-5
+    middle = distance(here)
+    (first,) = torch.autograd.grad(middle, here, create_graph=True)
+    (second,) = torch.autograd.grad(first, here)
+    behind, ahead = (distance(here.detach() + side * step) for side in (-1, 1))
+    assert float(first) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-6)
+    assert float(second) == pytest.approx(float(ahead + behind - 2 * middle.detach()) / step**2, rel=1e-5)
 
 
 @quiet

@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
+from raytrace.system.configurations import Operand
 from raytrace.tracing.spot import image_rays
 
 LIMITS = "radius=0.1% thickness=0.03 element_decenter=0.03 element_tilt=0.05"
@@ -374,6 +375,27 @@ def test_all_configurations_are_judged():
             squares.append(float(alone.nominal) ** 2)
         k = int(errors.argmax())
         assert float(found.nominal + found.maximum[k]) == pytest.approx((sum(squares) / 2) ** 0.5, rel=1e-4)
+
+
+def test_configurations_count_by_their_weights():
+    """CWGT 1 and 3: q is the mean by weight; of weights 0 and 1 that of the second one alone; of 0 and 0 the mean."""
+    lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
+    rows = rt.Tolerances((rt.Tolerance("thickness", (3,), -0.05, 0.05),))
+
+    def square(weights):
+        weight = Operand("CWGT", numbers=torch.tensor(weights, dtype=torch.float64))
+        weighted = dataclasses.replace(lens, operands=(*lens.operands, weight))
+        return float(rt.tolerance(weighted, rows, trials=0, rings=4).nominal) ** 2
+
+    alone = [float(rt.tolerance(one, rows, trials=0, rings=4).nominal) ** 2 for one in map(bare, lens.configurations)]
+    assert square([1.0, 3.0]) == pytest.approx(0.25 * alone[0] + 0.75 * alone[1], rel=1e-12)
+    assert square([0.0, 1.0]) == pytest.approx(alone[1], rel=1e-12)
+    assert square([0.0, 0.0]) == pytest.approx(0.5 * sum(alone), rel=1e-12)
+
+
+def bare(lens):
+    """A configuration without the others."""
+    return dataclasses.replace(lens, operands=(), current_configuration=1)
 
 
 def test_a_compensator_of_a_configuration_adjusts_it_alone():

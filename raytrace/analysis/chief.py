@@ -36,16 +36,21 @@ NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberra
 class Distortion(OverField):
     """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
 
-    height: along the meridian of the field, positive towards +y (+x where it is the x axis), as the ray's own y.
-    f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis. The table
-        has it in per cent, as f_theta.
-    f_theta: relative, height/(f θ) - 1; None for an object at a finite distance.
+    height: from the vertex of the sensor, along the meridian of the field, positive towards +y (+x where it is the x
+        axis), as the ray's own y; where the axis bends, along the image of the meridian. `image_height` of `hold` is
+        its size for the largest field.
+    ideal: heights f tan θ, of an object at a finite distance m h₀, from the image of the axis: not the vertex of the
+        sensor where a lens is tilted.
+    f_tan: relative, h/ideal - 1 with h from the image of the axis in the same wavelength; 0 on the axis. The table has
+        it in per cent, as f_theta.
+    f_theta: relative, h/(f θ) - 1; None for an object at a finite distance.
     fields: (2, F); valid: (F, W) bool.
     """
 
     lens: Lens
     fields: Tensor
     height: Tensor
+    ideal: Tensor
     f_tan: Tensor
     f_theta: Tensor | None
     valid: Tensor
@@ -147,9 +152,10 @@ class LateralColour(OverField):
 def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = SAMPLES) -> Distortion:
     """Distortion of the chief ray; fields: y or (x, y), by default `samples` from the axis to the largest.
 
-    Relative, in per cent in the table. The scale of the ideal image is that of each wavelength's own chief ray close to
-    the axis, on the sensor as it stands: an image out of focus is not distorted for that. wavelengths: µm. Raises
-    NothingToShow for the axis alone.
+    Relative, in per cent in the table. Heights count from the vertex of the sensor; the ideal image, and with it the
+    distortion, from the image of the axis, so that a shift of the whole image is none. The scale of the ideal image is
+    that of each wavelength's own chief ray close to the axis, on the sensor as it stands: an image out of focus is not
+    distorted for that. wavelengths: µm. Raises NothingToShow for the axis alone.
     """
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     refuse_axis(fields)
@@ -163,12 +169,15 @@ def distortion_of(lens: Lens, fields: Tensor) -> Distortion:
     close = _close_fields(lens, fields)
     _, close_angles, close_extent, _ = in_object_space(bare, close)
     length = dot_2(fields, _meridian(fields)).sign() * safe_sqrt(dot_2(extent, extent))
-    height, valid = _height(described, angles, fields, each_axis=True)
+    bent = is_bent(lens)
+    along = close if bent else fields
+    height, valid = _height(described, angles, along)
+    image = _height(described, angles, along, from_axis=True)[0] if bent else height
     reach = safe_sqrt(dot_2(close_extent, close_extent))
-    scale = _height(described, close_angles, close, each_axis=True)[0] / reach[:, None]
-    f_tan = relative_error(height, scale * length[:, None])
-    f_theta = relative_error(height, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
-    return Distortion(lens, fields, height, f_tan, f_theta, valid & found[:, None])
+    scale = _height(described, close_angles, close, from_axis=True)[0] / reach[:, None]
+    ideal = scale * length[:, None]
+    f_theta = relative_error(image, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
+    return Distortion(lens, fields, height, ideal, relative_error(image, ideal), f_theta, valid & found[:, None])
 
 
 def field_curvature(
@@ -254,11 +263,11 @@ def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
     return along * torch.hypot(*largest) * NEAR_AXIS
 
 
-def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = False) -> tuple[Tensor, Tensor]:
+def _height(lens: Lens, fields: Tensor, along: Tensor, *, from_axis: bool = False) -> tuple[Tensor, Tensor]:
     """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted.
 
-    Where the axis bends they count from its image at the primary wavelength, or at each one, along the image of the
-    meridian close to it, turned to the side of the field.
+    They count from the vertex of the sensor. Where the axis bends: along the image of the meridian close to it, turned
+    to the side of the field; from_axis: from the image of the axis in each wavelength.
     """
     points, valid = chief_points(lens, fields, lens.wavelengths)
     if is_bent(lens):
@@ -268,8 +277,7 @@ def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = Fals
         way = chief_points(lens, close, lens.wavelengths)[0] - axis
         side = torch.where(dot_2(way, meridian[:, :, None]).detach() < 0, -1.0, 1.0)
         length = side * safe_sqrt(dot_2(way, way))
-        axis = axis if each_axis else axis[..., lens.primary_wavelength - 1, None]
-        return safe_divide(dot_2(points - axis, way), length), valid
+        return safe_divide(dot_2(points - axis if from_axis else points, way), length), valid
     return dot_2(points, _meridian(along)[:, :, None]), valid
 
 

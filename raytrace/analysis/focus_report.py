@@ -23,7 +23,7 @@ from raytrace.analysis.spot_diagram import (
 from raytrace.io import write_lens
 from raytrace.maths.numerics import detached, safe_divide, value
 from raytrace.maths.result import Column, Result, Table, number, numbers, object_text
-from raytrace.maths.sampling import sampled
+from raytrace.maths.sampling import SAMPLINGS, sampled
 from raytrace.plotting import style
 from raytrace.system.lens import (
     Lens,
@@ -37,6 +37,7 @@ from raytrace.system.lens import (
     with_sensor_distance,
 )
 from raytrace.system.rays import Rays
+from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.focus import (
     along_normal,
@@ -73,7 +74,8 @@ class Focus(Result):
 
     lens, before: with the new and the old sensor distance; paraxial: (D,) of the paraxial image of every object; rms:
     of least RMS spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their
-    weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated.
+    weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated; rings: of the clear pupil, None
+    for other samplings.
     """
 
     COLUMNS = (
@@ -93,12 +95,18 @@ class Focus(Result):
     wavelength_weights: Tensor | None
     points: Tensor
     weights: Tensor
+    rings: int | None = None
     criterion: str = "rms"
 
     @property
     def sensor_distance(self) -> Tensor:
         """mm from the last surface before the image; differentiable in the lens, but for the criterion "mean"."""
         return self.lens.surfaces[-2].thickness
+
+    @property
+    def pupil(self) -> tuple[Tensor, Tensor] | None:
+        """Points and weights of the pupil, None for the clear pupil."""
+        return (self.points, self.weights) if self.rings is None else None
 
     @property
     def is_real(self) -> bool:
@@ -112,6 +120,7 @@ class Focus(Result):
             lens,
             self.points,
             self.weights,
+            rings=self.rings,
             object_distances=self.object_distances,
             distance_weights=self.distance_weights,
             fields=self.fields,
@@ -181,7 +190,7 @@ class Focus(Result):
         labels = _labels(lens, distances, fields)
         rule = {
             "fields": fields, "wavelengths": wavelengths, "wavelength_weights": self.wavelength_weights,
-            "pupil": (self.points, self.weights),
+            "pupil": self.pupil,
         }  # fmt: skip
 
         columns = max(len(labels), 1)
@@ -231,7 +240,9 @@ def focus(
     criterion: "rms" (minimum RMS spot radius, in closed form and differentiable), "paraxial" (image, or the weighted
     mean of those of several objects) or "mean" (minimum mean distance from the centroid). object_distances: mm, inf
     allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis; wavelengths: µm, by default the
-    primary one; weights: one for each, by default equal. sampling, rings, points, seed: as for `sampling.sampled`.
+    primary one; weights: one for each, by default equal. sampling, rings, points, seed: as for `sampling.sampled`;
+    `gauss` integrates a beam that apertures clip up to its edge, as `spot` does, other samplings count the rays that
+    arrive.
     Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
     """
     if criterion not in ("rms", "paraxial", "mean"):
@@ -251,6 +262,7 @@ def focus(
         "distance_weights": _weights(lens, distance_weights, len(distances), "`distance_weights`"),
         "field_weights": _weights(lens, field_weights, fields.shape[1], "`field_weights`"),
         "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), "`wavelength_weights`"),
+        "rings": (rings or SAMPLINGS["gauss"][2]) if sampling == "gauss" else None,
     }
     if not bool(torch.isfinite(paraxial).all()):
         raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
@@ -319,12 +331,21 @@ def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
 def _draw_focus(axes, before: Lens, after: Lens, distances: list[float], labels: list[str], rule: dict) -> None:
     """The curves, and lines for the sensor before and after and for the paraxial focus, all with their numbers."""
     bundles = [focus_rays(with_object_distance(before, distance), **rule) for distance in distances]
-    rays = Rays(
-        torch.cat([bundle.rays.position for bundle in bundles], dim=1),
-        torch.cat([bundle.rays.direction for bundle in bundles], dim=1),
-        torch.cat([bundle.rays.valid for bundle in bundles]),
+    most = max(bundle.weights.shape[-1] for bundle in bundles)  # rays of clear pupils differ in number
+
+    def joined(parts: Sequence[Tensor], dim: int) -> Tensor:
+        return torch.cat([torch.nn.functional.pad(part, (0, most - part.shape[-1])) for part in parts], dim)
+
+    rays = [bundle.rays for bundle in bundles]
+    bundle = FocusRays(
+        Rays(
+            joined([each.position for each in rays], 1),
+            joined([each.direction for each in rays], 1),
+            joined([each.valid for each in rays], 0),
+        ),
+        joined([bundle.weights.expand(bundle.rays.shape) for bundle in bundles], 0),
+        bundles[0].slant,
     )
-    bundle = FocusRays(rays, bundles[0].weights)
     sensor, moved = (float(lens.surfaces[-2].thickness) for lens in (before, after))
     paraxial = [float(paraxial_image_distance(before, before.wavelengths.new_tensor(d))) for d in distances]
     marks = {"sensor before": sensor, "sensor after": moved}
@@ -417,7 +438,7 @@ def through_focus_curve(found: Focus, by: str = "field"):
         colours, title = style.wavelength_colours(values), f"Field {field_label(lens, style.array(fields)[:, 0])}"
     bundle = focus_rays(
         lens, fields=fields, wavelengths=found.wavelengths.detach(), wavelength_weights=found.wavelength_weights,
-        pupil=(found.points, found.weights), by=by,
+        pupil=found.pupil, by=by,
     )  # fmt: skip
     sensor = float(lens.surfaces[-2].thickness)
     marks = {"paraxial focus": float(found.paraxial[0]), "sensor": sensor}
@@ -443,19 +464,24 @@ def focus_rays(
     fields: Tensor,
     wavelengths: Tensor | None,
     wavelength_weights: Tensor | None,
-    pupil: tuple[Tensor, Tensor],
+    pupil: tuple[Tensor, Tensor] | None = None,
     by: str = "field",
 ) -> FocusRays:
-    """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself."""
-    points, weights = pupil
+    """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself.
+
+    pupil: points (2, P) and weights (P,), of which the rays that arrive count, by default of the clear pupil.
+    """
+    scene = {"fields": fields, "wavelengths": wavelengths}
+    points, weights = clear_pupil(lens, **scene) if pupil is None else pupil
     shares, slant = shares_of(lens, wavelengths, wavelength_weights), float(along_normal(lens))
     with torch.no_grad():
-        rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
+        rays = image_rays(lens, points, **scene)
     if by == "wavelength":
+        weights = weights.expand(rays.shape).flatten(0, 1)
         return FocusRays(
             Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights, slant
         )
-    weights = (shares[:, None] * weights).flatten()
+    weights = (shares[:, None] * weights).flatten(-2)
     joined = Rays(rays.position.flatten(2), rays.direction.flatten(2), rays.valid.flatten(1))
     return FocusRays(joined, weights, slant)
 

@@ -95,14 +95,15 @@ def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Te
 def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
     """Coefficients c (..., J) that minimise Σ_p w_p (values_p - Σ_j c_j basis_jp)², by QR.
 
-    values: (..., P); basis: (J, P), as `polynomials` gives it; weights: (P,) or (..., P), not negative, 1 by default.
+    values: (..., P); basis: (J, P) or (J, ..., P), as `polynomials` gives it; weights:
+    (P,) or (..., P), not negative, 1 by default.
     Raises ValueError if a fit has fewer points of positive weight than coefficients.
     """
     weights = torch.ones_like(values) if weights is None else weights.expand(values.shape)
     refuse_few(int((weights > 0).sum(-1).min()), len(basis))
     root = torch.sqrt(torch.where(weights > 0, weights, 1.0))
     root = torch.where(weights > 0, root, 0.0)
-    return _solved(values, root, *torch.linalg.qr(root[..., None] * basis.T))
+    return _solved(values, root, *torch.linalg.qr(root[..., None] * basis.movedim(0, -1)))
 
 
 def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -> tuple[Tensor, Tensor]:
@@ -113,7 +114,7 @@ def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -
     """
     refuse_few(weights.shape[-1], len(basis))
     root = torch.sqrt(weights.detach())
-    q, r = torch.linalg.qr(root[..., None] * basis.T)
+    q, r = torch.linalg.qr(root[..., None] * basis.movedim(0, -1))
     known = _condition(r, root) < worst
     r = torch.where(known[..., None, None], r, torch.eye(len(basis), dtype=r.dtype, device=r.device))
     return _solved(torch.where(known[..., None], values, 0.0), root, q, r), known
@@ -125,7 +126,7 @@ def condition(basis: Tensor, weights: Tensor) -> Tensor:
     The largest over the smallest singular value of the weighted basis (J, P); weights: (..., P), not negative.
     """
     root = torch.sqrt(weights)
-    return _condition(torch.linalg.qr(root[..., None] * basis.T, mode="r").R, root)
+    return _condition(torch.linalg.qr(root[..., None] * basis.movedim(0, -1), mode="r").R, root)
 
 
 def _condition(r: Tensor, root: Tensor) -> Tensor:

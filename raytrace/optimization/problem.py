@@ -186,7 +186,9 @@ WORDS = {
     "total_track": Word("TOTR", "from the first vertex to the image"),
     "bfd": Word("TTHI", "from the last powered surface to the image", arguments=_behind_the_lens),
     "image_height": Word(
-        "REAR", "of the ray of the largest field through the centre of the stop", arguments=_through_stop
+        "REAR",
+        "from the vertex of the sensor, of the ray of the largest field through the centre of the stop",
+        arguments=_through_stop,
     ),
     "paraxial_image_height": Word("PIMH", "of the largest field"),
     "distortion": Word("DIMX", "the largest absolute value from the axis to the largest field", "%", _curve),

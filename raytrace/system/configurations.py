@@ -68,6 +68,13 @@ def count(operands: Sequence[Operand]) -> int:
     return max((len(operand) for operand in operands), default=1)
 
 
+def weights(operands: Sequence[Operand]) -> list[float]:
+    """Weights of the configurations, 1 together: those of the operand CWGT, alike without one or where all are 0."""
+    listed = next((operand.values() for operand in operands if operand.name == "CWGT"), [])
+    total = sum(listed)
+    return [weight / total for weight in listed] if total > 0 else [1 / count(operands)] * count(operands)
+
+
 def chosen(lens: Whole, number: int) -> Whole:
     """The lens in one of its configurations, 1 to `len(lens.configurations)`.
 

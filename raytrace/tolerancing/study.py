@@ -39,28 +39,30 @@ CHUNK = 1024
 
 
 class View(NamedTuple):
-    """A configuration of a lens with its criterion and sampling."""
+    """A configuration of a lens with its criterion and sampling, and its share in q."""
 
     lens: Lens
     criterion: Criterion
     sampling: Sampling
+    weight: float = 1.0
 
 
 class Study:
     """A lens with its tolerances, as functions of errors (L, N) and changes (L, C) of compensators.
 
-    views: its configurations, judged together: q is their mean. loss: share of the light of the nominal lens, in any of
-    them, that a lens may lose; one that loses more has no criterion, q is nan.
+    views: its configurations, judged together: q is their mean by weight. loss: share of the light of the nominal lens,
+    in any of them, that a lens may lose; one that loses more has no criterion, q is nan.
     """
 
     def __init__(self, views: Sequence[View], tolerances: Tolerances, loss: float):
         self.views, self.tolerances, self.loss = views, tolerances, loss
-        self.lens, self.criterion, self.sampling = views[0]
+        self.lens, self.criterion, self.sampling, _ = views[0]
         self.perturbations = [Perturbation(view.lens, tolerances) for view in views]
         self.compensators = tolerances.compensators
         for one in self.compensators:
             _check(self.lens, one)
         like = self.lens.wavelengths
+        self.weights = like.new_tensor([[view.weight] for view in views])
         self.least = like.new_tensor([one.minimum for one in self.compensators])
         self.most = like.new_tensor([one.maximum for one in self.compensators])
         self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
@@ -79,7 +81,7 @@ class Study:
 
     def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
-        return self._of_views(None, errors, changes).mean(0)
+        return (self.weights * self._of_views(None, errors, changes)).sum(0)
 
     def light(self, errors: Tensor, changes: Tensor) -> Tensor:
         """Share (L,) of the light of the nominal lens that arrives, of the configuration that loses most."""
@@ -88,14 +90,14 @@ class Study:
     def refocused(self, errors: Tensor) -> tuple[Tensor, Tensor] | None:
         """q (L,) with the sensor at its least, and its shift (L, 1); None where no parabola has it."""
         parts = []
-        for (lens, criterion, sampling), perturbation in zip(self.views, self.perturbations, strict=True):
+        for (lens, criterion, sampling, _), perturbation in zip(self.views, self.perturbations, strict=True):
             if criterion.parabola is None or not focuses(lens, self.compensators):
                 return None
             lenses = perturbation(errors)
             if not is_plain_sensor(lenses.surfaces[-1]):
                 return None
             parts.append([part.expand(len(errors)) for part in criterion.parabola(aligned(lenses, 3), sampling)])
-        parabola = (torch.stack(part).mean(0) for part in zip(*parts, strict=True))
+        parabola = ((self.weights * torch.stack(part)).sum(0) for part in zip(*parts, strict=True))
         q, shift = at_best_focus(tuple(parabola), self.least, self.most)
         return q, shift[:, None]
 
@@ -304,11 +306,12 @@ def _moments(row: Tolerance) -> tuple[float, float]:
 def views_of(
     lens: Lens, criterion: Callable[[Lens, Sampling], Criterion], fields, rings: int | None, arms: int | None
 ) -> list[View]:
-    """The configurations of a lens with their criteria, made of each and of its sampling."""
-    found = []
-    for each in lens.configurations if len(lens.configurations) > 1 else [lens]:
-        sampling = sampling_of(each, fields, rings, arms)
-        found.append(View(each, criterion(each, sampling), sampling))
+    """The configurations of a lens that have a weight with their criteria, made of each and of its sampling."""
+    found, weights = [], configurations.weights(lens.operands)
+    for each, weight in zip(lens.configurations if len(weights) > 1 else [lens], weights, strict=True):
+        if weight > 0:
+            sampling = sampling_of(each, fields, rings, arms)
+            found.append(View(each, criterion(each, sampling), sampling, weight))
     return found
 
 
@@ -317,8 +320,8 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
 
     fields: by default those of the lens with their weights; as errors are not symmetric, a lens that is round about its
     axis has each also mirrored along y, and the two share its weight. rings: of `gauss_rings`, or of the clear pupil
-    (`tracing.clear_pupil`) of a nominal lens that clips rays; by default the fewest that give the mean square spot
-    radius of `spot`, to _SAME.
+    (`tracing.clear_pupil`) of a nominal lens that clips rays, whose points lenses with errors have, too; by default the
+    fewest that give the mean square spot radius of `spot`, to _SAME.
     """
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)

@@ -398,7 +398,8 @@ def tolerance(
 ) -> Toleranced:
     """The lens as built: sensitivities, expectation by second order and Monte Carlo.
 
-    A lens of several configurations is judged in all of them, by the mean of what the compensators minimise.
+    A lens of several configurations is judged in all of them, by the mean of what the compensators minimise, by the
+    weights that its file gives them (CWGT), alike without.
     `lens.configuration(2)` of a lens read alone: leave its others out by `operands=()`.
 
     tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`

@@ -23,6 +23,7 @@ from raytrace.system.lens import (
 from raytrace.system.poses import direction_in
 from raytrace.system.rays import Rays
 from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
 from raytrace.tracing.trace import is_bent
@@ -77,15 +78,15 @@ def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, 
 def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
-    pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
-    lens. empty: "nan" ignores spots without rays; without any ray, or with parallel rays, the distance is nan with
-    gradient 0. "error" raises EmptySpot for either.
+    pupil, weights, scene: as for `bundles`. Differentiable in every number of the lens. empty: "nan" ignores spots
+    without rays; without any ray, or with parallel rays, the distance is nan with gradient 0. "error" raises EmptySpot
+    for either.
     """
     covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
-    for rays, share in bundles(lens, pupil, **scene):
-        moments = focus_moments(rays, weights, empty=empty)
+    for rays, light, share in bundles(lens, pupil, weights, **scene):
+        moments = focus_moments(rays, light, empty=empty)
         covariance, variance = (
-            total + torch.where(_lit(rays, weights), share * moment, 0.0).sum()
+            total + torch.where(_lit(rays, light), share * moment, 0.0).sum()
             for total, moment in zip((covariance, variance), moments, strict=True)
         )
     if empty == "error" and not bool(variance > 0):
@@ -103,13 +104,13 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
     """
     with torch.no_grad():
         start = focus_of_rms(lens, pupil, weights, **scene)
-        traced = list(bundles(lens, pupil, **scene))
+        traced = list(bundles(lens, pupil, weights, **scene))
     if not bool(torch.isfinite(start)):
         raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
 
     def merit(sensor: Tensor) -> Tensor:
         total = torch.zeros_like(sensor)
-        for rays, share in traced:
+        for rays, weights, share in traced:
             shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
             spots = through_focus(rays, shift.reshape(1), weights)
             x, y = torch.where(spots.valid, spots.points - spots.centroid[..., None], 0.0)
@@ -128,9 +129,9 @@ def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = 
     with empty = "error", raises EmptySpot.
     """
     total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
-    for rays, share in bundles(lens, pupil, **scene):
-        lit = _lit(rays, weights)
-        square = spot_of(rays, weights, empty=empty).mean_square_radius
+    for rays, light, share in bundles(lens, pupil, weights, **scene):
+        lit = _lit(rays, light)
+        square = spot_of(rays, light, empty=empty).mean_square_radius
         total = total + torch.where(lit, share * square, 0.0).sum()
         sum_of_shares = sum_of_shares + torch.where(lit, share, 0.0).sum()
     return where_lit(sum_of_shares > 0, safe_sqrt(safe_divide(total, sum_of_shares)), empty=empty)[0]
@@ -144,25 +145,33 @@ def _lit(rays: Rays, weights: Tensor) -> Tensor:
 def bundles(
     lens: Lens,
     pupil: Tensor,
+    weights: Tensor,
     *,
+    rings: int | None = None,
     object_distances: Sequence[Tensor | float] | None = None,
     distance_weights: Sequence[float] | None = None,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
     field_weights: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
-) -> Iterator[tuple[Rays, Tensor]]:
-    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and the weights (F, W) of their spots.
+) -> Iterator[tuple[Rays, Tensor, Tensor]]:
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default), their weights, and those (F, W) of
+    their spots.
 
-    fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
+    pupil, weights: (2, P), (P,) of a rule, of which the rays that arrive count; rings: instead, those of
+    `clear_pupil`, which end at the edges of apertures. fields, wavelengths: as for `launch`; weights of object
+    distances, fields and wavelengths: one for each, 1 by default.
     """
     distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
     distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
     for distance, distance_weight in zip(distances, distance_weights, strict=True):
-        rays = image_rays(with_object_distance(lens, distance), pupil, fields=fields, wavelengths=wavelengths)
+        view, scene = with_object_distance(lens, distance), {"fields": fields, "wavelengths": wavelengths}
+        if rings is not None:
+            pupil, weights = clear_pupil(view, rings=rings, arms=4 * rings, **scene)
+        rays = image_rays(view, pupil, **scene)
         share = rays.position.new_full(rays.shape[:-1], distance_weight)
         share = share if field_weights is None else share * field_weights[:, None]
-        yield rays, share if wavelength_weights is None else share * wavelength_weights
+        yield rays, weights, share if wavelength_weights is None else share * wavelength_weights
 
 
 def best_focus(lens: Lens) -> Tensor:
@@ -171,7 +180,8 @@ def best_focus(lens: Lens) -> Tensor:
     Raises EmptySpot where no ray arrives.
     """
     axis, weights = lens.wavelengths.new_zeros(2, 1), lens.wavelength_weights
-    return focus_of_rms(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
+    rule = gauss_rings(_RINGS)
+    return focus_of_rms(lens, *rule, rings=_RINGS, fields=axis, wavelength_weights=weights, empty="error")
 
 
 def along_normal(lens: Lens) -> Tensor | float:

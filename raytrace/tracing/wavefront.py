@@ -239,13 +239,11 @@ def zernike_coefficients(
 def without(wavefront: Wavefront, count: int) -> Tensor:
     """OPD (D, F, W, P) in mm less its best Noll terms 1 … count: 1 piston, 3 also tilt, 4 also focus."""
     basis = _basis(wavefront, [zernike.noll(j) for j in range(1, count + 1)])
-    fitted = zernike.fit(wavefront.opd, basis, wavefront.energy) @ basis
+    fitted = torch.einsum("...j,j...p->...p", zernike.fit(wavefront.opd, basis, wavefront.energy), basis)
     return torch.where(wavefront.valid, wavefront.opd - fitted, 0.0)
 
 
 def _basis(wavefront: Wavefront, orders: Sequence[zernike.Order]) -> Tensor:
-    if wavefront.pupil.dim() != 2:
-        raise ValueError("Zernike fits need one set of pupil points for all fields, a pupil of shape (2, P)")
     return zernike.polynomials(orders, *wavefront.pupil)
 
 

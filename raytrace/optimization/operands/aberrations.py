@@ -212,9 +212,8 @@ def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tup
 
         def errors(lens: Lens) -> list[Tensor]:
             curve = distortion_of(lens, points)
-            relative, height = (part[range(len(waves)), waves] for part in (curve.f_tan, curve.height))
-            lengths = height * relative / (1 + relative) / planner.unit
-            error = torch.where(torch.from_numpy(absolute), lengths, 100 * relative)
+            relative, ideal = (part[range(len(waves)), waves] for part in (curve.f_tan, curve.ideal))
+            error = torch.where(torch.from_numpy(absolute), ideal * relative / planner.unit, 100 * relative)
             return [*torch.where(curve.valid[range(len(waves)), waves], error, torch.nan)]
 
         return _by_analysis(errors)

@@ -388,8 +388,14 @@ def _terms(beam: Beam, tilted: bool) -> np.ndarray:
     )
 
 
-_RINGS = "int1 rings of four arms each, six at the least; a lost ray leaves no value"
-_GRID = "a grid of 2 int1 × 2 int1 cells across the pupil; rays that apertures stop do not count"
+_RINGS = (
+    "int1 rings of four arms each, six at the least, over the whole pupil: apertures stop no ray; a lost ray leaves no "
+    "value"
+)
+_GRID = (
+    "a grid of 2 int1 × 2 int1 cells across the pupil; rays that apertures stop do not count: no integral up to their "
+    "edges, as by `spot` and `wavefront`"
+)
 
 _SPOT, _WAVEFRONT = "RMS radius of a spot about", "RMS wavefront error about"
 #: By the second and the last letter: spot or wavefront, about the centroid or the chief ray.
