@@ -122,17 +122,23 @@ def clear_rays(scene: Scene, rings: int) -> tuple[Rays, Tensor]:
 
 
 @torch.no_grad()
-def is_clipped(scene: Scene, points: Tensor) -> bool:
-    """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails."""
+def is_clipped(scene: Scene, points: Tensor | None = None) -> bool:
+    """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails.
+
+    Without points rays at the edge alone are traced, and none where no aperture could stop them.
+    """
     return not scene.everywhere(~clipped(scene, points).any())
 
 
 @torch.no_grad()
-def clipped(scene: Scene, points: Tensor) -> Tensor:
+def clipped(scene: Scene, points: Tensor | None = None) -> Tensor:
     """Whether rays of each object distance (D,), or lens of a batch, fail; arguments as for `is_clipped`."""
+    points = scene.wavelengths.new_zeros(2, 0) if points is None else points
     if any(surface.apertures for surface in scene.lens.surfaces):
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
+    if points.shape[1] == 0:
+        return torch.zeros(scene.shape[0], dtype=torch.bool, device=points.device)
     return ~trace_scene(scene, points).valid.flatten(1).all(-1)
 
 
