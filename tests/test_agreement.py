@@ -330,6 +330,28 @@ def test_diffraction_transfer_and_energy(name):
     assert close(energy, kernel[inside].sum() / light, abs=1e-2)
 
 
+@quiet
+def test_modulation_has_a_limit(lens):
+    """No MTF exceeds that of its pupil without aberrations, tangential or sagittal, of any field and wavelength."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    curve = rt.mtf(lens, (_cutoff(lens) * torch.linspace(0, 1.1, 12, dtype=torch.float64)).tolist())
+    if curve.limit is None:
+        pytest.skip("the blur leaves nothing to diffraction")
+    for modulation, limit in zip((curve.tangential, curve.sagittal), curve.limit, strict=True):
+        assert bool((modulation <= limit + 5e-4)[~curve.by_rays].all())
+
+
+def test_a_perfect_lens_reaches_its_limit():
+    """In glass: a stigmatic ellipsoid has the cutoff of its numerical aperture, 1029.7 cycles/mm, not 1000."""
+    lens = member("immersed ellipsoid")
+    assert _cutoff(lens) == pytest.approx(1029.7, abs=0.1)
+    curve = rt.mtf(lens, [0.0, 250.0, 500.0, 1000.0, 1025.0, 1031.0])
+    assert close(curve.tangential, curve.limit[0], abs=1e-6)
+    assert close(curve.sagittal, curve.limit[1], abs=1e-6)
+    assert float(curve.limit[0, 0, 4]) > 1e-5
+    assert float(curve.limit[0, 0, 5]) == pytest.approx(0.0, abs=2e-4)
+
+
 def _cutoff(lens: Lens) -> float:
     """Cycles/mm beyond which nothing of the axial field is resolved: the width of the pupil in directions over λ."""
     line = torch.linspace(-1, 1, 201, dtype=torch.float64)

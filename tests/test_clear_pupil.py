@@ -145,3 +145,9 @@ def test_rays_are_counted(monkeypatch, apertures):
     arms = arms_of(window(Aperture("circular", (0.0, 3.0), False, (2.0, 2.0)), *apertures), 16)
     assert sum(traced) == arms.rays
     assert arms.outer.shape[-1] == (32 if apertures else arms.unit.shape[-1])
+
+
+def test_edges_of_convex_apertures_take_few_rays():
+    """A scan of eight steps, and three rays a round: two rounds enclose a smooth edge in 2⁻¹¹ of its arm."""
+    arms = arms_of(window(Aperture("circular", (0.0, 3.0), False, (2.0, 2.0))), 48)
+    assert arms.rays < 30 * (64 + arms.unit.shape[-1])

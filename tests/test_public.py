@@ -531,7 +531,7 @@ ANALYSES = (
     ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
     ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms_um", "all, weighted"),
-    ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "diffraction_limit", "1/mm"),
+    ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "tangential_limit", "1/mm"),
     (
         "mtf",
         {"frequencies": [20], "through_focus": 0.1, "geometric": True},

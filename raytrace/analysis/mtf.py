@@ -12,7 +12,15 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.analysis.panels import by_field, chart, finished, mark_fields
-from raytrace.analysis.pupil_autocorrelation import MARGIN, beam_of, exit_pupil, otf, points_needed, polynomials_of
+from raytrace.analysis.pupil_autocorrelation import (
+    MARGIN,
+    ExitPupil,
+    beam_of,
+    exit_pupil,
+    otf,
+    points_needed,
+    polynomials_of,
+)
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
     Numbers,
@@ -34,7 +42,7 @@ from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.clear_pupil import clear_pupil
-from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.f_number import axial_f_number, working_f_number
 from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
 
@@ -45,6 +53,7 @@ _FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
 _BUNDLES = 16  # stored of a field: its probe and the fits of its wave
 _SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
 _NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
+_LEAST_GRID = 128  # points across the pupil of a limit where rays give the modulation
 _FINE_GRID = 512  # points across the pupil, from where a quadrature of the sheared pupil is tried
 _RULES = (16, 20, 28, 40, 56, 80, 112, 160, 224)  # its points along and across
 
@@ -54,7 +63,8 @@ class Mtf(Analysis):
     """Modulation of all wavelengths together, by field and spatial frequency.
 
     tangential, sagittal: (F, K), of patterns that vary along y and along x.
-    limit: (K,) of a perfect lens of the paraxial working F/# on the axis, or None for rays alone.
+    limit: (2, F, K) tangential and sagittal, of the same light from the same clear pupils without aberrations, which no
+        modulation exceeds; None for rays alone.
     frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: all fields by rays, without diffraction.
     by_rays: (F,) bool, fields by rays, without diffraction.
     marked: whether the frequencies were asked for, and are marked on the curves.
@@ -76,7 +86,11 @@ class Mtf(Analysis):
     def columns(self) -> dict[str, Tensor]:
         heads = self.heads(frequency=self.frequencies)
         table = {**heads, "tangential": self.tangential, "sagittal": self.sagittal}
-        return table if self.limit is None else {**table, "diffraction_limit": axis(self.limit, 1, 2)}
+        return (
+            table
+            if self.limit is None
+            else {**table, "tangential_limit": self.limit[0], "sagittal_limit": self.limit[1]}
+        )
 
     def about(self) -> dict:
         return {"transfer": transfer(self)}
@@ -89,7 +103,7 @@ class Mtf(Analysis):
 
     @styled
     def draw(self):
-        """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
+        """Modulation over spatial frequency: tangential solid, sagittal dashed, the highest diffraction limit grey."""
         curves = self.drawn()
         _, panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
         frequency = array(curves.frequencies)
@@ -98,7 +112,7 @@ class Mtf(Analysis):
             mark_fields(panel, array(self.frequencies), array(self.tangential), array(self.sagittal))
         if curves.limit is not None:
             look = {"color": GREY, "linewidth": 1.0, "linestyle": ":"}
-            panel.plot(frequency, array(curves.limit), label="diffraction limit", **look)
+            panel.plot(frequency, array(curves.limit.amax((0, 1))), label="diffraction limit", **look)
         panel.set(xlim=(0, frequency.max()), ylim=(0, 1.0))
         return finished(panel, curves, f"{transfer(curves)} MTF", 6)
 
@@ -199,9 +213,8 @@ def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, choice: Tensor | None,
     rows = [_of_field(lens, *each, frequencies) for each in zip(fields.split(1, 1), wanted, strict=True)]
     tangential, sagittal = (torch.cat(parts) for parts in list(zip(*rows, strict=True))[:2])
     by_rays = torch.tensor([row[2] for row in rows], device=fields.device)
-    perfect = clear_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
     whole = bool(by_rays.all())
-    limit = None if whole else perfect
+    limit = None if whole else torch.stack([torch.cat(row[3]()) for row in rows], 1)
     return Mtf(lens, fields, frequencies, tangential, sagittal, limit, whole, by_rays, marked)
 
 
@@ -213,23 +226,35 @@ def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bo
 
 def _of_field(
     lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor, memo: Memo | None = None
-) -> tuple[Tensor, Tensor, bool]:
-    """Tangential and sagittal MTF (1, K) of a field (2, 1), and whether of rays; memo: of its beam at other sensors."""
-    if geometric:
-        return *_geometric(lens, field, frequencies), True
+) -> tuple[Tensor, Tensor, bool, Callable[[], tuple[Tensor, Tensor]]]:
+    """Tangential and sagittal MTF (1, K) of a field (2, 1), whether of rays, and what makes both of its pupil alone.
+
+    memo: of its beam at other sensors.
+    """
     scene = dataclasses.replace(scene_of(lens, field), memo=memo or Memo(_BUNDLES))  # the beam is traced once
     shares = wavelength_shares(lens)
+
+    def limit(pupil: ExitPupil | None = None) -> tuple[Tensor, Tensor]:
+        pupil = exit_pupil(scene, size=_LEAST_GRID, fit=True) if pupil is None else pupil
+        perfect = dataclasses.replace(pupil, amplitude=pupil.amplitude.abs() + 0j, centre=0 * pupil.centre)
+        return _of_pupil(perfect, frequencies, shares)
+
+    if geometric:
+        return *_geometric(lens, field, frequencies), True, limit
     sheared = _sheared(scene, frequencies)
     if sheared is not None:
-        return *sheared, False
+        return *sheared(), False, lambda: sheared(perfect=True)
     seconds = None if geometric is False else _SECONDS
     try:
-        return *mtf_on_grid(scene, frequencies, shares, seconds=seconds, fit=True), False
+        pupil = exit_pupil(scene, seconds=seconds, fit=True)
     except TooManyPoints:
         if geometric is False:
             raise
-    both = _where_diffraction_is_no_matter(scene, frequencies)
-    return (*mtf_on_grid(scene, frequencies, shares, fit=True), False) if both is None else (*both, True)
+        both = _where_diffraction_is_no_matter(scene, frequencies)
+        if both is not None:
+            return *both, True, limit
+        pupil = exit_pupil(scene, fit=True)
+    return *_of_pupil(pupil, frequencies, shares), False, lambda: limit(pupil)
 
 
 def _where_diffraction_is_no_matter(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -310,9 +335,10 @@ def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:
 
 
 def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
-    """Highest frequency 1/(λ N) in cycles/mm that passes on the axis, N the paraxial working F/#, see
-    `axial_f_number`."""
-    return 1e3 / (wavelength * axial_f_number(lens))
+    """Highest frequency 1/(λ N) in cycles/mm that passes on the axis, N the working F/# of the real marginal ray, or of
+    the paraxial one where it is lost."""
+    real = working_f_number(lens)
+    return 1e3 / (wavelength * torch.where(torch.isfinite(real), real, axial_f_number(lens)))
 
 
 def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tuple[Tensor, Tensor]:
@@ -320,7 +346,10 @@ def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tu
 
     shares: (W,) of the wavelengths of the scene; grid: options of `exit_pupil`.
     """
-    pupil = exit_pupil(scene, **grid)
+    return _of_pupil(exit_pupil(scene, **grid), frequencies, shares)
+
+
+def _of_pupil(pupil: ExitPupil, frequencies: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
     shift, weights = pupil.centre - pupil.centre[..., :1], shares * pupil.light
     sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
     otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
@@ -328,8 +357,9 @@ def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tu
     return tangential, sagittal
 
 
-def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
-    """The same by the quadrature of `pupil_autocorrelation.py`, where the wave is polynomial and the grid is slower.
+def _sheared(scene: Scene, frequencies: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:
+    """What makes the same by the quadrature of `pupil_autocorrelation.py`, where the wave is polynomial and the grid is
+    slower; `perfect`: without aberrations.
 
     The grid needs points for all that the blur could modulate, the quadrature for the frequencies that are listed.
     """
@@ -344,12 +374,17 @@ def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
         return None
     shift = _from_primary(scene.lens, beam.wavefront.centre[:2, 0])
     weights = wavelength_shares(scene.lens) * beam.wavefront.energy.sum(-1)[0]
-    result = []
-    for section, along in ((1, polynomials), (0, polynomials.mT)):
-        shear = frequencies[:, None] / (beam.half[section, 0, 0] * beam.waves_per)
-        parts = _overlaps(along, shear, rules)
-        result.append(modulation(parts.mT[None], frequencies, shift[section], weights))
-    return tuple(result)
+
+    def sections(*, perfect: bool = False) -> tuple[Tensor, Tensor]:
+        light = polynomials * polynomials.new_tensor([1.0, 1.0, 1.0 - perfect]).reshape(3, 1, 1, 1, 1)
+        result = []
+        for section, along in ((1, light), (0, light.mT)):
+            shear = frequencies[:, None] / (beam.half[section, 0, 0] * beam.waves_per)
+            parts = _overlaps(along, shear, [_RULES[0]] * len(rules) if perfect else rules)
+            result.append(modulation(parts.mT[None], frequencies, (1 - perfect) * shift[section], weights))
+        return tuple(result)
+
+    return sections
 
 
 def rule_of_blur(turns: float) -> int | None:

@@ -20,7 +20,7 @@ from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
 from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
-from raytrace.tracing.scene import Scene
+from raytrace.tracing.scene import Scene, symmetry
 from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.words import calling_level
 
@@ -164,16 +164,20 @@ def wavefront(
 
 def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str, listed: bool) -> WavefrontMap:
     view = scene_of(lens, fields)
-    line, inside, points = _grid(size, **like(lens))
+    folded = symmetry(view) != "none"  # the half x ≥ 0 of the pupil has the other's OPD
+    line, inside, points = _grid(size, folded, **like(lens))
     drawn = wavefront_of(view, points)
-    dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, **like(lens))[2])
-    front = wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
+    dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, folded, **like(lens))[2])
+    clear = clear_wavefront(view, *_RINGS)
+    front = clear if clear.pupil.dim() == 2 else wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
     wave = 1e-3 * lens.wavelengths
     of = (lambda numbers: numbers[0]) if lens.count is None else (lambda numbers: numbers)
-    opd = drawn.opd.new_zeros(*of(drawn.opd).shape[:-1], size, size)
+    opd = drawn.opd.new_zeros(*of(drawn.opd).shape[:-1], *inside.shape)
     opd[..., inside] = of(drawn.opd) / wave[:, None]
     valid = torch.zeros_like(opd, dtype=torch.bool)
     valid[..., inside] = of(drawn.valid)
+    if folded:
+        opd, valid = (torch.cat([half.flip(-1)[..., : size // 2], half], -1) for half in (opd, valid))
     return WavefrontMap(
         lens=lens,
         fields=fields,
@@ -181,7 +185,7 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
         opd=opd,
         valid=valid,
         coefficients=of(zernike_coefficients(front, terms, numbering)) / wave[:, None],
-        rms=of(rms(clear_wavefront(view, *_RINGS))) / wave,
+        rms=of(rms(clear)) / wave,
         peak_to_valley=of(peak_to_valley(dense)) / wave,
         strehl=of(_strehl(view)),
         numbering=numbering,
@@ -189,10 +193,13 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
     )
 
 
-def _grid(size: int, **like) -> tuple[Tensor, Tensor, Tensor]:
-    """A line of `size` points from -1 to 1, which of their pairs (y, x) lie in the pupil, and those (2, P)."""
+def _grid(size: int, folded: bool, **like) -> tuple[Tensor, Tensor, Tensor]:
+    """A line of `size` points from -1 to 1, which of their pairs (y, x) lie in the pupil, and those (2, P).
+
+    folded: of x the half from the middle on.
+    """
     line = torch.linspace(-1.0, 1.0, size, **like)
-    y, x = torch.meshgrid(line, line, indexing="ij")
+    y, x = torch.meshgrid(line, line[size // 2 if folded else 0 :], indexing="ij")
     inside = x * x + y * y <= 1
     return line, inside, torch.stack([x[inside], y[inside]])
 

@@ -14,6 +14,7 @@ Values: frozen dataclasses of tensors that `torch.func` and `torch.utils._pytree
 """
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Callable, Sequence
@@ -120,8 +121,10 @@ def unit(vector: Tensor) -> Tensor:
     return scaled / norm
 
 
-def polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
-    """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`."""
+def polynomial(coefficients, x):
+    """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`, or m dual numbers."""
+    if not isinstance(coefficients, Tensor):
+        return functools.reduce(lambda total, coefficient: total * x + coefficient, reversed(coefficients), 0.0)
     if len(coefficients) == 0:
         return torch.zeros_like(x)
     *lower, total = coefficients.unbind(0)

@@ -148,7 +148,7 @@ def _smooth_waves(scene: Scene, probe: Wavefront, phase: float, order: int) -> C
     points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, **like)
     others = gauss_rings(_DEGREE // 2 + 3, 2 * _DEGREE + 7, **like)[0]
     front, fitted = wavefront_of(scene, torch.cat([points, others], 1)), len(weights)
-    if not scene.everywhere(front.valid.all()) or is_clipped(scene, points[:, :1]):
+    if not scene.everywhere(front.valid.all()) or is_clipped(scene):
         return None
     numbers = torch.stack([front.opd, *front.direction[:2]])
     series = (numbers[..., :fitted] * weights) @ zernike.polynomials(orders, *points).T

@@ -65,6 +65,11 @@ def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | flo
     return S, dS, d2S + r * d2q + 2 * turn * (dq * along) - 2 * dr * turn * turn * q
 
 
+def conic_sag(u, c, w):
+    """c u/(1+w) of u = r² and the root w = √(1 - (1+k) c² u). Any number type."""
+    return c * u / (1 + w)
+
+
 def conic_terms(
     u: Tensor, c: Tensor, conic: Tensor | None, highest: int, along: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -72,7 +77,7 @@ def conic_terms(
     shape = 1.0 if conic is None else 1 + conic
     radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
     w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
-    S = c * u / (1 + w)
+    S = conic_sag(u, c, w)
     dS = d2S = torch.zeros_like(u)
     if highest > 0:
         dS = 0.5 * c / w

@@ -1,7 +1,8 @@
 """Ray aiming: rays through given points of the stop, and chief rays to given image points.
 
 Roots of traced residuals are found by Newton's method from the paraxial rays; where it fails, by continuation from the
-axis to the full field. Each root is independent of the others of a batch.
+axis to the full field. Many rays of one pupil start from series through a few of them. Each root is independent of the
+others of a batch.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.maths import zernike
 from raytrace.maths.numerics import broadcast_shape, is_any, safe_divide, varies, with_batch_axes
+from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at
@@ -22,6 +25,8 @@ _TOLERANCE = 1e-7  # of the radius of the stop and of the height of the image, i
 _FEW = 1000  # rays that cost less to trace in copies than to differentiate more than once
 _LOST = 1e-2  # a root missed by more at one stage is abandoned
 _CLOSE = 0.1  # of the tolerance: Newton's next step then ends at rounding
+_MANY, _DEGREE = 600, 12  # rays of one pupil that start from series of this degree, through 224 rays
+_CHORDS = 4  # steps from there
 
 _length = partial(torch.linalg.vector_norm, dim=0)
 
@@ -33,24 +38,46 @@ def aim_at_stop(
     lens: Lens,
     through: Callable[[Tensor, float], Rays],
     pupil: Tensor,
-    target: Tensor,
+    turned: Callable[[Tensor], Tensor],
     wavelength: Tensor,
     radius: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Entrance pupil points (2, ...) whose rays pass the stop at `target` times `radius`; and whether found (...).
+    """Entrance pupil points (2, ...) whose rays pass the stop at turned(pupil) times `radius`; and whether found (...).
 
-    pupil: (2, ...), initial points; radius: mm, negative where the entrance pupil is an inverted image of the stop;
+    pupil: (2, ...), initial points too; radius: mm, negative where the entrance pupil is an inverted image of the stop;
     through(pupil, fraction): rays of a fraction of the field.
     """
-    # The radius may have an axis of object distances that pupil points lack.
-    pupil, target = (with_batch_axes(points, radius.dim()) for points in (pupil, target))
+    pupil = with_batch_axes(pupil, radius.dim())  # the radius may have an axis of object distances that points lack
+    target, first = turned(pupil), through(pupil[..., :1].detach(), 1.0)
 
-    def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+    def missed(aim: Tensor, fraction: float, target: Tensor = target) -> tuple[Tensor, Tensor]:
         position, arrives = at_stop(lens, through(aim, fraction), wavelength)
         return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
 
-    given = lens, through(pupil.detach(), 1.0), target, radius, wavelength
-    aim, found = _root(missed, pupil, origin=lambda start: start, given=given)
+    def near() -> tuple[Tensor, Tensor]:
+        """Roots (2, ...), and columns (2, 2, ...) of inverse Jacobians, as Zernike series through those of few rays."""
+        at = pupil.detach()
+        shared = at[(slice(None), *[slice(1)] * (at.dim() - 2))]
+        at = shared if torch.equal(shared.expand_as(at), at) else at
+        low, high = at.amin(-1, keepdim=True), at.amax(-1, keepdim=True)
+        low = torch.stack([torch.where(low[0] >= 0, -high[0], low[0]), low[1]])  # half a pupil represents all of it
+        centre, half = 0.5 * (low + high), 0.5 * (high - low)
+        disc = safe_divide(at - centre, half)
+        size = _length(disc).amax(-1, keepdim=True)
+        points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, dtype=at.dtype, device=at.device)
+        few = centre + half * size * with_batch_axes(points, at.dim() - 1)
+        aim, _ = aim_at_stop(lens, through, few, turned, wavelength, radius)
+        rows = _error_and_jacobian(partial(missed, target=turned(few)), aim, 1.0)[1]
+        inverse = [_solve(rows, unit) for unit in ((1.0, 0.0), (0.0, 1.0))]
+        orders = [zernike.noll(j) for j in range(1, (_DEGREE + 1) * (_DEGREE + 2) // 2 + 1)]
+        series = (torch.stack([aim.detach(), *inverse]) * weights) @ zernike.polynomials(orders, *points).T
+        basis = zernike.polynomials(orders, *safe_divide(disc, size.expand_as(disc)))
+        start, *columns = torch.einsum("...j,j...p->...p", series, basis)
+        return start, torch.stack(columns)
+
+    of_one_pupil = broadcast_shape(first.shape, wavelength.shape)[-1:] == (1,) and pupil.shape[-1] >= _MANY
+    given = lens, first, target, radius, wavelength
+    aim, found = _root(missed, pupil, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
     return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
 
 
@@ -99,9 +126,17 @@ def aim_at_image(
 
 
 def _root(
-    residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor], given: object
+    residual: Residual,
+    start: Tensor,
+    *,
+    origin: Callable[[Tensor], Tensor],
+    given: object,
+    near: Callable[[], tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); origin: axial roots."""
+    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); origin: axial roots.
+
+    near: makes starts (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first.
+    """
     with torch.no_grad():
         first = start[..., :1] if start.dim() > 1 else start  # one ray of the last axis shows the others
         batch = broadcast_shape(start.shape[1:], residual(first, 1.0)[0].shape[1:])
@@ -109,18 +144,34 @@ def _root(
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
     # Roots not found are evaluated on the axis, where every derivative is finite.
     root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
-    last_step = torch.zeros_like(root)
-    for stages in _STAGES:
-        followed, worst, step = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
-        close = (worst <= tolerance) & ~found
-        root, last_step = torch.where(close, followed, root), torch.where(close, step, last_step)
-        found = found | close
+    last_step, close = torch.zeros_like(root), _CLOSE * tolerance
+    searches = [partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES]
+    if near is not None and not torch._C._are_functorch_transforms_active():
+        searches.insert(0, lambda: _chords(residual, *near(), close))
+    for search in searches:
+        followed, worst, step = search()
+        new = (worst <= tolerance) & ~found
+        root, last_step = torch.where(new, followed, root), torch.where(new, step, last_step)
+        found = found | new
         if not is_any(~found):
             break
     root = root - last_step
     if not any(map(varies, pytree.tree_leaves(given))):  # else the last step is attached: first derivatives are exact
         return root, found
     return root - _solve(_error_and_jacobian(residual, root, 1.0)[1], residual(root, 1.0)[0]), found
+
+
+@torch.no_grad()
+def _chords(residual: Residual, root: Tensor, columns: Tensor, close: float) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_followed`, at the full field from close starts: steps by the columns of constant inverse Jacobians."""
+    for left in reversed(range(_CHORDS)):
+        error, arrives = residual(root, 1.0)
+        error = error.detach()
+        step = sum(column * part for column, part in zip(columns, error, strict=True))
+        worst = torch.where(arrives, error.abs().amax(0), torch.inf)
+        if not left or not is_any(worst > close):
+            return root, worst, step
+        root = root - step
 
 
 def _followed(
@@ -189,7 +240,12 @@ def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[T
     with torch.enable_grad():
         point = point.detach().requires_grad_()
         value, arrives = function(point)
-    return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], arrives
+
+    def pull(v: Tensor) -> Tensor:  # of a scalar: with weights `grad` imports sympy, too
+        with torch.enable_grad():
+            return torch.autograd.grad((value * v).sum(), point, retain_graph=True)[0]
+
+    return value.detach(), pull, arrives
 
 
 def _solve(rows: list[Tensor], error: Tensor) -> Tensor:

@@ -31,8 +31,8 @@ from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
 from raytrace.tracing.trace import without_apertures
 
-_SCAN = 32  # steps along an arm in which edges are looked for
-_SECTIONS, _ZOOMS = 8, 2  # an edge is enclosed in 8⁻² of a step: slopes are good to 5e-4
+_SCAN, _COARSER = 32, 8  # steps along an arm in which edges are looked for, and where nothing stands inside the beam
+_NARROW, _NEAR, _ROUNDS = 2**-11, 1 / 32, 8  # an edge is enclosed in 2⁻¹¹ of its arm: slopes are good to 5e-4
 _MOST_PARTS = 3  # clear parts of one arm
 _COARSE = 64  # arms round the pupil between which kinks are looked for
 _NEWTON = 4  # steps to a kink
@@ -122,17 +122,23 @@ def clear_rays(scene: Scene, rings: int) -> tuple[Rays, Tensor]:
 
 
 @torch.no_grad()
-def is_clipped(scene: Scene, points: Tensor) -> bool:
-    """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails."""
+def is_clipped(scene: Scene, points: Tensor | None = None) -> bool:
+    """Whether a ray of the whole scene through pupil points (2, P), or just inside the edge of the pupil, fails.
+
+    Without points rays at the edge alone are traced, and none where no aperture could stop them.
+    """
     return not scene.everywhere(~clipped(scene, points).any())
 
 
 @torch.no_grad()
-def clipped(scene: Scene, points: Tensor) -> Tensor:
+def clipped(scene: Scene, points: Tensor | None = None) -> Tensor:
     """Whether rays of each object distance (D,), or lens of a batch, fail; arguments as for `is_clipped`."""
+    points = scene.wavelengths.new_zeros(2, 0) if points is None else points
     if any(surface.apertures for surface in scene.lens.surfaces):
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
+    if points.shape[1] == 0:
+        return torch.zeros(scene.shape[0], dtype=torch.bool, device=points.device)
     return ~trace_scene(scene, points).valid.flatten(1).all(-1)
 
 
@@ -269,7 +275,8 @@ def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Te
     B is A, or a multiple of it if an obstruction lies in an arm: then the second clear parts of all arms follow the
     first ones. A part that an arm does not have lies between 0 and 0. First derivatives are exact to 1e-6, second ones
     to 1e-3, where an aperture of any shape sets the edge; where rays miss a surface or are totally reflected the edge
-    has none. Parts and gaps shorter than 1/32 of an arm may be missed; gaps behind the third part are filled.
+    has none. Parts and gaps shorter than 1/32 of an arm may be missed, or 1/8 where no aperture stops light within the
+    beam; gaps behind the third part are filled.
     """
     radius, number, slope, exists, traced = _enclosed(scene, unit, origin)
     unit = unit.repeat(1, 1, 1, 1, radius.shape[-1] // unit.shape[-1])
@@ -294,32 +301,44 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
     arms = unit.shape[-1]
     with torch.no_grad():
         reach = _reach(unit, origin)
-        step = torch.linspace(0, 1, _SCAN + 1, dtype=unit.dtype, device=unit.device)
-        radii = step[:, None, None, None, None] * reach
-        passed = (_clearances(scene, radii, unit, origin) >= 0).all(0)
+        apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+        steps = _SCAN if any(map(stands_inside, apertures)) else _COARSER
+        step = torch.linspace(0, 1, steps + 1, dtype=unit.dtype, device=unit.device)
+        scanned = _clearances(scene, step[:, None, None, None, None] * reach, unit, origin)
+        passed = (scanned >= 0).all(0)
         part = (passed & ~torch.cat([torch.zeros_like(passed[:1]), passed[:-1]])).cumsum(0).clamp_max(_MOST_PARTS)
         count = max(1, int(part.max()))
         here = torch.cat([passed & (part == number + 1) for number in range(count)], -1)
-        unit, reach = unit.repeat(1, 1, 1, 1, count), reach.repeat(1, 1, 1, count)
+        unit, reach, scanned = (torch.cat([t] * count, -1) for t in (unit, reach, scanned))
         first, last = (t.to(torch.int8).argmax(0) for t in (here, here.flip(0)))
-        at = torch.stack([first, _SCAN - last]), torch.stack([first - 1, _SCAN - last + 1])
-        passes, blocked = (step[place.clamp(0, _SCAN)] * reach for place in at)
-        ends = torch.stack([at[1][0] < 0, at[1][1] > _SCAN])  # at the origin, at the edge of the pupil
-        share = torch.linspace(0, 1, _SECTIONS + 1, dtype=passes.dtype, device=passes.device)
-        for _ in range(_ZOOMS):
-            radii = passes + share[:, None, None, None, None, None] * (blocked - passes)
-            clearances = _clearances(scene, radii.flatten(0, 1), unit, origin).unflatten(1, radii.shape[:2])
-            index = (clearances >= 0).all(0)[1:].to(torch.int64).cumprod(0).sum(0)[None]
-            pair = index, (index + 1).clamp_max(_SECTIONS)
-            passes, blocked = (radii.gather(0, at)[0] for at in pair)
-        inside, outside = (clearances.gather(1, at.expand(len(clearances), *at.shape))[:, 0] for at in pair)
+        at = torch.stack([first, steps - last]), torch.stack([first - 1, steps - last + 1])
+        ends = torch.stack([at[1][0] < 0, at[1][1] > steps])  # at the origin, at the edge of the pupil
+        at = [place.clamp(0, steps) for place in at]
+        passes, blocked = (step[place] * reach for place in at)
+        inside, outside = (scanned.gather(1, place.expand(len(scanned), *place.shape)) for place in at)
+        traced = arms * (steps + 1)
+        for _ in range(_ROUNDS):  # rays close to where the first clearance vanishes along a chord, and halfway
+            wide = (blocked - passes).abs() > _NARROW * reach
+            some = slice(int(not bool(wide[0].any())), None)  # most arms start at a clear point
+            if not bool(wide.any()):
+                break
+            zero = torch.where(outside < 0, safe_divide(inside, inside - outside), 1.0).amin(0)[some]
+            share = torch.stack([zero - _NEAR, zero + _NEAR, torch.full_like(zero, 0.5)]).clamp(0, 1).sort(0).values
+            radii = passes[some] + share * (blocked - passes)[some]
+            between = _clearances(scene, radii.flatten(0, 1), unit, origin).unflatten(1, radii.shape[:2])
+            traced += radii.shape[0] * radii.shape[1] * unit.shape[-1]
+            line = torch.cat([inside[:, None, some], between, outside[:, None, some]], 1)
+            radii = torch.cat([passes[None, some], radii, blocked[None, some]])
+            index = (between >= 0).all(0).to(torch.int64).cumprod(0).sum(0)[None]
+            for place, radius, clearance in ((index, passes, inside), (index + 1, blocked, outside)):
+                new = line.gather(1, place.expand(len(line), *place.shape))[:, 0]
+                clearance[:, some] = torch.where(wide[some], new, clearance[:, some])
+                radius[some] = torch.where(wide[some], radii.gather(0, place)[0], radius[some])
         # The aperture that stops the ray; a missed surface, last in the list, has no slope.
         lowest, number = outside.min(0)
-        apertures = len(clearances) - 1
         slope = safe_divide((outside - inside).gather(0, number[None])[0], blocked - passes)
-        slope = torch.where((lowest < 0) & (number < apertures) & ~ends, slope, 0.0)
+        slope = torch.where((lowest < 0) & (number < len(scanned) - 1) & ~ends, slope, 0.0)
         number = torch.where(ends, number.new_tensor([-1, 0]).reshape(2, 1, 1, 1, 1), number + 1)
-        traced = arms * (_SCAN + 1) + arms * count * 2 * _ZOOMS * (_SECTIONS + 1)
     return passes, number, slope, here.any(0), traced
 
 

@@ -133,10 +133,12 @@ def rays_of_field(
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
         return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index, entrance)
 
+    def turned(pupil: Tensor) -> Tensor:
+        return pupil if entrance is None else _turned(entrance.turn, pupil)
+
     if _is_aimed(lens):
         radius = _aimed_radius(lens, paraxial, entrance)
-        target = pupil if entrance is None else _turned(entrance.turn, pupil)
-        pupil, found = aim_at_stop(lens, through, pupil, target, wavelength, radius)
+        pupil, found = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
         reached = reached & found
     rays = through(pupil)
     return dataclasses.replace(rays, valid=rays.valid & reached)

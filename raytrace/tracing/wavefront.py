@@ -134,7 +134,7 @@ def clear_wavefront(scene: Scene, rings: int, arms: int, *, reference: Tensor | 
     """
     points, weights = gauss_rings(rings, arms, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
     front = wavefront_of(scene, points, weights, reference=reference)
-    if scene.everywhere(front.valid.all()) and not is_clipped(scene, points[:, -1:]):
+    if scene.everywhere(front.valid.all()) and not is_clipped(scene):
         return front
     return wavefront_of(scene, *arms_of(scene, arms).rule(rings), reference=reference)
 

@@ -154,7 +154,7 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
         "frequency": frequencies.tolist(),
         "tangential": curves(found.tangential),
         "sagittal": curves(found.sagittal),
-        "limit": None if found.limit is None else curves(found.limit),
+        "limit": None if found.limit is None else curves(found.limit.amax((0, 1))),
         "transfer": transfer(found),
     }
 

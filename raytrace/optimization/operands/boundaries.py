@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, polynomial, slope_of, value_of
 from raytrace.optimization.lens_state import ENDS, Bundle, LensState, largest_field, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,
@@ -30,7 +30,7 @@ from raytrace.optimization.operands.operand import (
     once_a_context,
 )
 from raytrace.system.lens import media
-from raytrace.system.shapes import EVEN
+from raytrace.system.shapes import EVEN, conic_sag
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
 from raytrace.tracing.geometry import edge_thickness, rims
 
@@ -203,12 +203,8 @@ class Gaps:
         if closed.any():
             over = np.where(closed, 1 - left / _EDGE, 0.0)
             left = np.where(closed, _EDGE / (1 + over + over * over), left)
-        sag = c * u / (1 + np.sqrt(left))
-        power = u
-        for name in self.terms:
-            sag = sag + power * state.of_surfaces(name)[surfaces]
-            power = power * u
-        return sag
+        sag = conic_sag(u, c, np.sqrt(left))
+        return sag + u * polynomial([state.of_surfaces(name)[surfaces] for name in self.terms], u)
 
     def slenderness(self, context: EvaluationContext):
         """Diameter over centre thickness of glasses."""
