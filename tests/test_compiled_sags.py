@@ -1,6 +1,7 @@
 """Sags that are not round in the compiled trace: rays, adjoint and tangents as torch finds them."""
 
 import dataclasses
+import time
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.numerics import to
-from raytrace.system.rays import Rays
+from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import (
     SAG_TERMS,
     FringeSag,
@@ -92,6 +93,39 @@ def test_rays_of_all_fates_are_traced_as_by_torch(name, dtype):
         without = trace_surfaces(surfaces, dataclasses.replace(rays, opl=None), indices=indices(dtype))
     assert without.opl is None
     assert_same_rays(without, dataclasses.replace(eager, opl=None), 10 * CLOSE[dtype])
+
+
+@pytest.mark.parametrize("conic", [None, 2.0, -3.0])
+@pytest.mark.parametrize("terms", [(), (2e-4, -3e-6)])
+def test_a_crossing_beyond_the_rim_counts_where_none_lies_within_it(conic, terms):
+    """Rays of any slope at a steep bowl, of which many cross it inside the rim and outside, some in both places."""
+    bowl = departed(PolynomialSag(drawn(14, 0.01), scalar(6.0)), 1 / 9, conic, *terms)
+    bowl = dataclasses.replace(bowl, semi_diameter=4.0)
+    spread = torch.rand(4, 3000, generator=torch.Generator().manual_seed(5), dtype=torch.float64) * 2 - 1
+    ones = torch.ones(3000, dtype=torch.float64)
+    rays = start(torch.stack([6 * spread[0], 6 * spread[1], -ones]), torch.stack([3 * spread[2], 3 * spread[3], ones]))
+    compiled, eager = both(lambda: trace_surfaces([bowl], rays, indices=indices()[:2]))
+    radius = torch.hypot(*eager.position[:2])
+    near = (radius > 4.0) & (radius < 1.125 * 4.0) & eager.valid
+    assert int(near.sum()) > 50
+    assert_same_rays(compiled, eager, 1e-13)
+
+
+def test_rays_a_little_beyond_a_rim_are_traced_as_fast_as_within_it():
+    """They are not looked for one by one: half of these rays are beyond the rim."""
+    bowl = departed(PolynomialSag(drawn(14, 1e-4), scalar(6.0)), 1 / 30)
+    angle = torch.arange(60000, dtype=torch.float64)
+    radius = 3.9 + 0.2 * (angle % 2)
+    position = torch.stack([radius * angle.cos(), radius * angle.sin(), -torch.ones_like(angle)])
+    rays = start(position, position.new_tensor([0.0, 0.0, 1.0])[:, None])
+    seconds = {}
+    with trace_engine("compiled"):
+        for rim in (4.0, 5.0) * 3:
+            surface = dataclasses.replace(bowl, semi_diameter=rim)
+            begin = time.process_time()
+            trace_surfaces([surface], rays, indices=indices()[:2])
+            seconds.setdefault(rim, []).append(time.process_time() - begin)
+    assert min(seconds[4.0]) < 3 * min(seconds[5.0])
 
 
 @each

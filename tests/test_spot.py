@@ -237,3 +237,44 @@ def test_spots_of_a_batch_are_those_of_its_lenses():
     assert bool(clipped.any())
     assert not bool(clipped.all())
     assert rt.spot(rt.perturbed(lens, rows, torch.zeros(0, len(rows)))).rms_radius.shape == (0, 1, 1)
+
+
+def test_statistics_of_many_spots_are_those_of_each():
+    """More points than are processed at once, some invalid, one spot dark."""
+    generator = torch.Generator().manual_seed(2)
+    points = torch.randn(2, 9, 3, 5000, generator=generator, dtype=torch.float64)
+    valid = torch.rand(9, 3, 5000, generator=generator) > 0.2
+    valid[4, 1] = False
+    valid[:, :, 0] = False
+    weights = torch.rand(5000, generator=generator, dtype=torch.float64)
+    names = ("centroid", "mean_square_radius", "rms_radius", "geometric_radius")
+    for about in (None, torch.randn(2, 9, 3, generator=generator, dtype=torch.float64)):
+        several = spot_of_points(points, valid, weights, about=about)
+        for k, j in ((0, 0), (4, 1), (8, 2)):
+            alone = spot_of_points(
+                points[:, k, j], valid[k, j], weights, about=None if about is None else about[:, k, j]
+            )
+            for name in names:
+                torch.testing.assert_close(
+                    getattr(several, name)[..., k, j], getattr(alone, name), rtol=1e-13, atol=0, equal_nan=True
+                )
+    k, j = 2, 1
+    mask, share = valid[k, j], weights[valid[k, j]] / weights[valid[k, j]].sum()
+    mean = (share * points[:, k, j, mask]).sum(-1)
+    square = (share * ((points[:, k, j, mask] - mean[:, None]) ** 2).sum(0)).sum()
+    found = spot_of_points(points, valid, weights)
+    torch.testing.assert_close(found.centroid[:, k, j], mean, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(found.rms_radius[k, j], square.sqrt(), rtol=1e-13, atol=0)
+
+
+def test_statistics_in_several_pieces_have_their_derivatives(monkeypatch):
+    monkeypatch.setattr("raytrace.tracing.spot._PIECE", 5)
+    points = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(6), dtype=torch.float64, requires_grad=True)
+    valid = torch.tensor([[True] * 5, [False, True, True, False, True], [True, False] * 2 + [True]])
+
+    def figures(points):
+        spots = spot_of_points(points, valid)
+        return spots.centroid, spots.mean_square_radius, spots.rms_radius, spots.geometric_radius
+
+    assert gradcheck(figures, (points,))
+    assert gradgradcheck(figures, (points,))

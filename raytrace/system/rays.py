@@ -43,13 +43,13 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
     position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
     """
     axes = max(position.dim(), direction.dim()) - 1
-    position, direction = torch.broadcast_tensors(with_batch_axes(position, axes), with_batch_axes(direction, axes))
-    usable = torch.isfinite(position).all(0) & torch.isfinite(direction).all(0) & (direction != 0).any(0)
-    axis = torch.zeros_like(direction)
-    axis[2] = 1.0
+    position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
+    directed = torch.isfinite(direction).all(0) & (direction != 0).any(0)
+    usable = torch.isfinite(position).all(0) & directed
+    axis = direction.new_tensor([0.0, 0.0, 1.0]).reshape(3, *(1,) * axes)
     return Rays(
         position=torch.where(usable, position, 0.0),
-        direction=unit(torch.where(usable, direction, axis)),
+        direction=torch.where(usable, unit(torch.where(directed, direction, axis)), axis),
         valid=usable,
         opl=opl if opl is None else torch.where(usable, opl, 0.0),
     )

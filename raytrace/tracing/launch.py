@@ -37,6 +37,7 @@ from raytrace.maths.numerics import (
     unit,
     value,
     varies,
+    with_batch_axes,
 )
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import (
@@ -47,6 +48,7 @@ from raytrace.system.lens import (
     field_points,
     index_behind,
     name_of_field,
+    one_lens,
     shared,
     wavelengths_of,
 )
@@ -175,6 +177,8 @@ def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays
 
     direction: (3, ...) of any length; aim: (3, ...) mm in the frame of surface 1; index: (...) of the object space.
     """
+    axes = max(aim.dim(), direction.dim()) - 1
+    aim, direction = with_batch_axes(aim, axes), with_batch_axes(direction, axes)
     return start(aim, direction, index * dot(aim, unit(direction)))
 
 
@@ -349,9 +353,9 @@ def _through_entrance_pupil(
     # Not the index: all wavelengths start alike, and only their paths differ.
     if point is None:
         distance = lens.surfaces[0].thickness
-        x, y, aim_x, aim_y, depth, _ = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
+        aim_x, aim_y, depth, _ = torch.broadcast_tensors(aim_x, aim_y, depth, distance)
         aim = torch.stack([aim_x, aim_y, depth])
-        return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
+        return rays_from_infinity(torch.stack([*field, torch.ones_like(field[0])]), aim, index=index)
     *point, aim_x, aim_y, depth = torch.broadcast_tensors(*point, aim_x, aim_y, depth)
     point, aim = torch.stack(point), torch.stack([aim_x, aim_y, depth])
     # Rays travel towards +z and start at the nearer of object point O and pupil point A. A virtual object lies behind
@@ -498,6 +502,7 @@ def _rise(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
 TOLERANCE = 0.02
 
 MOST_FIELDS = 64  # measured per call: a map of the field has thousands
+MOST_LENSES = 64  # of a batch
 
 
 class UnfilledStop(RaytraceWarning):
@@ -547,18 +552,19 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
 def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> str:
     """Words for the field of (2, F) that misses the stop most, if it does by more than TOLERANCE; else empty.
 
-    Of more than MOST_FIELDS fields so many are measured, and the largest one. Fields without rays at the stop are left
-    to LostRays. Nothing is traced if rays are aimed, if object space is telecentric, and where a derivative by numbers
-    of the lens or fields may be requested.
+    Of more than MOST_FIELDS fields so many are measured, and the largest one; of more than MOST_LENSES lenses so many,
+    evenly spaced in the batch. Fields without rays at the stop are left to LostRays. Nothing is traced if rays are
+    aimed, if object space is telecentric, and where a derivative by numbers of the lens or fields may be requested.
     """
     lens = with_ray_aiming(lens, ray_aiming)
     if any(map(varies, pytree.tree_leaves((lens, fields)))) or lens.fields.telecentric or aiming_of(lens) != "off":
         return ""
     if fields.shape[1] > MOST_FIELDS:
-        spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
-        fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
+        fields = fields[:, [*_spread(fields.shape[1], MOST_FIELDS), int(fields.norm(dim=0).argmax())]]
     if lens.count == 0:
-        return
+        return ""
+    if (lens.count or 1) > MOST_LENSES:
+        lens = one_lens(lens, torch.tensor(_spread(lens.count, MOST_LENSES), device=lens.wavelengths.device))
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most
@@ -575,6 +581,11 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
         f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
         f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')"
     )
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """`most` evenly spaced places of a sequence."""
+    return torch.linspace(0, count - 1, most, dtype=torch.float64).long().tolist()
 
 
 def _words(missed: Tensor, place: str) -> str:

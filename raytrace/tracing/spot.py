@@ -3,19 +3,24 @@
 Arrivals: where every ray of a spot meets the sensor, from which field, colour and point of the pupil.
 """
 
+import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford, afford_rays
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
 from raytrace.tracing.trace import is_bent, trace_lens, without_apertures
+
+_PIECE = 2**16  # points whose statistics are formed at once: they stay in the cache
 
 
 @value
@@ -62,25 +67,42 @@ def spot_of_points(
     One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
     of one ray has radius 0 and gradient 0.
     """
-    weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
+    shape = points.shape[1:]
+    weights = torch.ones_like(points[0]) if weights is None else weights.expand(shape)
+    size = max(1, _PIECE // max(1, math.prod(shape[1:])))
+    if len(shape) == 1 or shape[0] <= size:
+        figures = _statistics(points, valid, weights, about)
+    else:
+        around = itertools.repeat(None) if about is None else about.expand(2, *shape[:-1]).split(size, 1)
+        parts = zip(points.split(size, 1), valid.expand(shape).split(size), weights.split(size), around, strict=False)
+        each = zip(*(_statistics(*part) for part in parts), strict=True)
+        figures = [torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each)]
+    return Spot(*where_lit(*figures, empty=empty), points=points, valid=valid, rays=valid.sum(-1))
+
+
+def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | None) -> tuple[Tensor, ...]:
+    """Whether light arrives (...), its centroid (2, ...), the mean square, RMS and geometric radius (...)."""
     weights = torch.where(valid, weights, 0.0)
     total = weights.sum(-1, keepdim=True)
-    share = safe_divide(weights, total)
-    first = valid & (valid.to(torch.int64).cumsum(-1) == 1)
-    reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
+    share = weights * safe_divide(torch.ones_like(total), total)
+    reference = torch.zeros_like(total)
+    if points.shape[-1]:
+        first = valid.to(torch.uint8).argmax(-1, keepdim=True)
+        reference = points.gather(-1, first.expand(2, *first.shape))
+        reference = torch.where(valid.any(-1, keepdim=True), reference, 0.0)
     offset = torch.where(valid, points - reference, 0.0)
     mean = (share * offset).sum(-1, keepdim=True)
     centre = mean if about is None else about[..., None] - reference
     centred = torch.where(valid, offset - centre, 0.0)
-    mean_square = (share * (centred[0] ** 2 + centred[1] ** 2)).sum(-1)
+    mean_square = (share * dot_2(centred, centred)).sum(-1)
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)
-    square = (centred[0] / scale) ** 2 + (centred[1] / scale) ** 2
+    scaled = centred / scale
+    square = dot_2(scaled, scaled)
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
     rms, geometric = (scale[..., 0] * safe_sqrt(t) for t in (scaled_mean, largest))
-    found = where_lit(total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric, empty=empty)
-    return Spot(*found, points=points, valid=valid, rays=valid.sum(-1))
+    return total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric
 
 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
@@ -182,6 +204,7 @@ def arrivals(
     each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
     for field in progress(fields.unbind(1)):
         launched = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
+        launched = dataclasses.replace(launched, opl=None)
         rays = trace_lens(lens, launched, lens.wavelengths[:, None])
         on_sensor = rays, torch.zeros_like(rays.valid, dtype=torch.int64), rays.valid
         if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails

@@ -118,7 +118,7 @@ int cross_conic(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const 
 // Newton's method from the base conic, every ray frozen once its step is small: quadratic convergence then puts the
 // error below rounding. Rays that take more than a few steps are left to `careful`.
 template <typename T>
-constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(1e-9);
+constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(5e-9);
 constexpr int kSteps = 8;
 
 // |F| of a hit over the size of its terms, above which it is left to `careful`: where a section closes its slope has no
@@ -126,10 +126,28 @@ constexpr int kSteps = 8;
 template <typename T>
 constexpr T kOff = sizeof(T) == 4 ? T(1e-4) : T(1e-10);
 
+// How far beyond the rim a loop follows rays.
+template <typename T>
+constexpr T kBeyond = T(1.125);
+
+// cos² of the angle to the axis above which a ray crosses a round sag with its sag terms only once up to a radius: it runs
+// more steeply than the surface stands anywhere there. NaN or 1 where there is no such angle.
+template <int kind, typename T>
+T single_crossing(const Surface<T>& s, T radius) {
+  const T bent = s.c * radius;  // the slope of a conic rises outwards
+  T slope = magnitude(bent) / root(T(1) - (T(1) + s.k) * bent * bent), power = kind == kOdd ? T(1) : radius;
+  for (int j = 0; j < s.at->terms; j++) {
+    slope += T(kind == kOdd ? j + 1 : 2 * j + 2) * magnitude(s.a[j]) * power;
+    power *= kind == kOdd ? radius : radius * radius;
+  }
+  if constexpr (has_sag_terms(kind)) slope += sag_terms_slope(s, radius);
+  return T(1) - T(1) / (T(1) + slope * slope);
+}
+
 template <typename T, int kind, int terms>
 void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   const T gap = s.gap, c = s.c, shape = T(1) + s.k;
-  const T rim_squared = T(s.rim) * T(s.rim);
+  const T rim = T(s.rim) * (is_freeform(kind) ? T(1) : kBeyond<T>), rim_squared = rim * rim;
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i] - gap, L = from.L[i], M = from.M[i], N = from.N[i];
@@ -197,6 +215,9 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   const Law<T, bend> law(s);
   const bool has_gap = s.at->gap >= 0;
   const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
+  const T beyond = kBeyond<T> * T(s.rim), beyond_squared = beyond * beyond;
+  T single = 1;
+  if constexpr (!is_freeform(kind)) single = single_crossing<kind>(s, beyond);
   int flagged = 0;
 #pragma omp simd reduction(+ : flagged)
   for (int i = 0; i < n; i++) {
@@ -232,7 +253,8 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
       cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
     }
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
-    good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
+    good &= (notes.active[i] < T(0.5)) & (cosine * N > 0);
+    good &= (u <= rim_squared) | ((u <= beyond_squared) & (N * N > single));
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
     good &= magnitude(off) <= kOff<T> * (size + root(u));
     T l = L, m = M, o = N;

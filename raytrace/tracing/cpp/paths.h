@@ -26,9 +26,43 @@ void clear(Added<T, size>& to, int n) {
   for (T* part : {to.p, to.x, to.y, to.xx, to.xy, to.yy}) std::memset(part, 0, n * sizeof(T));
 }
 
+// A polynomial in x of the terms x^k y^j, from k on down, by Horner's rule, with its derivatives; the terms from 1 on.
+template <bool second, int k, int j, typename T>
+[[gnu::always_inline]] inline void along_x(const T* c, T x, T& q, T& dq, T& d2q) {
+  if (second) d2q = d2q * x + dq;  // half of the second derivative
+  dq = dq * x + q;
+  q = q * x + c[place_of(k, j) + 1];
+  if constexpr (k > 0) along_x<second, k - 1, j>(c, x, q, dq, d2q);
+}
+
+// Horner's rule in y over those of a degree, from j on down, at one point.
+template <bool second, int top, int j, typename T>
+[[gnu::always_inline]] inline void along_y(const T* c, T x, T y, T& p, T& px, T& py, T& pxx, T& pxy, T& pyy) {
+  T q = 0, dq = 0, d2q = 0;
+  along_x<second, top - j, j>(c, x, q, dq, d2q);
+  if (second) pyy = pyy * y + T(2) * py, pxy = pxy * y + px, pxx = pxx * y + T(2) * d2q;
+  py = py * y + p, px = px * y + dq, p = p * y + q;
+  if constexpr (j > 0) along_y<second, top, j - 1>(c, x, y, p, px, py, pxx, pxy, pyy);
+}
+
+constexpr int kLow = 4;  // degree up to which a polynomial stays in registers
+
 // Horner's rule in y over polynomials in x, each with its first derivative, and with the second if asked for.
 template <bool second, typename C, typename T, int size>
 void polynomial(const C* c, int count, const T* x, const T* y, int n, Added<T, size>& to) {
+  const int top = degree(count);
+  if (top > 1 && top <= kLow) {
+    T terms[(kLow + 1) * (kLow + 2) / 2] = {};
+    for (int k = 0; k < count; k++) terms[k + 1] = T(c[k]);
+#pragma omp simd
+    for (int i = 0; i < n; i++) {
+      T p = 0, px = 0, py = 0, pxx = 0, pxy = 0, pyy = 0;
+      along_y<second, kLow, kLow>(terms, x[i], y[i], p, px, py, pxx, pxy, pyy);
+      to.p[i] = p, to.x[i] = px, to.y[i] = py;
+      if (second) to.xx[i] = pxx, to.xy[i] = pxy, to.yy[i] = pyy;
+    }
+    return;
+  }
   clear(to, n);
   if (count <= 2) {
     const T a = count > 0 ? T(c[0]) : T(0), b = count > 1 ? T(c[1]) : T(0);
@@ -36,7 +70,6 @@ void polynomial(const C* c, int count, const T* x, const T* y, int n, Added<T, s
     for (int i = 0; i < n; i++) to.p[i] = a * x[i] + b * y[i], to.x[i] = a, to.y[i] = b;
     return;
   }
-  const int top = degree(count);
   for (int j = top; j >= 0; j--) {
     for (T* part : {to.q, to.dq, to.d2q}) std::memset(part, 0, n * sizeof(T));
     for (int k = top - j; k >= 0; k--) {

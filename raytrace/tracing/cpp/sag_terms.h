@@ -63,18 +63,21 @@ inline Added<double, 1> sag_terms_at(const Surface<double>& s, double x, double 
   return found;
 }
 
-// A bound on |D| up to a radius.
-inline double sag_terms_size(const Surface<double>& s, double radius) {
-  const double* numbers = s.sag_terms;
-  const double reach = (radius + std::fabs(numbers[0]) + std::fabs(numbers[1])) / std::fabs(numbers[2]);
+// Bounds on |D| and on its slope up to a radius.
+template <typename T>
+T sag_terms_bound(const Surface<T>& s, T radius, bool slope) {
+  const T* numbers = s.sag_terms;
+  const T over = T(1) / magnitude(numbers[2]), reach = (radius + magnitude(numbers[0]) + magnitude(numbers[1])) * over;
   const int count = s.at->sag_term_count;
-  double total = std::fabs(numbers[3]), power = 1;
-  for (int n = 1, k = 0; k < count; n++) {
-    power *= reach;
-    for (int j = 0; j <= n && k < count; j++, k++) total += std::fabs(numbers[kFrame + k]) * power;
-  }
+  T total = slope ? T(0) : magnitude(numbers[3]), power = slope ? over : reach;
+  for (int n = 1, k = 0; k < count; n++, power *= reach)
+    for (int j = 0; j <= n && k < count; j++, k++) total += T(slope ? n : 1) * magnitude(numbers[kFrame + k]) * power;
   return total;
 }
+template <typename T>
+T sag_terms_size(const Surface<T>& s, T radius) { return sag_terms_bound(s, radius, false); }
+template <typename T>
+T sag_terms_slope(const Surface<T>& s, T radius) { return sag_terms_bound(s, radius, true); }
 
 // What the numbers get from the cotangents z̄ of the sag, in notes.px, and x̄, ȳ of its slopes, in notes.t and notes.active;
 // D of the block stands in notes.added with its second derivatives.
