@@ -114,7 +114,7 @@ class FieldKernels:
         distances, which = _distinct(self.object_distances)
         kernels = dataclasses.replace(self, object_distances=distances)
         if not MODELS[self.model].traces:
-            return kernels._computed(torch.zeros_like(points[:, :1]))[0, which]
+            return kernels._in_parts(torch.zeros_like(points[:, :1]))[0, which]
         if self._has_radii:
             # Moments of all radii and distances, pixels of the pairs: these cost more.
             radii, places = self._distinct_radii(points)
@@ -132,7 +132,7 @@ class FieldKernels:
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
-            return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
+            return self._in_parts(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
         if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
             return self._in_parts(points)
         compute = self._turned if self._has_radii else self._in_parts
@@ -152,18 +152,18 @@ class FieldKernels:
         return kernels.flip(-1)
 
     def _in_parts(self, points: Tensor) -> Tensor:
-        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
-        return torch.cat([self._computed(part) for part in points.split(count, 1)])
-
-    def _computed(self, points: Tensor) -> Tensor:
-        """By the PSF model, field by field."""
+        """By the PSF model, field by field; the chief rays of all places are aimed and traced at once."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        kernels = self._of_elements(fields) if self.elements else self._of_model(fields)
-        kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
-        return torch.where(arrives[:, None, None, None, None], _of_sum_1(kernels), 0.0)
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
+        kernels = []
+        for part, origin in zip(fields.split(count, 1), self.origin(fields).split(count, 2), strict=True):
+            light = _of_sum_1(self.light(part, origin)) if self.elements else self._of_model(part, origin)
+            light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
+            kernels.append(_of_sum_1(light))
+        return torch.where(arrives[:, None, None, None, None], torch.cat(kernels), 0.0)
 
-    def _of_model(self, fields: Tensor) -> Tensor:
+    def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
         """(D, F, W, h, w) of sum 1, 0 without light, columns towards +x."""
         numbers = pytree.tree_leaves((self.lens, self.object_distances))
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
@@ -173,29 +173,25 @@ class FieldKernels:
             about = {"fields": fields, "object_distances": self.object_distances}
             about |= {"normalise": "window", "center": "axis", "per_wavelength": True}
             model, kernels = model_of(self.model, order=self.order), []
-            for wavelengths, window in self._windows(fields):
+            for wavelengths, window in self._windows(origin):
                 kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=wavelengths).kernel)
             return torch.cat(kernels, 2)
 
-    def _of_elements(self, fields: Tensor) -> Tensor:
-        """The same of the lens with elements at its stop."""
-        return _of_sum_1(self.light(fields))
-
-    def light(self, fields: Tensor) -> Tensor:
+    def light(self, fields: Tensor, origin: Tensor) -> Tensor:
         """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
         kernels = []
-        for wavelengths, window in self._windows(fields):
+        for wavelengths, window in self._windows(origin):
             view = scene(self.lens, fields, self.object_distances, wavelengths)
             centre = window.centre[..., None].expand(2, *view.shape)
             window = dataclasses.replace(window, centre=centre)
             kernels.append(hybrid.kernels(view, self.elements, window, order=self.order).kernel)
         return torch.cat(kernels, 2)
 
-    def _windows(self, fields: Tensor) -> Iterator[tuple[Tensor, Grid]]:
+    def _windows(self, origin: Tensor) -> Iterator[tuple[Tensor, Grid]]:
         """Wavelengths with a common origin, µm, and their pixels about it, whose centres are (2, D, F)."""
-        wavelengths, pitch = self.lens.wavelengths, fields.new_tensor(self.sensor.pitch)
+        wavelengths, pitch = self.lens.wavelengths, origin.new_tensor(self.sensor.pitch)
         groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
-        for some, centre in zip(groups, self._origin(fields).unbind(-1), strict=True):
+        for some, centre in zip(groups, origin.unbind(-1), strict=True):
             yield some, make_grid(pitch, self.size, centre)
 
     def _turned(self, points: Tensor) -> Tensor:
@@ -254,12 +250,12 @@ class FieldKernels:
         spots = psf(
             self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
         )
-        moments = spots.centroid[1] - self._origin(fields)[1], spots.covariance[0], spots.covariance[2]
+        moments = spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
         return *(torch.where(known, moment, 0.0) for moment in moments), known.to(radii)
 
-    def _origin(self, fields: Tensor) -> Tensor:
-        """(2, D, N, 1 or W)."""
+    def origin(self, fields: Tensor) -> Tensor:
+        """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1 or W), see `origin`."""
         return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
 
 
@@ -471,7 +467,7 @@ def _window_of_elements(
             light = kernels.light()
         else:
             parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
-            light = torch.cat([part.light(fields) for part in parts])
+            light = torch.cat([part.light(fields, part.origin(fields)) for part in parts])
         edge = (larger - size) // 2
         inner, outer = (part.sum((-2, -1)) for part in (light[..., edge:-edge, edge:-edge], light))
         if bool((outer - inner <= _TAIL * outer).all()):

@@ -23,6 +23,7 @@ from typing import Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.analysis.illumination import relative_illumination
 from raytrace.budget import OverBudget, afford
@@ -46,6 +47,7 @@ from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.imaging.warp import resampled
 from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
+from raytrace.maths.numerics import varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
@@ -58,7 +60,7 @@ from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _MOST_NODES = 65  # along the longer side
 _DEGREE = 13  # of the polynomials of the distortion of other lenses
@@ -70,8 +72,11 @@ _ROUNDS = 4
 _PLANES = 8
 _AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
 _EDGE = 0.01  # pixels, to which it is known
+_BEYOND_FIELDS = 1.5  # image heights of the largest field, to the corners of a sensor
 _FAINT = 1e-3  # relative illumination that counts as none: rays hardly find so narrow a beam
-_WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
+_WAVELENGTHS = 6, 8, 10, 13, 17, 22, 30, 41, 61  # over the response of a sensor; the last number is the reference
+_CELLS = 8  # between nodes, in whose middles the interpolation is checked
+_FIRST_NODES = 5  # along the longer side
 _WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
 _BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
 _COPIES = 6  # of the kernels and of the image, which are in memory together
@@ -85,6 +90,10 @@ _NEGLECTED = {
     "drt": "diffraction",
     "wave": "nothing of the wavefront",
 }
+
+
+class BeyondFields(RaytraceWarning):
+    """A sensor much larger than the image of the lens's fields."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,32 +142,7 @@ class ImageFormation:
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
         depth = None if depth is None else checked_depth(depth, picture)
-        how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
-        return self.image_of(picture, depth, **how)
 
-    def image_of(
-        self,
-        picture: Tensor,
-        depth: Tensor | None,
-        *,
-        background: Tensor | None,
-        softness: float,
-        boundary: str,
-        progress: Callable[[int, int], object] | None,
-    ) -> Tensor:
-        """The same of a picture, a depth map and a background that are checked."""
-        image = self._on_fine_pixels(picture, depth, background, softness, boundary, progress)
-        return binned(image, self.sampling)
-
-    def _on_fine_pixels(
-        self,
-        picture: Tensor,
-        depth: Tensor | None,
-        background: Tensor | None,
-        softness: float,
-        boundary: str,
-        progress: Callable[[int, int], object] | None,
-    ) -> Tensor:
         def warped(part: Tensor) -> Tensor:
             return part if self.ideal is None else resampled(part, self.ideal, boundary)
 
@@ -172,7 +156,8 @@ class ImageFormation:
             share = self.haze.to(picture)[..., None, None]
             window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
         if depth is None:
-            return window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
+            image = window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
+            return binned(image, self.sampling)
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
         shade = shade if self.lit is None else torch.where(self.lit, shade, 1.0)
         planes = self.planes.to(depth)
@@ -190,7 +175,7 @@ class ImageFormation:
                 )
                 yield window[d] * light, coverage
 
-        return occlusion(layers()) + haze
+        return binned(occlusion(layers()) + haze, self.sampling)
 
 
 def binned(image: Tensor, count: int) -> Tensor:
@@ -303,18 +288,21 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
+    if not is_stop_alone(lens):
+        _warn_beyond_fields(lens, sensor)
     circle = None if is_stop_alone(lens) else _image_circle(lens, sensor, like)
     corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     how = {"lateral_colour": lateral_colour, "elements": elements}
     if wavelengths is not None:
         lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
-    elif sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
-        lens = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
-    chosen, reason = _model_of(lens, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
+    sampled = lens
+    if wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
+        sampled = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
+    weights = sensor.weights(sampled.wavelengths, sampled.wavelength_weights).to(like)
+    chosen, reason = _model_of(sampled, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
     model, order, size = chosen
     _afford_kernels((3, 3) if nodes is None else nodes, len(distances), weights, size, sensor)
-    kernels, haze = field_kernels(lens, sensor, model, order, size, distances, weights, **how), None
+    kernels, haze = field_kernels(sampled, sensor, model, order, size, distances, weights, **how), None
     if isinstance(kernels, FieldKernels):
         grid, error = _grid(kernels, circle, nodes, _BETWEEN * tol, like)
     else:
@@ -329,9 +317,28 @@ def optics(
     flux = _flux(grid, shade, sensor)
     shade = shade if lit is None or shade is None else shade * lit
     return ImageFormation(
-        whole, grid, flux, shade, ideal, planes, error, model, order, tol, lens.wavelengths.detach(), reason, lit,
+        whole, grid, flux, shade, ideal, planes, error, model, order, tol, sampled.wavelengths.detach(), reason, lit,
         sampling, haze,
     )  # fmt: skip
+
+
+def _warn_beyond_fields(lens: Lens, sensor: Sensor) -> None:
+    """Warn BeyondFields of a sensor whose corners lie far beyond the image of the lens's largest field."""
+    corner, height = float(torch.hypot(*sensor.corners).max()), _image_height(lens, sensor)
+    if height and corner > _BEYOND_FIELDS * height:
+        warnings.warn(
+            f"the corners of the sensor lie {corner:.3g} mm from the axis, {corner / height:.2g} times the image "
+            f"height of the largest field, {height:.3g} mm: the blur beyond that height may be too large to compute; "
+            "take a smaller sensor (--sensor), or give the lens larger fields",
+            BeyondFields,
+            stacklevel=calling_level(),
+        )
+
+
+def _image_height(lens: Lens, sensor: Sensor) -> float:
+    """Largest distance from the axis, mm, at which the chief rays of the lens's fields meet the sensor."""
+    fields = field_points(None, like=lens).detach()
+    return float(torch.hypot(*sensor.landing(lens, fields)).detach().nan_to_num(0.0).max())
 
 
 def _diagonal(lens: Lens, sensor: Sensor) -> Tensor:
@@ -347,25 +354,28 @@ def _over_response(
 ) -> Lens:
     """The lens at as many equidistant wavelengths over the response as the kernels of the channels need.
 
-    The error of a number is the change of the channels' Gaussian kernels to about 1.5 times as many: of a shift d and a
-    difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². Warns NotConverged.
+    The error of a number is the difference of the channels' Gaussian kernels from those of the reference: of a shift d
+    and a difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². Warns NotConverged.
     """
     sensor.weights(lens.wavelengths)  # a lens of another band is an error
-    before = None
-    for count in _WAVELENGTHS:
+
+    def moments(count: int) -> tuple[Lens, Tensor, Tensor]:
         sampled = _at_wavelengths(lens, *band(sensor.response), count)
-        mean, variance = channel_moments(sampled, sensor, places, distances, lateral_colour=lateral_colour)
-        if before is not None:
-            square = variance + sensor.pitch**2 / 12
-            shift, wider = mean - before[1], variance - before[2]
-            change = math.sqrt(2 / math.pi) * shift.abs() / square.sqrt()
-            change = float((change + math.sqrt(2 / (math.pi * math.e)) * wider.abs() / square).max())
-            if change <= tol:
-                return before[0]
-        before = sampled, mean, variance
+        return sampled, *channel_moments(sampled, sensor, places, distances, lateral_colour=lateral_colour)
+
+    *counts, most = _WAVELENGTHS
+    _, mean, variance = moments(most)
+    square = variance + sensor.pitch**2 / 12
+    for count in counts:
+        sampled, *others = moments(count)
+        shift, wider = mean - others[0], variance - others[1]
+        error = math.sqrt(2 / math.pi) * shift.abs() / square.sqrt()
+        error = float((error + math.sqrt(2 / (math.pi * math.e)) * wider.abs() / square).max())
+        if error <= tol:
+            return sampled
     message = (
         f"the kernels of {len(sampled.wavelengths)} wavelengths over the response of the sensor have an estimated "
-        f"error of {change:.1e}, above {tol:.1e}"
+        f"error of {error:.1e}, above {tol:.1e}"
     )
     warnings.warn(message, NotConverged, stacklevel=calling_level())
     return sampled
@@ -458,7 +468,7 @@ def _model_of(
 def _apart(kernels: Tensor, others: Tensor) -> float:
     """Largest Σ |h - ĥ| of kernels (..., h, w) in windows of any size with one middle."""
     size = max(kernels.shape[-1], others.shape[-1])
-    padded = [torch.nn.functional.pad(one, [(size - one.shape[-1]) // 2] * 4) for one in (kernels, others)]
+    padded = [torch.nn.functional.pad(part, [(size - part.shape[-1]) // 2] * 4) for part in (kernels, others)]
     return float((padded[0] - padded[1]).abs().sum((-2, -1)).max())
 
 
@@ -544,36 +554,39 @@ def _grid(
 ) -> tuple[Tensor, float]:
     """Kernels (m, n, D, C, h, w) at as many nodes as the tolerance needs, and the error of their interpolation.
 
-    The error is that in the middle of a cell, where four kernels are averaged, the mean over the cells. Nodes outside
-    the image circle have the kernels of its edge. Raises OverBudget.
+    The error is that in the middle of a cell, where four kernels are averaged, the mean over 8 cells. Nodes
+    outside the image circle have the kernels of its edge. Raises OverBudget.
     """
     sensor = kernels.sensor
 
-    def at(*about: float) -> Tensor:
-        return kernels.at(_within(circle, _places(sensor, *about)))
+    def kernels_at(places: Tensor) -> Tensor:
+        return kernels.at(_within(circle, places))
 
     if nodes is not None:
-        return at(*nodes, like).unflatten(0, nodes), math.nan
+        return kernels_at(_places(sensor, *nodes, like)).unflatten(0, nodes), math.nan
     columns, rows = sensor.pixels
-    longer = max(columns, rows)
-    count = 3
+    longer, count = max(columns, rows), _FIRST_NODES
     with torch.no_grad():
         while True:
             m, n = (max(2, round((count - 1) * side / longer) + 1) for side in (rows, columns))
             _afford_kernels((m, n), len(kernels.object_distances), kernels.weights, kernels.size, sensor)
-            grid = at(m, n, like).unflatten(0, (m, n))
-            mean = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-            middle = at(m, n, like, 0.5).unflatten(0, (m - 1, n - 1))
-            error = float((mean - middle).abs().sum((-2, -1)).amax((2, 3)).mean())
+            grid = kernels_at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+            middles = _places(sensor, m, n, like, 0.5)
+            # Cells evenly spaced in the order of their distance from the middle of the sensor.
+            outwards = torch.hypot(*(middles - middles.mean(1, keepdim=True))).argsort(stable=True)
+            cells = outwards[torch.linspace(0, len(outwards) - 1, min(_CELLS, len(outwards))).round().long()]
+            mean = (0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])).flatten(0, 1)[cells]
+            error = float((mean - kernels_at(middles[:, cells])).abs().sum((-2, -1)).amax((1, 2)).mean())
             if error <= tol or count >= _MOST_NODES:
                 break
-            # The error of linear interpolation falls with the square of the cell.
-            count = min(_MOST_NODES, max(count + 2, math.ceil(1.1 * (count - 1) * math.sqrt(error / tol)) + 1))
+            # The error of linear interpolation falls with the square of the cell, of sharp kernels with its power 1.4.
+            count = min(_MOST_NODES, max(count + 2, math.ceil(1.1 * (count - 1) * (error / tol) ** 0.7) + 1))
     if error > tol:
         message = f"the kernels between {m} × {n} nodes have an estimated error of {error:.1e}, above {tol:.1e}"
         warnings.warn(message, NotConverged, stacklevel=calling_level())
-    if torch.is_grad_enabled():
-        grid = at(m, n, like).unflatten(0, (m, n))
+    numbers = pytree.tree_leaves((kernels.lens, kernels.object_distances, kernels.elements))
+    if torch.is_grad_enabled() and any(map(varies, numbers)):
+        grid = kernels_at(_places(sensor, m, n, like)).unflatten(0, (m, n))
     return grid, error
 
 
@@ -665,10 +678,9 @@ def _ideal(
     # Least squares by the pseudoinverse along either axis.
     fitted = [torch.linalg.pinv(row[0]) @ part.reshape(_FIT, _FIT) @ torch.linalg.pinv(column[0]).T for part in shift]
     shift = torch.stack([row[1] @ part @ column[1].T for part in fitted])
-    at = torch.meshgrid(
-        *(torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns)), indexing="ij"
-    )
-    return torch.stack([at[1], at[0]]) + shift
+    lines = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns))
+    row, column = torch.meshgrid(*lines, indexing="ij")
+    return torch.stack([column, row]) + shift
 
 
 def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
@@ -765,7 +777,7 @@ def render(
         distortion=distortion, lateral_colour=lateral_colour, illumination=illumination, size=size, sampling=sampling,
     )  # fmt: skip
     how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
-    return Rendering(ready.image_of(light, depth, **how), binned(light, sampling), lens, ready)
+    return Rendering(ready(light, depth, **how), binned(light, sampling), lens, ready)
 
 
 def element_in_stop(
@@ -894,12 +906,10 @@ def default_sensor(
     others = {"response": {1: None, 3: "rgb"}.get(picture.shape[-3]), **others}
     if size is not None:
         return Sensor(size=size, pixels=(columns, rows), offset=offset, **others)
-    fields = field_points(None, like=lens).detach()
-    probe = Sensor(size=(1.0, rows / columns), pixels=(columns, rows))
-    reach = torch.hypot(*probe.landing(lens, fields)).max()
-    if not reach > 0:
+    reach = _image_height(lens, Sensor(size=(1.0, rows / columns), pixels=(columns, rows)))
+    if not reach:
         raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
-    pitch = 2 * float(reach) / math.hypot(columns, rows)
+    pitch = 2 * reach / math.hypot(columns, rows)
     return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), offset=offset, **others)
 
 
@@ -1051,7 +1061,7 @@ class Rendering(Result):
     def draw(self):
         """The ideal lens's picture and the image, both in detail at the centre and at the upper left corner, and the
         kernels there, of several depths that of the farthest; brightness is encoded as sRGB."""
-        ideal, image = (_shown(one) for one in (self.picture, self.image))
+        ideal, image = (_shown(picture) for picture in (self.picture, self.image))
         ready = self.optics
         rows, columns = image.shape[:2]
         size = max(min(rows, columns) // 8, min(64, (min(rows, columns) + 2) // 3))
@@ -1072,8 +1082,8 @@ class Rendering(Result):
         )  # fmt: skip
         whole, close = figure.subfigures(2, 1, height_ratios=heights)
         pictures = {"ideal lens": ideal, "this lens": image}
-        for panel, (title, one) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
-            panel.imshow(one, vmin=0, vmax=1, cmap="gray")
+        for panel, (title, picture) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
+            panel.imshow(picture, vmin=0, vmax=1, cmap="gray")
             panel.set_title(title)
             panel.axis("off")
             for row, column, _, colour in details.values():
@@ -1084,8 +1094,8 @@ class Rendering(Result):
                 panel.plot(right, below, color=colour, linewidth=1.2, scalex=False, scaley=False, clip_on=False)
         panels = iter(close.subplots(1, 6))
         for place, (row, column, kernel, colour) in details.items():
-            at = slice(row, row + size), slice(column, column + size)
-            shown = {f"{place}, {title}": one[at] for title, one in pictures.items()}
+            detail = slice(row, row + size), slice(column, column + size)
+            shown = {f"{place}, {title}": picture[detail] for title, picture in pictures.items()}
             shown[f"kernel, {window}"] = _shown(kernel / kernel.amax())
             for title, part in shown.items():
                 panel = next(panels)
