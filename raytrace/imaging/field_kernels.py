@@ -8,7 +8,7 @@ Of a rotationally symmetric lens and the Gaussian model, centroids and covarianc
 place. Kernels of the other models are computed in one octant and mirrored to the others.
 
 Phase elements at the stop of a lens add their path to its waves (`wave_optics.hybrid`). Of elements alone, in a stop
-without a lens, the kernel of the axis is that of every place: a paraxial camera.
+without a lens, every place has the kernel of the axis: a paraxial camera.
 """
 
 import dataclasses
@@ -127,7 +127,7 @@ class FieldKernels:
 
     @property
     def _has_radii(self) -> bool:
-        """Whether the moments at a radius are those of all its azimuths."""
+        """Whether all azimuths of a radius have the same moments."""
         return self.model == "gaussian" and is_round_about_axis(self.lens)
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
@@ -206,7 +206,7 @@ class FieldKernels:
         return self._gaussians(points, moments)
 
     def _distinct_radii(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Radii (K,) mm of places (2, N), to 1e-6 of a pixel, and the number of that of each place."""
+        """Radii (K,) mm of places (2, N), to 1e-6 of a pixel, and the number of each place's radius among them."""
         radius = safe_sqrt((points * points).sum(0)) / self.sensor.pitch
         units, which = torch.unique((radius * 1e6).round(), return_inverse=True)
         return units * (1e-6 * self.sensor.pitch), which
@@ -261,7 +261,7 @@ class FieldKernels:
 
 @dataclasses.dataclass(frozen=True)
 class ElementKernels:
-    """Kernels of elements alone, the same at every place of the sensor, where `FieldKernels` has those of a lens.
+    """Kernels of elements alone, the same at every place of the sensor, as `FieldKernels` of a lens.
 
     lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
     plan: the sampling, of an earlier call: for loops; memo: of sums that do not depend on the heights.
@@ -308,7 +308,7 @@ class ElementKernels:
 
 
 def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances without repetition, and the number of that of each; all of them where they vary."""
+    """Distances without repetition, and each one's number among them; all of them where they vary."""
     if varies(distances):
         return distances, torch.arange(len(distances), device=distances.device)
     return distances.unique(return_inverse=True)
@@ -520,11 +520,11 @@ def order_of(
             return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
         fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
         fields = fields[:, ~fields.isnan().any(0)]
-        # The error of a Gaussian is that of its width and of its light in the window: a single pixel is enough.
+        # Width and light in the window determine the error of a Gaussian: a single pixel is enough.
         pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
         about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size), "tol": tol}
         about |= {"object_distances": object_distances}
-        # Each place alone: a clipped beam has more rays of an order, which those of other places do not have.
+        # Each place alone: a clipped beam has more rays of an order than the beams of other places.
         return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))
 
 

@@ -101,7 +101,7 @@ class ImageFormation:
     """Image formation of a lens on a sensor, for any number of pictures: kernels, light and distortion, from `optics`.
 
     kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
-    a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
+    a white scene, on larger pixels; illumination: (H, W) of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
     middle of a cell, the mean over the cells; nan of requested nodes; model, order: of the PSF; reason: for the model;
@@ -269,7 +269,7 @@ def optics(
     """Prepare a lens and its sensor for `ImageFormation.__call__`; arguments as for `render`.
 
     elements: at the stop; of elements alone the lens is `wave_optics.hybrid.stop_alone`. object_distances: (D,) mm of
-    layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
+    layers, by default the lens's; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
     needs; order, size: of the PSF model and of its window, as of an earlier call, for loops; sampling: pixels of the
     pictures in one of the sensor, along a side.
     """
@@ -354,7 +354,7 @@ def _over_response(
 ) -> Lens:
     """The lens at as many equidistant wavelengths over the response as the kernels of the channels need.
 
-    The error of a number is the difference of the channels' Gaussian kernels from those of the reference: of a shift d
+    The error of a number is the difference of the channels' Gaussian kernels from the reference's: of a shift d
     and a difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². Warns NotConverged.
     """
     sensor.weights(lens.wavelengths)  # a lens of another band is an error
@@ -421,7 +421,7 @@ def _model_of(
     """Model, order and window of the kernels, and the reason for the model.
 
     Without a model: the first one of the ladder of `psf_models` that traces rays whose kernels on the diagonal differ
-    from those of the next by less than the tolerance. Warns NotConverged where waves need too many rays.
+    from the next model's by less than the tolerance. Warns NotConverged where waves need too many rays.
     """
 
     def fitted(name: str) -> tuple[str, int, int]:
@@ -625,7 +625,7 @@ def _pooled(kernels: Tensor, factor: int) -> Tensor:
 
 
 def enlarged(light: Tensor, picture: Tensor) -> Tensor:
-    """Numbers (C, H′, W′) on larger pixels at those of pictures (..., C, H, W), bilinear."""
+    """Numbers (C, H′, W′) on larger pixels, at the pixels of pictures (..., C, H, W), bilinear."""
     if light.shape[-2:] == picture.shape[-2:]:
         return light.to(picture)
     how = {"size": picture.shape[-2:], "mode": "bilinear", "align_corners": False}
@@ -635,7 +635,7 @@ def enlarged(light: Tensor, picture: Tensor) -> Tensor:
 def _illumination(
     lens: Lens, sensor: Sensor, circle: tuple[Tensor, Tensor] | None, pixels: Tensor | None, like: Tensor
 ) -> Tensor:
-    """Relative illumination (H, W) of the pixels, outside the image circle that of its edge.
+    """Relative illumination (H, W) of the pixels; outside the image circle, the value at its edge.
 
     pixels: places of a round lens within the circle.
     """
@@ -662,9 +662,9 @@ def _ideal(
 ) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
-    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, whose pixels are given,
+    Chief rays near the axis give the scale, on the sensor as it stands. Of a round lens, whose pixels are given,
     linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays. Outside the image circle the
-    displacement is in proportion to the radius, or that of the edge.
+    displacement is in proportion to the radius, or equal to the displacement at the edge.
     """
     if pixels is not None:
         nodes = radii(pixels, _RADII)
@@ -734,10 +734,10 @@ def render(
     lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
         or of `depth`.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
-    sensor: its pixels are those of the picture, or k × k of them, by which the scene is then sampled more finely; by
+    sensor: of as many pixels as the picture, or of pixels that hold k × k of it, a scene sampled more finely; by
         default of the size that the largest field of the lens fills to its corners, one channel, or "rgb" of three.
     wavelengths: (W,) µm; of a sensor with a response by default as many over it as `tol` needs, else, and where the
-        lens has a single one, those of the lens; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
+        lens has a single one, the lens's; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
         equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
         layers, a logistic function of so large a share of the difference of their reciprocal distances.
@@ -745,9 +745,9 @@ def render(
         by default every layer continues behind nearer ones as its visible surroundings do.
     elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
     model: of the PSF, see `rt.psf`; by default the first of "gaussian", "drt" and "wave" whose kernels differ from
-        those of the next by less than `tol`; with elements "wave".
-    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice that of a picture from 0 to 1; size:
-        pixels across their window, an odd number, by default as many as hold the light.
+        the next model's by less than `tol`; with elements "wave".
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice the error of a picture from 0 to 1.
+    size: pixels across their window, an odd number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call, and their total.
@@ -817,7 +817,7 @@ def render_patches(
     change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
     the `ImageFormation` of the initial lens by the same model. model: by default "gaussian"; elements: as for `render`,
     with the model "wave". object_distances: (B,) mm from surface 1
-    to the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers
+    to the object of each patch, or one of all, inf allowed; by default the lens's. Differentiable in the numbers
     of the lens, of the elements and in the distances.
     Warns DarkPlaces of points without light, whose kernels are 0. Raises ValueError for numbers of patches, points and
     distances that differ, and for points that are not finite.
@@ -1015,7 +1015,7 @@ class Rendering(Result):
             dark = 100 * (1 - float(ready.lit.double().mean()))
             lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")
         if (darkest := self._darkest()) is not None:
-            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of that of the axis")
+            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of the axis")
         if ready.ideal is not None and max(ready.ideal.shape[-2:]) > 1:
             last, first = self._ends()
             (column, row), ideal = last - first, ready.ideal[:, last[1], last[0]] - ready.ideal[:, first[1], first[0]]
@@ -1060,7 +1060,7 @@ class Rendering(Result):
     @styled
     def draw(self):
         """The ideal lens's picture and the image, both in detail at the centre and at the upper left corner, and the
-        kernels there, of several depths that of the farthest; brightness is encoded as sRGB."""
+        kernels there, of several depths the farthest; brightness is encoded as sRGB."""
         ideal, image = (_shown(picture) for picture in (self.picture, self.image))
         ready = self.optics
         rows, columns = image.shape[:2]
