@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 import warnings
 
 import numpy as np
@@ -14,6 +15,7 @@ from raytrace.imaging import field_kernels
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge, channel_moments
 from raytrace.imaging.image import blur, blur_layers, depth_masks
 from raytrace.imaging.render import (
+    BeyondFields,
     ImageFormation,
     Rendering,
     _over_response,
@@ -28,6 +30,7 @@ from raytrace.imaging.warp import resampled
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.system.lens import with_field_kind
 
+render_module = sys.modules["raytrace.imaging.render"]
 COLUMNS, ROWS = 48, 32
 SENSOR = rt.Sensor(size=(2.4, 1.6), pixels=(COLUMNS, ROWS), response="rgb")  # 50 µm
 FIELD = rt.Sensor(size=(18.0, 12.0), pixels=(COLUMNS, ROWS), response="rgb")
@@ -473,6 +476,47 @@ def test_the_grid_is_refined_to_the_tolerance(triplet):
         errors = [optics(triplet, FIELD, tol=tol, **how).error for tol in (0.2, 0.02)]
     assert errors[0] <= 0.1
     assert errors[1] <= 0.01
+
+
+def test_the_error_of_a_few_cells_is_about_that_of_all(triplet, monkeypatch):
+    how = {"model": "gaussian", "illumination": False, "distortion": False, "tol": 0.05}
+    few = optics(triplet, FIELD, **how)
+    monkeypatch.setattr(render_module, "_CELLS", 10**6)
+    every = optics(triplet, FIELD, **how)
+    assert few.kernels.shape == every.kernels.shape
+    assert few.error == pytest.approx(every.error, rel=0.3)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_kernels_are_computed_once_unless_they_are_differentiated(triplet, monkeypatch):
+    places = []
+    at = FieldKernels.at
+    monkeypatch.setattr(FieldKernels, "at", lambda self, points: places.append(points.shape[1]) or at(self, points))
+    how = {"model": "gaussian", "illumination": False, "distortion": False, "tol": 0.3}
+    kernels = optics(triplet, FIELD, **how).kernels
+    assert places.count(kernels.shape[0] * kernels.shape[1]) == 1
+    distance = torch.tensor(1e4, dtype=torch.float64, requires_grad=True)
+    assert optics(triplet, FIELD, object_distances=distance, **how).kernels.requires_grad
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_wavelengths_over_the_response_are_no_more_than_the_tolerance_needs(triplet):
+    counts = [
+        len(optics(triplet, FIELD, model="gaussian", nodes=(2, 2), tol=tol, distortion=False).wavelengths)
+        for tol in (0.3, 0.01)
+    ]
+    assert counts[0] < counts[1] <= 13
+
+
+def test_a_sensor_far_beyond_the_fields_is_reported_before_the_kernels(triplet, monkeypatch):
+    def computed(*_):
+        raise AssertionError("kernels are computed")
+
+    monkeypatch.setattr(render_module, "_image_circle", computed)
+    large = rt.Sensor(size=(90, 60), pixels=(300, 200), response="rgb")
+    reported = pytest.warns(BeyondFields, match=r"54.1 mm from the axis, 2.4 times .* take a smaller sensor")
+    with reported, pytest.raises(AssertionError, match="kernels are computed"):
+        optics(triplet, large)
 
 
 def test_no_error_is_estimated_of_requested_nodes(triplet):

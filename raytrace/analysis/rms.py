@@ -30,7 +30,7 @@ class RmsOverField(OverField):
 
     Of the wavefront: waves about the mean; of the spot: mm about the centroid. nan where no light arrives.
     strehl: (F,) Σ w exp(-(2π σ)²) of the wavefronts that make `polychromatic` (Mahajan 1983); None of spots.
-    fields: (2, F); reference: that of the polychromatic wavefront; pupil: points (2, P) and weights (P,) of the rays,
+    fields: (2, F); reference: of the polychromatic wavefront; pupil: points (2, P) and weights (P,) of the rays,
     None of the clear pupil.
     """
 
@@ -128,7 +128,7 @@ def rms_over_field(
 def _rms(lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor] | None) -> RmsOverField:
     shares = wavelength_shares(lens)
     if spot:
-        rings = SAMPLINGS["gauss"][2]  # those of `spot`
+        rings = SAMPLINGS["gauss"][2]  # as of `spot`
         points, weights = clear_pupil(lens, fields=fields, rings=rings, arms=4 * rings) if pupil is None else pupil
         rays = image_rays(lens, points, fields=fields)
         joint = (shares[:, None] * weights).flatten(-2)

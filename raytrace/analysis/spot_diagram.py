@@ -290,7 +290,7 @@ def _of_clear_pupils(
 
 
 def _put(numbers: Tensor, new: Tensor, axis: int, lenses: Tensor) -> Tensor:
-    """Numbers with those of some lenses replaced; of one lens, which has no such axis, the new ones."""
+    """Numbers (…, lenses, …) in which some lenses have new ones; of one lens, without this axis, the new ones."""
     return numbers.index_copy(axis, lenses, new) if new.dim() == numbers.dim() else new.squeeze(axis)
 
 
@@ -341,10 +341,10 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rays of the rule `pupil` (points, weights) that arrive, by default that of `spot`.
+    The RMS radius is computed from the arriving rays of the rule `pupil` (points, weights), by default `spot`'s.
     The dots have no weight in it but count for the geometric radius, as do points on the rim of the pupil. They are
-    those of `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about:
-    (2, F) mm, from where radii count, the centroid by default. rings: of dots.
+    points of `even_hexapolar`: each stands for the same area of the pupil, so that their density is the light's.
+    about: (2, F) mm, from where radii count, the centroid by default. rings: of dots.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     rule = SAMPLINGS["gauss"][2]

@@ -3,6 +3,7 @@
 A speed is rays × surfaces / s. Surfaces are all of the file but the object: stop and image count.
 """
 
+import abc
 import dataclasses
 import math
 import statistics
@@ -42,7 +43,7 @@ def name_of(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-class Tracer:
+class Tracer(abc.ABC):
     """A tracer of one lens: its name and dtype; with_path: whether it computes the optical path.
 
     most: rays it traces in bearable time, None for any number.
@@ -55,16 +56,18 @@ class Tracer:
     most: int | None = None
     device: str = "cpu"
 
-    def prepare(self) -> None:
-        """Called before every timed call."""
+    prepare = nothing  # called before every timed call
 
+    @abc.abstractmethod
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
         """Positions (2, P) on the image and optical path (P,) or None, without gradient."""
-        raise NotImplementedError
 
     def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]:
-        """Derivatives of the mean squared distance from `centroid` (2,) with respect to `variables`, then indices."""
-        raise NotImplementedError
+        """Derivatives of the mean squared distance from `centroid` (2,) with respect to `variables`, then indices.
+
+        None without `has_gradient`.
+        """
+        return ()
 
 
 class Own(Tracer):

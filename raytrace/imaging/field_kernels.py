@@ -8,7 +8,7 @@ Of a rotationally symmetric lens and the Gaussian model, centroids and covarianc
 place. Kernels of the other models are computed in one octant and mirrored to the others.
 
 Phase elements at the stop of a lens add their path to its waves (`wave_optics.hybrid`). Of elements alone, in a stop
-without a lens, the kernel of the axis is that of every place: a paraxial camera.
+without a lens, every place has the kernel of the axis: a paraxial camera.
 """
 
 import dataclasses
@@ -114,7 +114,7 @@ class FieldKernels:
         distances, which = _distinct(self.object_distances)
         kernels = dataclasses.replace(self, object_distances=distances)
         if not MODELS[self.model].traces:
-            return kernels._computed(torch.zeros_like(points[:, :1]))[0, which]
+            return kernels._in_parts(torch.zeros_like(points[:, :1]))[0, which]
         if self._has_radii:
             # Moments of all radii and distances, pixels of the pairs: these cost more.
             radii, places = self._distinct_radii(points)
@@ -127,12 +127,12 @@ class FieldKernels:
 
     @property
     def _has_radii(self) -> bool:
-        """Whether the moments at a radius are those of all its azimuths."""
+        """Whether all azimuths of a radius have the same moments."""
         return self.model == "gaussian" and is_round_about_axis(self.lens)
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
-            return self._computed(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
+            return self._in_parts(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
         if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
             return self._in_parts(points)
         compute = self._turned if self._has_radii else self._in_parts
@@ -152,18 +152,18 @@ class FieldKernels:
         return kernels.flip(-1)
 
     def _in_parts(self, points: Tensor) -> Tensor:
-        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
-        return torch.cat([self._computed(part) for part in points.split(count, 1)])
-
-    def _computed(self, points: Tensor) -> Tensor:
-        """By the PSF model, field by field."""
+        """By the PSF model, field by field; the chief rays of all places are aimed and traced at once."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        kernels = self._of_elements(fields) if self.elements else self._of_model(fields)
-        kernels = torch.einsum("cw,dfwij->fdcij", self.weights.to(kernels), kernels).flip(-1)
-        return torch.where(arrives[:, None, None, None, None], _of_sum_1(kernels), 0.0)
+        count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
+        kernels = []
+        for part, origin in zip(fields.split(count, 1), self.origin(fields).split(count, 2), strict=True):
+            light = _of_sum_1(self.light(part, origin)) if self.elements else self._of_model(part, origin)
+            light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
+            kernels.append(_of_sum_1(light))
+        return torch.where(arrives[:, None, None, None, None], torch.cat(kernels), 0.0)
 
-    def _of_model(self, fields: Tensor) -> Tensor:
+    def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
         """(D, F, W, h, w) of sum 1, 0 without light, columns towards +x."""
         numbers = pytree.tree_leaves((self.lens, self.object_distances))
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
@@ -173,29 +173,25 @@ class FieldKernels:
             about = {"fields": fields, "object_distances": self.object_distances}
             about |= {"normalise": "window", "center": "axis", "per_wavelength": True}
             model, kernels = model_of(self.model, order=self.order), []
-            for wavelengths, window in self._windows(fields):
+            for wavelengths, window in self._windows(origin):
                 kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=wavelengths).kernel)
             return torch.cat(kernels, 2)
 
-    def _of_elements(self, fields: Tensor) -> Tensor:
-        """The same of the lens with elements at its stop."""
-        return _of_sum_1(self.light(fields))
-
-    def light(self, fields: Tensor) -> Tensor:
+    def light(self, fields: Tensor, origin: Tensor) -> Tensor:
         """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
         kernels = []
-        for wavelengths, window in self._windows(fields):
+        for wavelengths, window in self._windows(origin):
             view = scene(self.lens, fields, self.object_distances, wavelengths)
             centre = window.centre[..., None].expand(2, *view.shape)
             window = dataclasses.replace(window, centre=centre)
             kernels.append(hybrid.kernels(view, self.elements, window, order=self.order).kernel)
         return torch.cat(kernels, 2)
 
-    def _windows(self, fields: Tensor) -> Iterator[tuple[Tensor, Grid]]:
+    def _windows(self, origin: Tensor) -> Iterator[tuple[Tensor, Grid]]:
         """Wavelengths with a common origin, µm, and their pixels about it, whose centres are (2, D, F)."""
-        wavelengths, pitch = self.lens.wavelengths, fields.new_tensor(self.sensor.pitch)
+        wavelengths, pitch = self.lens.wavelengths, origin.new_tensor(self.sensor.pitch)
         groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
-        for some, centre in zip(groups, self._origin(fields).unbind(-1), strict=True):
+        for some, centre in zip(groups, origin.unbind(-1), strict=True):
             yield some, make_grid(pitch, self.size, centre)
 
     def _turned(self, points: Tensor) -> Tensor:
@@ -210,7 +206,7 @@ class FieldKernels:
         return self._gaussians(points, moments)
 
     def _distinct_radii(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Radii (K,) mm of places (2, N), to 1e-6 of a pixel, and the number of that of each place."""
+        """Radii (K,) mm of places (2, N), to 1e-6 of a pixel, and the number of each place's radius among them."""
         radius = safe_sqrt((points * points).sum(0)) / self.sensor.pitch
         units, which = torch.unique((radius * 1e6).round(), return_inverse=True)
         return units * (1e-6 * self.sensor.pitch), which
@@ -254,18 +250,18 @@ class FieldKernels:
         spots = psf(
             self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
         )
-        moments = spots.centroid[1] - self._origin(fields)[1], spots.covariance[0], spots.covariance[2]
+        moments = spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
         return *(torch.where(known, moment, 0.0) for moment in moments), known.to(radii)
 
-    def _origin(self, fields: Tensor) -> Tensor:
-        """(2, D, N, 1 or W)."""
+    def origin(self, fields: Tensor) -> Tensor:
+        """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1 or W), see `origin`."""
         return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
 
 
 @dataclasses.dataclass(frozen=True)
 class ElementKernels:
-    """Kernels of elements alone, the same at every place of the sensor, where `FieldKernels` has those of a lens.
+    """Kernels of elements alone, the same at every place of the sensor, as `FieldKernels` of a lens.
 
     lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
     plan: the sampling, of an earlier call: for loops; memo: of sums that do not depend on the heights.
@@ -312,7 +308,7 @@ class ElementKernels:
 
 
 def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances without repetition, and the number of that of each; all of them where they vary."""
+    """Distances without repetition, and each one's number among them; all of them where they vary."""
     if varies(distances):
         return distances, torch.arange(len(distances), device=distances.device)
     return distances.unique(return_inverse=True)
@@ -471,7 +467,7 @@ def _window_of_elements(
             light = kernels.light()
         else:
             parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
-            light = torch.cat([part.light(fields) for part in parts])
+            light = torch.cat([part.light(fields, part.origin(fields)) for part in parts])
         edge = (larger - size) // 2
         inner, outer = (part.sum((-2, -1)) for part in (light[..., edge:-edge, edge:-edge], light))
         if bool((outer - inner <= _TAIL * outer).all()):
@@ -524,11 +520,11 @@ def order_of(
             return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
         fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
         fields = fields[:, ~fields.isnan().any(0)]
-        # The error of a Gaussian is that of its width and of its light in the window: a single pixel is enough.
+        # Width and light in the window determine the error of a Gaussian: a single pixel is enough.
         pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
         about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size), "tol": tol}
         about |= {"object_distances": object_distances}
-        # Each place alone: a clipped beam has more rays of an order, which those of other places do not have.
+        # Each place alone: a clipped beam has more rays of an order than the beams of other places.
         return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))
 
 

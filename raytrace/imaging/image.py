@@ -219,7 +219,7 @@ def extended_layers(light: Tensor, masks: Tensor, background: Tensor | None = No
         α_d = m_d/v_d,   v_d = Σ_(k ≤ d) m_k     where nearer layers leave a share v_d visible
 
     Where they hide it, a layer continues as its visible surroundings do (`_filled`), the farthest one as `background`,
-    if this is given. light: (..., D, C, H, W), that of each layer's own part, m_d x; masks: (..., D, H, W).
+    if this is given. light: (..., D, C, H, W), of each layer's own part, m_d x; masks: (..., D, H, W).
     """
     count, visible = masks.shape[-3], masks.cumsum(-3)[..., None, :, :]
     for d in range(count):
@@ -262,7 +262,7 @@ def _sure(known: Tensor) -> Tensor:
 
 
 def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tensor:
-    """Mirror images behind an axis up to `length`, blending from that of its end to that of its start."""
+    """Mirror images behind an axis up to `length`, blending from the image at its end to the image at its start."""
     count = picture.shape[axis]
     missing = length - count
     if missing == 0:
@@ -339,7 +339,7 @@ def add_shot_noise(picture: Tensor, electrons: Tensor | float, *, generator: tor
 
 
 def count_electrons(picture: Tensor, electrons: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
-    """Poisson shot noise: y = n/N, n of mean N x, 0 for x < 0; the gradient is that of x."""
+    """Poisson shot noise: y = n/N, n of mean N x, 0 for x < 0; the gradient is x's."""
     picture = as_picture(picture)
     counts = torch.poisson((picture.detach() * electrons).clamp(min=0), generator=generator)
     return picture + (counts / electrons - picture).detach()

@@ -23,6 +23,7 @@ from typing import Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.analysis.illumination import relative_illumination
 from raytrace.budget import OverBudget, afford
@@ -46,6 +47,7 @@ from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.imaging.warp import resampled
 from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
+from raytrace.maths.numerics import varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
@@ -58,7 +60,7 @@ from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
-from raytrace.words import calling_level
+from raytrace.words import RaytraceWarning, calling_level
 
 _MOST_NODES = 65  # along the longer side
 _DEGREE = 13  # of the polynomials of the distortion of other lenses
@@ -70,8 +72,11 @@ _ROUNDS = 4
 _PLANES = 8
 _AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
 _EDGE = 0.01  # pixels, to which it is known
+_BEYOND_FIELDS = 1.5  # image heights of the largest field, to the corners of a sensor
 _FAINT = 1e-3  # relative illumination that counts as none: rays hardly find so narrow a beam
 _WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
+_CELLS = 8  # between nodes, in whose middles the interpolation is checked
+_FIRST_NODES = 5  # along the longer side
 _WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
 _BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
 _COPIES = 6  # of the kernels and of the image, which are in memory together
@@ -87,12 +92,16 @@ _NEGLECTED = {
 }
 
 
+class BeyondFields(RaytraceWarning):
+    """A sensor much larger than the image of the lens's fields."""
+
+
 @dataclasses.dataclass(frozen=True)
 class ImageFormation:
     """Image formation of a lens on a sensor, for any number of pictures: kernels, light and distortion, from `optics`.
 
     kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
-    a white scene, on larger pixels; illumination: (H, W), that of its image, or None for 1; ideal: (2, H, W),
+    a white scene, on larger pixels; illumination: (H, W) of its image, or None for 1; ideal: (2, H, W),
     column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
     distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
     middle of a cell, the mean over the cells; nan of requested nodes; model, order: of the PSF; reason: for the model;
@@ -133,32 +142,7 @@ class ImageFormation:
         if depth is None and len(self.planes) > 1:
             raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
         depth = None if depth is None else checked_depth(depth, picture)
-        how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
-        return self.image_of(picture, depth, **how)
 
-    def image_of(
-        self,
-        picture: Tensor,
-        depth: Tensor | None,
-        *,
-        background: Tensor | None,
-        softness: float,
-        boundary: str,
-        progress: Callable[[int, int], object] | None,
-    ) -> Tensor:
-        """The same of a picture, a depth map and a background that are checked."""
-        image = self._on_fine_pixels(picture, depth, background, softness, boundary, progress)
-        return binned(image, self.sampling)
-
-    def _on_fine_pixels(
-        self,
-        picture: Tensor,
-        depth: Tensor | None,
-        background: Tensor | None,
-        softness: float,
-        boundary: str,
-        progress: Callable[[int, int], object] | None,
-    ) -> Tensor:
         def warped(part: Tensor) -> Tensor:
             return part if self.ideal is None else resampled(part, self.ideal, boundary)
 
@@ -172,7 +156,8 @@ class ImageFormation:
             share = self.haze.to(picture)[..., None, None]
             window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
         if depth is None:
-            return window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
+            image = window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
+            return binned(image, self.sampling)
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
         shade = shade if self.lit is None else torch.where(self.lit, shade, 1.0)
         planes = self.planes.to(depth)
@@ -190,7 +175,7 @@ class ImageFormation:
                 )
                 yield window[d] * light, coverage
 
-        return occlusion(layers()) + haze
+        return binned(occlusion(layers()) + haze, self.sampling)
 
 
 def binned(image: Tensor, count: int) -> Tensor:
@@ -284,7 +269,7 @@ def optics(
     """Prepare a lens and its sensor for `ImageFormation.__call__`; arguments as for `render`.
 
     elements: at the stop; of elements alone the lens is `wave_optics.hybrid.stop_alone`. object_distances: (D,) mm of
-    layers, by default that of the lens; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
+    layers, by default the lens's; nodes: (m, n) of the grid of kernels, instead of as many as the tolerance
     needs; order, size: of the PSF model and of its window, as of an earlier call, for loops; sampling: pixels of the
     pictures in one of the sensor, along a side.
     """
@@ -303,18 +288,21 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
+    if not is_stop_alone(lens):
+        _warn_beyond_fields(lens, sensor)
     circle = None if is_stop_alone(lens) else _image_circle(lens, sensor, like)
     corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     how = {"lateral_colour": lateral_colour, "elements": elements}
     if wavelengths is not None:
         lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
-    elif sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
-        lens = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(like)
-    chosen, reason = _model_of(lens, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
+    sampled = lens
+    if wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
+        sampled = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
+    weights = sensor.weights(sampled.wavelengths, sampled.wavelength_weights).to(like)
+    chosen, reason = _model_of(sampled, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
     model, order, size = chosen
     _afford_kernels((3, 3) if nodes is None else nodes, len(distances), weights, size, sensor)
-    kernels, haze = field_kernels(lens, sensor, model, order, size, distances, weights, **how), None
+    kernels, haze = field_kernels(sampled, sensor, model, order, size, distances, weights, **how), None
     if isinstance(kernels, FieldKernels):
         grid, error = _grid(kernels, circle, nodes, _BETWEEN * tol, like)
     else:
@@ -329,9 +317,28 @@ def optics(
     flux = _flux(grid, shade, sensor)
     shade = shade if lit is None or shade is None else shade * lit
     return ImageFormation(
-        whole, grid, flux, shade, ideal, planes, error, model, order, tol, lens.wavelengths.detach(), reason, lit,
+        whole, grid, flux, shade, ideal, planes, error, model, order, tol, sampled.wavelengths.detach(), reason, lit,
         sampling, haze,
     )  # fmt: skip
+
+
+def _warn_beyond_fields(lens: Lens, sensor: Sensor) -> None:
+    """Warn BeyondFields of a sensor whose corners lie far beyond the image of the lens's largest field."""
+    corner, height = float(torch.hypot(*sensor.corners).max()), _image_height(lens, sensor)
+    if height and corner > _BEYOND_FIELDS * height:
+        warnings.warn(
+            f"the corners of the sensor lie {corner:.3g} mm from the axis, {corner / height:.2g} times the image "
+            f"height of the largest field, {height:.3g} mm: the blur beyond that height may be too large to compute; "
+            "take a smaller sensor (--sensor), or give the lens larger fields",
+            BeyondFields,
+            stacklevel=calling_level(),
+        )
+
+
+def _image_height(lens: Lens, sensor: Sensor) -> float:
+    """Largest distance from the axis, mm, at which the chief rays of the lens's fields meet the sensor."""
+    fields = field_points(None, like=lens).detach()
+    return float(torch.hypot(*sensor.landing(lens, fields)).detach().nan_to_num(0.0).max())
 
 
 def _diagonal(lens: Lens, sensor: Sensor) -> Tensor:
@@ -411,7 +418,7 @@ def _model_of(
     """Model, order and window of the kernels, and the reason for the model.
 
     Without a model: the first one of the ladder of `psf_models` that traces rays whose kernels on the diagonal differ
-    from those of the next by less than the tolerance. Warns NotConverged where waves need too many rays.
+    from the next model's by less than the tolerance. Warns NotConverged where waves need too many rays.
     """
 
     def fitted(name: str) -> tuple[str, int, int]:
@@ -458,7 +465,7 @@ def _model_of(
 def _apart(kernels: Tensor, others: Tensor) -> float:
     """Largest Σ |h - ĥ| of kernels (..., h, w) in windows of any size with one middle."""
     size = max(kernels.shape[-1], others.shape[-1])
-    padded = [torch.nn.functional.pad(one, [(size - one.shape[-1]) // 2] * 4) for one in (kernels, others)]
+    padded = [torch.nn.functional.pad(part, [(size - part.shape[-1]) // 2] * 4) for part in (kernels, others)]
     return float((padded[0] - padded[1]).abs().sum((-2, -1)).max())
 
 
@@ -544,36 +551,39 @@ def _grid(
 ) -> tuple[Tensor, float]:
     """Kernels (m, n, D, C, h, w) at as many nodes as the tolerance needs, and the error of their interpolation.
 
-    The error is that in the middle of a cell, where four kernels are averaged, the mean over the cells. Nodes outside
-    the image circle have the kernels of its edge. Raises OverBudget.
+    The error is that in the middle of a cell, where four kernels are averaged, the mean over 8 cells. Nodes
+    outside the image circle have the kernels of its edge. Raises OverBudget.
     """
     sensor = kernels.sensor
 
-    def at(*about: float) -> Tensor:
-        return kernels.at(_within(circle, _places(sensor, *about)))
+    def kernels_at(places: Tensor) -> Tensor:
+        return kernels.at(_within(circle, places))
 
     if nodes is not None:
-        return at(*nodes, like).unflatten(0, nodes), math.nan
+        return kernels_at(_places(sensor, *nodes, like)).unflatten(0, nodes), math.nan
     columns, rows = sensor.pixels
-    longer = max(columns, rows)
-    count = 3
+    longer, count = max(columns, rows), _FIRST_NODES
     with torch.no_grad():
         while True:
             m, n = (max(2, round((count - 1) * side / longer) + 1) for side in (rows, columns))
             _afford_kernels((m, n), len(kernels.object_distances), kernels.weights, kernels.size, sensor)
-            grid = at(m, n, like).unflatten(0, (m, n))
-            mean = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-            middle = at(m, n, like, 0.5).unflatten(0, (m - 1, n - 1))
-            error = float((mean - middle).abs().sum((-2, -1)).amax((2, 3)).mean())
+            grid = kernels_at(_places(sensor, m, n, like)).unflatten(0, (m, n))
+            middles = _places(sensor, m, n, like, 0.5)
+            # Cells evenly spaced in the order of their distance from the middle of the sensor.
+            outwards = torch.hypot(*(middles - middles.mean(1, keepdim=True))).argsort(stable=True)
+            cells = outwards[torch.linspace(0, len(outwards) - 1, min(_CELLS, len(outwards))).round().long()]
+            mean = (0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])).flatten(0, 1)[cells]
+            error = float((mean - kernels_at(middles[:, cells])).abs().sum((-2, -1)).amax((1, 2)).mean())
             if error <= tol or count >= _MOST_NODES:
                 break
-            # The error of linear interpolation falls with the square of the cell.
-            count = min(_MOST_NODES, max(count + 2, math.ceil(1.1 * (count - 1) * math.sqrt(error / tol)) + 1))
+            # The error of linear interpolation falls with the square of the cell, of sharp kernels with its power 1.4.
+            count = min(_MOST_NODES, max(count + 2, math.ceil(1.1 * (count - 1) * (error / tol) ** 0.7) + 1))
     if error > tol:
         message = f"the kernels between {m} × {n} nodes have an estimated error of {error:.1e}, above {tol:.1e}"
         warnings.warn(message, NotConverged, stacklevel=calling_level())
-    if torch.is_grad_enabled():
-        grid = at(m, n, like).unflatten(0, (m, n))
+    numbers = pytree.tree_leaves((kernels.lens, kernels.object_distances, kernels.elements))
+    if torch.is_grad_enabled() and any(map(varies, numbers)):
+        grid = kernels_at(_places(sensor, m, n, like)).unflatten(0, (m, n))
     return grid, error
 
 
@@ -612,7 +622,7 @@ def _pooled(kernels: Tensor, factor: int) -> Tensor:
 
 
 def enlarged(light: Tensor, picture: Tensor) -> Tensor:
-    """Numbers (C, H′, W′) on larger pixels at those of pictures (..., C, H, W), bilinear."""
+    """Numbers (C, H′, W′) on larger pixels, at the pixels of pictures (..., C, H, W), bilinear."""
     if light.shape[-2:] == picture.shape[-2:]:
         return light.to(picture)
     how = {"size": picture.shape[-2:], "mode": "bilinear", "align_corners": False}
@@ -622,7 +632,7 @@ def enlarged(light: Tensor, picture: Tensor) -> Tensor:
 def _illumination(
     lens: Lens, sensor: Sensor, circle: tuple[Tensor, Tensor] | None, pixels: Tensor | None, like: Tensor
 ) -> Tensor:
-    """Relative illumination (H, W) of the pixels, outside the image circle that of its edge.
+    """Relative illumination (H, W) of the pixels; outside the image circle, the value at its edge.
 
     pixels: places of a round lens within the circle.
     """
@@ -649,9 +659,9 @@ def _ideal(
 ) -> Tensor:
     """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
 
-    The scale is that of chief rays near the axis, on the sensor as it stands. Of a round lens, whose pixels are given,
+    Chief rays near the axis give the scale, on the sensor as it stands. Of a round lens, whose pixels are given,
     linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays. Outside the image circle the
-    displacement is in proportion to the radius, or that of the edge.
+    displacement is in proportion to the radius, or equal to the displacement at the edge.
     """
     if pixels is not None:
         nodes = radii(pixels, _RADII)
@@ -665,10 +675,9 @@ def _ideal(
     # Least squares by the pseudoinverse along either axis.
     fitted = [torch.linalg.pinv(row[0]) @ part.reshape(_FIT, _FIT) @ torch.linalg.pinv(column[0]).T for part in shift]
     shift = torch.stack([row[1] @ part @ column[1].T for part in fitted])
-    at = torch.meshgrid(
-        *(torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns)), indexing="ij"
-    )
-    return torch.stack([at[1], at[0]]) + shift
+    lines = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns))
+    row, column = torch.meshgrid(*lines, indexing="ij")
+    return torch.stack([column, row]) + shift
 
 
 def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
@@ -722,10 +731,10 @@ def render(
     lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
         or of `depth`.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
-    sensor: its pixels are those of the picture, or k × k of them, by which the scene is then sampled more finely; by
+    sensor: of as many pixels as the picture, or of pixels that hold k × k of it, a scene sampled more finely; by
         default of the size that the largest field of the lens fills to its corners, one channel, or "rgb" of three.
     wavelengths: (W,) µm; of a sensor with a response by default as many over it as `tol` needs, else, and where the
-        lens has a single one, those of the lens; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
+        lens has a single one, the lens's; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
         equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
         layers, a logistic function of so large a share of the difference of their reciprocal distances.
@@ -733,9 +742,9 @@ def render(
         by default every layer continues behind nearer ones as its visible surroundings do.
     elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
     model: of the PSF, see `rt.psf`; by default the first of "gaussian", "drt" and "wave" whose kernels differ from
-        those of the next by less than `tol`; with elements "wave".
-    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice that of a picture from 0 to 1; size:
-        pixels across their window, an odd number, by default as many as hold the light.
+        the next model's by less than `tol`; with elements "wave".
+    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice the error of a picture from 0 to 1.
+    size: pixels across their window, an odd number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
     distortion, lateral_colour, illumination: False leaves it out.
     progress: called with the number of convolutions done since the last call, and their total.
@@ -765,7 +774,7 @@ def render(
         distortion=distortion, lateral_colour=lateral_colour, illumination=illumination, size=size, sampling=sampling,
     )  # fmt: skip
     how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
-    return Rendering(ready.image_of(light, depth, **how), binned(light, sampling), lens, ready)
+    return Rendering(ready(light, depth, **how), binned(light, sampling), lens, ready)
 
 
 def element_in_stop(
@@ -805,7 +814,7 @@ def render_patches(
     change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
     the `ImageFormation` of the initial lens by the same model. model: by default "gaussian"; elements: as for `render`,
     with the model "wave". object_distances: (B,) mm from surface 1
-    to the object of each patch, or one of all, inf allowed; by default that of the lens. Differentiable in the numbers
+    to the object of each patch, or one of all, inf allowed; by default the lens's. Differentiable in the numbers
     of the lens, of the elements and in the distances.
     Warns DarkPlaces of points without light, whose kernels are 0. Raises ValueError for numbers of patches, points and
     distances that differ, and for points that are not finite.
@@ -894,12 +903,10 @@ def default_sensor(
     others = {"response": {1: None, 3: "rgb"}.get(picture.shape[-3]), **others}
     if size is not None:
         return Sensor(size=size, pixels=(columns, rows), offset=offset, **others)
-    fields = field_points(None, like=lens).detach()
-    probe = Sensor(size=(1.0, rows / columns), pixels=(columns, rows))
-    reach = torch.hypot(*probe.landing(lens, fields)).max()
-    if not reach > 0:
+    reach = _image_height(lens, Sensor(size=(1.0, rows / columns), pixels=(columns, rows)))
+    if not reach:
         raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
-    pitch = 2 * float(reach) / math.hypot(columns, rows)
+    pitch = 2 * reach / math.hypot(columns, rows)
     return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), offset=offset, **others)
 
 
@@ -1005,7 +1012,7 @@ class Rendering(Result):
             dark = 100 * (1 - float(ready.lit.double().mean()))
             lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")
         if (darkest := self._darkest()) is not None:
-            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of that of the axis")
+            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of the axis")
         if ready.ideal is not None and max(ready.ideal.shape[-2:]) > 1:
             last, first = self._ends()
             (column, row), ideal = last - first, ready.ideal[:, last[1], last[0]] - ready.ideal[:, first[1], first[0]]
@@ -1050,8 +1057,8 @@ class Rendering(Result):
     @styled
     def draw(self):
         """The ideal lens's picture and the image, both in detail at the centre and at the upper left corner, and the
-        kernels there, of several depths that of the farthest; brightness is encoded as sRGB."""
-        ideal, image = (_shown(one) for one in (self.picture, self.image))
+        kernels there, of several depths the farthest; brightness is encoded as sRGB."""
+        ideal, image = (_shown(picture) for picture in (self.picture, self.image))
         ready = self.optics
         rows, columns = image.shape[:2]
         size = max(min(rows, columns) // 8, min(64, (min(rows, columns) + 2) // 3))
@@ -1072,8 +1079,8 @@ class Rendering(Result):
         )  # fmt: skip
         whole, close = figure.subfigures(2, 1, height_ratios=heights)
         pictures = {"ideal lens": ideal, "this lens": image}
-        for panel, (title, one) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
-            panel.imshow(one, vmin=0, vmax=1, cmap="gray")
+        for panel, (title, picture) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
+            panel.imshow(picture, vmin=0, vmax=1, cmap="gray")
             panel.set_title(title)
             panel.axis("off")
             for row, column, _, colour in details.values():
@@ -1084,8 +1091,8 @@ class Rendering(Result):
                 panel.plot(right, below, color=colour, linewidth=1.2, scalex=False, scaley=False, clip_on=False)
         panels = iter(close.subplots(1, 6))
         for place, (row, column, kernel, colour) in details.items():
-            at = slice(row, row + size), slice(column, column + size)
-            shown = {f"{place}, {title}": one[at] for title, one in pictures.items()}
+            detail = slice(row, row + size), slice(column, column + size)
+            shown = {f"{place}, {title}": picture[detail] for title, picture in pictures.items()}
             shown[f"kernel, {window}"] = _shown(kernel / kernel.amax())
             for title, part in shown.items():
                 panel = next(panels)

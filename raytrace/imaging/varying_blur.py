@@ -122,7 +122,7 @@ def _convolved(picture: Tensor, kernel: Tensor) -> Tensor:
 def _modes(kernels: Tensor, tol: float) -> tuple[Tensor | None, Tensor | None]:
     """Kernels u_j (J, h, w) and shares a (J, m, n, C) that give all kernels to `tol`; None where these are too many.
 
-    The modes are singular vectors of at most 256 of the kernels, evenly spread; the error is that of all.
+    The modes are singular vectors of at most 256 of the kernels, evenly spread; the error is checked for all.
     """
     flat = kernels.detach().flatten(3).flatten(0, 2)
     some = flat[:: math.ceil(len(flat) / _SAMPLE)]
