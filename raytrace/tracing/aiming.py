@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, is_any, safe_divide, varies, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.maths.tangents import values_alone, varies
+from raytrace.maths.transforms import in_transform, is_any
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at
@@ -183,10 +185,10 @@ def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> t
 def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
     """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph."""
     # `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
-    if torch._C._are_functorch_transforms_active():
+    if in_transform():
         value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
         return value.detach(), lambda v: pull(v)[0].detach(), arrives
-    with torch.enable_grad():
+    with torch.enable_grad(), values_alone():
         point = point.detach().requires_grad_()
         value, arrives = function(point)
     return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], arrives

@@ -25,20 +25,10 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import (
-    broadcast_shape,
-    detached,
-    dot,
-    dot_2,
-    is_any,
-    safe_divide,
-    safe_sqrt,
-    select,
-    unit,
-    value,
-    varies,
-)
+from raytrace.maths.numerics import broadcast_shape, detached, dot, dot_2, safe_divide, safe_sqrt, select, unit, value
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.tangents import varies
+from raytrace.maths.transforms import is_any
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,
