@@ -73,6 +73,8 @@ from raytrace.maths.sampling import hexapolar as hexapolar
 from raytrace.maths.sampling import sobol as sobol
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
+from raytrace.optimization.jacobian import Jacobian as Jacobian
+from raytrace.optimization.jacobian import jacobian as jacobian
 from raytrace.optimization.merit import BadMerit as BadMerit
 from raytrace.optimization.merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.merit import Merit as Merit
@@ -143,7 +145,6 @@ from raytrace.tracing.ray_listing import trace as trace
 from raytrace.tracing.scene import Memo as Memo
 from raytrace.tracing.spot import Spot as Spot
 from raytrace.tracing.streaming import mean_square_gradient as mean_square_gradient
-from raytrace.tracing.trace import hit_jacobian as hit_jacobian
 from raytrace.viewer.widget import view as view
 from raytrace.wave_optics.compute import elements as elements
 from raytrace.wave_optics.compute import wave_psf as wave_psf

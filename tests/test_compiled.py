@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from compiled_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
+from hits import hit_jacobian
 from problems import both_engines, double_gauss, lens, scalar, surface, vector, vignetting_aperture
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
@@ -32,7 +33,7 @@ from raytrace.tracing.compiled import (
     with_numbers,
 )
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import hit_jacobian, pushed, trace_lens, trace_surfaces
+from raytrace.tracing.trace import pushed, trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -6,6 +6,7 @@ import random
 import pytest
 import torch
 from compiled_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
+from hits import hit_jacobian
 from problems import lens, scalar, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
@@ -20,7 +21,7 @@ from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
 from raytrace.tracing.compiled import push, rows_of, task_of, trace_compiled, trace_engine
-from raytrace.tracing.trace import hit_jacobian, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

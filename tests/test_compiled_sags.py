@@ -6,6 +6,7 @@ import time
 import pytest
 import torch
 from compiled_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
+from hits import hit_jacobian
 from problems import scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
@@ -25,7 +26,7 @@ from raytrace.system.sag_terms import (
 )
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import is_expressible, trace_engine
-from raytrace.tracing.trace import hit_jacobian, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 
 
 def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
+from hits import hit_jacobian
 from problems import both_engines
 from torch.testing import assert_close
 
@@ -20,7 +21,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import engine
 from raytrace.tracing.refraction import refract
-from raytrace.tracing.trace import hit_jacobian, trace_surfaces
+from raytrace.tracing.trace import trace_surfaces
 
 LENGTHS = {"x", "y", "z", "opl"}
 ASPHERES = [case for case in CASES if case.get("family") == "asphere" and len(case["surfaces"]) < 5]

@@ -26,7 +26,7 @@ from torch import Tensor
 from raytrace.analysis.setting import refuse_dark
 from raytrace.budget import forewarn, piece
 from raytrace.maths import zernike
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import placed, safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.psf_models.dft import TooManyPoints, phasor
 from raytrace.system.apertures import stands_inside
@@ -210,13 +210,11 @@ def exit_pupil(
     ]
     field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
     field, light = (part if own is None else torch.where(own, part, 0.0) for part in (field, light))
-    amplitude = field.new_zeros(*field.shape[1:3], size, size)
-    amplitude[..., inside] = field[0]
     energy = torch.where(probe.valid, probe.energy, 0.0)
     total = energy.sum(-1)
     offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
     return ExitPupil(
-        amplitude=amplitude,
+        amplitude=placed(field[0], inside),
         energy=light.sum(-1)[0],
         step=(2 / size * half * beam.waves_per)[:, 0],
         centre=probe.centre[:2, 0],

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.result import flat
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.transforms import is_wrapped
 from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
 from raytrace.tracing.paraxial import first_order, largest_field
@@ -52,7 +52,7 @@ def setting(
     warn_of_filling(lens, found)
     if curve:
         return lens, found
-    hidden = any(isinstance(leaf, Tensor) and is_functorch_wrapped_tensor(leaf) for leaf in pytree.tree_leaves(lens))
+    hidden = any(isinstance(leaf, Tensor) and is_wrapped(leaf) for leaf in pytree.tree_leaves(lens))
     if not hidden and lens.count is None:
         check_reach(lens, None if fields is None else found, every=every)
     return lens, found

@@ -13,6 +13,7 @@ from raytrace.analysis.mtf import cutoff, modulation, rule_of_blur
 from raytrace.analysis.pupil_autocorrelation import MARGIN, otf
 from raytrace.analysis.setting import wavelength_shares
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.tangents import applied
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.system.lens import Lens, name_of_field
 from raytrace.tracing.scene import Scene, scene
@@ -128,7 +129,7 @@ class ShearedPupils:
             raised.append(torch.stack(terms, -1))
         basis = self.root[:, None] * raised[0][..., [i for i, _ in powers]] * raised[1][..., [j for _, j in powers]]
         wanted = torch.stack([*(p.expand_as(waves) for p in self.points), waves], -1)
-        found = _LeastSquares.apply(basis, self.root[:, None] * wanted)
+        found = applied(_LeastSquares, basis, self.root[:, None] * wanted)
         size = self.degree + 1
         place = torch.tensor([i * size + j for i, j in powers], device=found.device)
         table = found.new_zeros(3, *found.shape[:-2], size * size).index_copy(-1, place, found.movedim(-1, 0))

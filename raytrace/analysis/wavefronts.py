@@ -14,7 +14,7 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths import zernike
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import placed, value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
 from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
@@ -172,10 +172,7 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
     front = clear if clear.pupil.dim() == 2 else wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
     wave = 1e-3 * lens.wavelengths
     of = (lambda numbers: numbers[0]) if lens.count is None else (lambda numbers: numbers)
-    opd = drawn.opd.new_zeros(*of(drawn.opd).shape[:-1], *inside.shape)
-    opd[..., inside] = of(drawn.opd) / wave[:, None]
-    valid = torch.zeros_like(opd, dtype=torch.bool)
-    valid[..., inside] = of(drawn.valid)
+    opd, valid = placed(of(drawn.opd) / wave[:, None], inside), placed(of(drawn.valid), inside)
     if folded:
         opd, valid = (torch.cat([half.flip(-1)[..., : size // 2], half], -1) for half in (opd, valid))
     return WavefrontMap(

@@ -510,6 +510,28 @@ COMMANDS = (
         each="list every row, also the rays of one field",
     ),
     _command(
+        "jacobian",
+        "derivatives of rays or of a merit function by the variables",
+        "Derivatives of the points where rays land, of their directions or paths, or of the residuals of a merit "
+        "function, by all design variables in one pass, with the launch and aiming of the rays. The text has the mean "
+        "and the largest derivative by each variable; -o and --json have all of them.",
+        """
+        cooke_triplet --vary curvature thickness
+        lens.zmx --of paths --field 0 10 -o derivatives.json
+        double_gauss --vary curvature --of merit --merit spot""",
+        lens,
+        conditions,
+        option("--vary", metavar="WHAT", nargs="+", help="variables, pickups and solves (default: the file's)"),
+        option(
+            "--of",
+            metavar="QUANTITY",
+            choices=("landing points", "directions", "paths", "merit"),
+            help="'landing points' (default), directions, paths or merit",
+        ),
+        option("--merit", metavar="KIND", help="of --of merit: spot, wavefront or angular (default: the file's)"),
+        table,
+    ),
+    _command(
         "view",
         "turn the numbers of a lens in a browser",
         "Serve the viewer of a lens on 127.0.0.1: its prescription as a table with a slider on every number, layout, "

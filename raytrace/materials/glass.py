@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.transforms import is_wrapped
 from raytrace.words import RaytraceWarning, calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------
@@ -542,7 +542,7 @@ def _description(glass: Glass) -> list[str]:
     """Name and catalog, n_d and V_d as its coefficients give them; of a batch the smallest and the largest."""
     name = label(glass) or ("air" if glass.formula == "constant" and glass.coefficients.dim() == 1 else "no name")
     words = [f"{name} ({glass.catalog})" if glass.catalog else name]
-    if glass.formula in ("mirror", "constant") or is_functorch_wrapped_tensor(glass.coefficients):
+    if glass.formula in ("mirror", "constant") or is_wrapped(glass.coefficients):
         return words
     for symbol, number in (("n_d", nd(glass).detach()), ("V_d", abbe_number(glass).detach())):
         low, high = (f"{float(extreme):.6g}" for extreme in (number.min(), number.max()))

@@ -22,9 +22,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
-from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
+
+from raytrace.maths.transforms import is_wrapped
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
@@ -55,36 +55,6 @@ def dot_2(a: Tensor, b: Tensor) -> Tensor:
     return a[0] * b[0] + a[1] * b[1]
 
 
-def differentiating() -> bool:
-    """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
-
-    False only under `torch.no_grad()` with no forward derivative; then what serves derivatives alone is left out.
-    """
-    return torch.is_grad_enabled() or getattr(forward_ad, "_current_level", 0) >= 0
-
-
-def varies(number: Tensor | float | None) -> bool:
-    """Whether a derivative by this number may be requested: backward, forward, or by a transform of torch.func.
-
-    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
-    """
-    if not isinstance(number, Tensor):
-        return False
-    if number.requires_grad or is_functorch_wrapped_tensor(number):
-        return True
-    return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None
-
-
-def is_any(mask: Tensor) -> bool:
-    """Whether any entry of a mask (...) is true; inside `torch.func.vmap`, of any element of its batch.
-
-    A search that ends early then ends when all elements have: `bool(mask.any())` raises an error there.
-    """
-    while is_functorch_wrapped_tensor(mask):
-        mask = torch._C._functorch.get_unwrapped(mask)
-    return bool(mask.any())
-
-
 def with_batch_axes(vector: Tensor, count: int) -> Tensor:
     """The vector (3, ...) with at least `count` batch axes: axes of length 1 are put in behind its components.
 
@@ -107,6 +77,13 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
                     raise ValueError(f"shapes {', '.join(str(tuple(shape)) for shape in shapes)} do not broadcast")
                 sizes[-place] = shape[-place]
     return torch.Size(sizes)
+
+
+def placed(entries: Tensor, mask: Tensor) -> Tensor:
+    """A tensor (..., *mask.shape) with entries (..., K) where the mask (...) is true, in order, and 0 elsewhere."""
+    places = mask.flatten().nonzero()[:, 0]
+    empty = entries.new_zeros((*entries.shape[:-1], mask.numel()))
+    return empty.index_copy(-1, places, entries).unflatten(-1, mask.shape)
 
 
 def unit(vector: Tensor) -> Tensor:
@@ -380,7 +357,7 @@ def _summary(item: object) -> str:
     """A tensor of at most nine numbers as these, a larger one as shape, type and range; other items as they are."""
     if type(item) is tuple:
         return f"({', '.join(map(_summary, item))}{',' if len(item) == 1 else ''})"
-    if not isinstance(item, Tensor) or item.is_meta or is_functorch_wrapped_tensor(item):
+    if not isinstance(item, Tensor) or item.is_meta or is_wrapped(item):
         return repr(item)
     array = item.detach().cpu().resolve_conj()
     if array.numel() <= 9:

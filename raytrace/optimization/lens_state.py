@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
@@ -351,12 +351,12 @@ class LensState:
             self.__dict__.pop(name, None)
         self._kept.clear()
 
-    # -- functions of torch, the only ways from there to dual numbers, but for whole bundles of rays ---------------
+    # -- functions of torch ----------------------------------------------------------------------------------------
 
     def through_torch(
         self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False, only: Sequence | None = None
     ) -> list:
-        """Numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
+        """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
         clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on.
         """
@@ -365,24 +365,6 @@ class LensState:
             leaves, lens = view.leaves({at: value_of(self.numbers[at]) for at in only or self.numbers})
             numbers = function(lens)
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
-
-    def each_through_torch(self, function: Callable, arrays: Sequence):
-        """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
-        with torch.set_grad_enabled(self.count > 0):
-            leaves, lens = self.view.leaves({at: value_of(n) for at, n in self.numbers.items()})
-            entries = [torch.tensor(value_of(array), requires_grad=self.count > 0) for array in arrays]
-            numbers = function(lens, *entries)
-            if not self.count:
-                return numbers.numpy()
-            by = torch.autograd.grad(numbers.sum(), entries, retain_graph=True, allow_unused=True)
-            slopes = np.zeros((self.count, len(numbers)))
-            for array, derivative in zip(arrays, by, strict=True):
-                if isinstance(array, Dual) and derivative is not None:
-                    slopes += array.full() * derivative.numpy()
-            of_lens = torch.autograd.grad(numbers.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
-            if any(derivative is not None for derivative in of_lens):
-                slopes += np.stack([self._chained(number, leaves).slope for number in numbers], -1)
-        return Dual(numbers.detach().numpy(), slopes)
 
     def _chained(self, number: Tensor, leaves: dict) -> Dual:
         """A number () computed from leaves, with its derivatives by the variables."""
@@ -394,6 +376,35 @@ class LensState:
                 if derivative is not None and isinstance(moved, Dual):
                     slope = slope + float(derivative) * moved.slope
         return Dual(value, slope)
+
+    def moving_lens(self, *, clips: bool = False) -> Lens:
+        """The lens whose numbers carry their derivatives by all variables: of many numbers in one forward pass.
+
+        clips: whether the lens has its apertures.
+        """
+        numbers = {
+            at: with_tangents(
+                torch.tensor(float(value_of(self.numbers[at])), dtype=torch.float64),
+                torch.from_numpy(np.array(slope_of(self.numbers[at], self.count))),
+            )
+            for at in self.numbers
+        }
+        return (self.view.clipping if clips else self.view).held(numbers)
+
+    def each_through_torch(self, function: Callable, arrays: Sequence):
+        """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
+        entries = [torch.tensor(value_of(array)) for array in arrays]
+        if not self.count:
+            with torch.no_grad():
+                values = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in self.numbers.items()}
+                return function(self.view.held(values), *entries).numpy()
+        moved = [
+            with_tangents(entry, torch.from_numpy(array.full().copy())) if isinstance(array, Dual) else entry
+            for entry, array in zip(entries, arrays, strict=True)
+        ]
+        with torch.enable_grad():
+            numbers = function(self.moving_lens(), *moved)
+        return Dual(numbers.detach().numpy(), tangents_of(numbers, self.count).detach().numpy())
 
 
 def _gaussian(state: LensState, wavelength: int) -> Gaussian:
@@ -497,13 +508,9 @@ def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, star
 
 
 def rays_by_torch(
-    state: LensState, function: Callable[[Lens], Rays], shape: tuple[int, int], *, backward: bool = False
+    state: LensState, function: Callable[[Lens], Rays], shape: tuple[int, int]
 ) -> tuple[list, np.ndarray]:
-    """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity.
-
-    backward: one backward pass for each number, if the function takes forward derivatives of its own (rays aimed about
-    a base ray), which do not nest; else one forward pass for each variable, of which there are fewer than rays.
-    """
+    """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity."""
 
     def parts_of(lens: Lens) -> list[Tensor]:
         rays = function(lens)
@@ -514,23 +521,10 @@ def rays_by_torch(
         *parts, valid = (part.numpy().copy() for part in parts_of(state.view.held(values)))
     if not state.count:
         return parts, valid
-    if backward:
-        numbers = state.through_torch(lambda lens: [n for part in parts_of(lens)[:-1] for n in part.reshape(-1)])
-        slopes = np.stack([number.slope for number in numbers], -1).reshape(state.count, 7, *shape).swapaxes(0, 1)
-    else:
-        slopes = np.zeros((7, state.count, *shape))
-        for variable in range(state.count):
-            with forward_ad.dual_level():
-                moved = {
-                    at: forward_ad.make_dual(values[at], values[at].new_tensor(float(number.slope[variable])))
-                    for at, number in state.numbers.items()
-                    if isinstance(number, Dual)
-                }
-                for slope, part in zip(slopes, parts_of(state.view.held(values | moved))[:-1], strict=True):
-                    tangent = forward_ad.unpack_dual(part).tangent
-                    if tangent is not None:
-                        slope[variable] = tangent.numpy()
-    return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(parts, slopes, strict=True)], valid
+    with torch.enable_grad():
+        *moved, _ = parts_of(state.moving_lens())
+    slopes = [np.where(valid, tangents_of(part, state.count).numpy(), 0.0) for part in moved]
+    return [Dual(value, slope) for value, slope in zip(parts, slopes, strict=True)], valid
 
 
 def largest_field(lens: Lens) -> float:
@@ -813,7 +807,7 @@ class Bundle:
     def launched(self, state: LensState):
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
-            parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:], backward=self._aims_bent)
+            parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:])
             return parts[:3], parts[3:6], parts[6], valid
         if not self._aims:
             return self._through(state, self.pupil)
@@ -869,10 +863,6 @@ class Bundle:
         field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
         return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
 
-    @cached_property
-    def _aims_bent(self) -> bool:
-        return self._aims and is_bent(self.view.lens)
-
     def _hits_by_torch(self, state: LensState) -> Hits:
         def end(lens: Lens) -> Rays:
             wavelength = lens.wavelengths[:, None]
@@ -880,7 +870,7 @@ class Bundle:
             rays = self._start_by_torch(lens)
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength)
 
-        parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=self._aims_bent)
+        parts, valid = rays_by_torch(state, end, self.field.shape[1:])
         return self._as_hits(state, parts, valid)
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.maths.tangents import applied
 from raytrace.optimization.merit import Evaluated, Evaluation, Merit
 from raytrace.optimization.variables import APERTURE, GLASS_NUMBER, Address, Model
 from raytrace.system.lens import Lens, aligned
@@ -43,7 +44,7 @@ class MeritOfBatch:
 
     def square(self) -> Tensor:
         """M² (L,) with its derivatives."""
-        return _Square.apply(self.numbers, self.evaluation, self.by)
+        return applied(_Square, self.numbers, self.evaluation, self.by)
 
 
 class _Square(torch.autograd.Function):

@@ -15,6 +15,7 @@ from torch import Tensor
 from raytrace.budget import afford, piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.sampling import Grid, centres, gauss_rings
+from raytrace.maths.tangents import applied
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
 from raytrace.words import RaytraceWarning, calling_level
@@ -162,12 +163,12 @@ def _in_chunks(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Te
 
 def bessel_j0(x: Tensor) -> Tensor:
     """J₀ with its derivatives (those of torch.special detach silently)."""
-    return _Bessel.apply(x, 0)
+    return applied(_Bessel, x, 0, slopes=lambda *of: (_bessel_slope(*of),))
 
 
 def bessel_j1(x: Tensor) -> Tensor:
     """J₁ with its derivatives (those of torch.special detach silently)."""
-    return _Bessel.apply(x, 1)
+    return applied(_Bessel, x, 1, slopes=lambda *of: (_bessel_slope(*of),))
 
 
 def rings_and_arms(phase: float, order: int) -> tuple[int, int]:

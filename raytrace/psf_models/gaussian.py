@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from numpy.polynomial import legendre
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import Grid, centres, edges, gauss_rings, sobol
+from raytrace.maths.tangents import applied
+from raytrace.maths.transforms import is_wrapped
 from raytrace.psf_models.drt import histogram
 from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import stands_inside
@@ -62,7 +63,7 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
         across, along = _sides(x, x_edges, y, y_edges, half)
         return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
     xy = torch.where(both, covariance[1], 0.0)[..., None, None]
-    return _Rotated.apply(x, y, half, variance_x, variance_y, xy, x_edges, y_edges)
+    return applied(_Rotated, x, y, half, variance_x, variance_y, xy, x_edges, y_edges, slopes=_slopes)
 
 
 def wide_gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
@@ -170,7 +171,7 @@ def _slopes(x, y, half, xx, yy, xy, x_edges, y_edges) -> tuple[Tensor, ...]:
 def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     """P by the product rule where half a pixel is no wider than 1.5 conditional σ, else by `_rule`."""
     det = _determinant(xx, xy, yy)
-    if any(map(is_functorch_wrapped_tensor, (*across, *along, xx, xy, yy))):
+    if any(map(is_wrapped, (*across, *along, xx, xy, yy))):
         return _rule(across, along, xx, xy, yy, det)  # a choice by values cannot be mapped
     width = across[3] * safe_sqrt(safe_divide(torch.maximum(xx, yy), det))
     batch = torch.broadcast_shapes(*(t.shape[:-2] for t in (xx, across[2], along[2])))

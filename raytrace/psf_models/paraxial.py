@@ -2,11 +2,11 @@
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import detached, safe_divide
 from raytrace.maths.sampling import Grid
+from raytrace.maths.transforms import is_wrapped
 from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media
@@ -50,7 +50,7 @@ def has_one_focus(lens: Lens) -> bool:
     if is_bent(lens):
         return False
     numbers = pytree.tree_leaves(lens)
-    if all(map(is_round, lens.surfaces)) or any(map(is_functorch_wrapped_tensor, numbers)):
+    if all(map(is_round, lens.surfaces)) or any(map(is_wrapped, numbers)):
         return True
     with torch.no_grad():
         tangential, sagittal = 1 / base_ray(detached(lens)).focal_length.flatten(1)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import has_abbe_number, is_air
+from raytrace.maths.transforms import in_transform
 from raytrace.system import configurations
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve
@@ -308,7 +309,7 @@ def _single(poses: Sequence[Pose]) -> Pose | None:
 
 def _pose(rows: Rows, k: int) -> Pose:
     """The pose of a passage. Raises BadTolerance where its tilt about y is a right angle."""
-    sine, hidden = rows[2][0], torch._C._are_functorch_transforms_active()
+    sine, hidden = rows[2][0], in_transform()
     if isinstance(sine, Tensor) and not hidden and bool((sine.detach().abs() > 1 - 1e-12).any()):
         message = "its axes turn by 90° about y, where a further tilt has no angles about x and z"
         raise BadTolerance(f"surface {k}: {message}; put the turn on a coordinate break of its own")
@@ -450,7 +451,7 @@ def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Sol
     if (k, quantity) in solves and not message:
         source = solves[k, quantity].source
         message = f"its {quantity} follows that of surface {source}; put the tolerance there"
-    if not message and not torch._C._are_functorch_transforms_active():
+    if not message and not in_transform():
         message = _objection(lens, row, surface)
     if message:
         raise BadTolerance(f"{_named(row)}: {message}")

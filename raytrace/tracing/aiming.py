@@ -13,8 +13,10 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import broadcast_shape, is_any, safe_divide, varies, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.tangents import values_alone, varies
+from raytrace.maths.transforms import in_transform, is_any
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at
@@ -146,7 +148,7 @@ def _root(
     root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
     last_step, close = torch.zeros_like(root), _CLOSE * tolerance
     searches = [partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES]
-    if near is not None and not torch._C._are_functorch_transforms_active():
+    if near is not None and not in_transform():
         searches.insert(0, lambda: _chords(residual, *near(), close))
     for search in searches:
         followed, worst, step = search()
@@ -234,10 +236,10 @@ def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> t
 def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
     """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph."""
     # `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
-    if torch._C._are_functorch_transforms_active():
+    if in_transform():
         value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
         return value.detach(), lambda v: pull(v)[0].detach(), arrives
-    with torch.enable_grad():
+    with torch.enable_grad(), values_alone():
         point = point.detach().requires_grad_()
         value, arrives = function(point)
 

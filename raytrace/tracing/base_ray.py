@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, dot, is_any, safe_sqrt, unit, value, varies
+from raytrace.maths.numerics import broadcast_shape, dot, safe_sqrt, unit, value
+from raytrace.maths.tangents import varies
+from raytrace.maths.transforms import in_forward_mode, in_transform, is_any
 from raytrace.system.lens import Lens, batch_shape, media
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
@@ -251,7 +252,7 @@ def _linearised(function: Callable, at: Tensor, given: object) -> tuple[Tensor, 
         ones = torch.eye(count, dtype=at.dtype, device=at.device)
         return ones.reshape(count, count, *(1,) * (at.dim() - 1)).expand(count, count, *at.shape[1:])
 
-    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+    if in_transform() or in_forward_mode():
         change = units(len(at))
         figures, slopes, others = torch.func.jvp(function, (at[:, None] + 0 * change,), (change,), has_aux=True)
         return figures[:, 0], slopes, others

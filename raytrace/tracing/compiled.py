@@ -18,10 +18,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
 from raytrace.maths.numerics import broadcast_shape, with_batch_axes
+from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
+from raytrace.maths.transforms import in_forward_mode, in_transform
 from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.poses import Gap, Turn, passage
@@ -88,8 +89,8 @@ def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
         or rays.direction.device.type != "cpu"
         or numbers.device.type != "cpu"
         or dtypes not in ({torch.float32}, {torch.float64})
-        or torch._C._are_functorch_transforms_active()
-        or getattr(forward_ad, "_current_level", -1) >= 0
+        or in_transform()
+        or in_forward_mode()
         or torch.compiler.is_compiling()
     ):
         return False
@@ -460,6 +461,8 @@ def trace_compiled(
     task = task_of(surfaces, rays, indices=indices, side=side, gap=gap, wavelength=wavelength)
     if task is None:
         return None
+    if any(isinstance(part, MovingTensor) for part in task.inputs):
+        return None if any(t is not None and t.requires_grad for t in task.inputs) else moved(task)
     if not (torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in task.inputs)):
         return forward(task)
 
@@ -563,18 +566,35 @@ def push(
     call = _call(task.structure, task.valid, *task.inputs)
     changes, shape = changes.contiguous(), task.valid.shape
     call.changes, call.change, call.everywhere = len(changes), changes.data_ptr(), everywhere
-    ends = [part.new_empty(3, *pages, *shape) for part in (position, direction)]
-    ends.append(None if opl is None else opl.new_empty(*pages, *shape))
-    valid = task.valid.new_empty(*pages, *shape)
+    ends = [part.new_empty((3, *pages, *shape)) for part in (position, direction)]
+    ends.append(None if opl is None else opl.new_empty((*pages, *shape)))
+    valid = task.valid.new_empty((*pages, *shape))
     call.rays_out, call.valid_out = _pointers(*ends), valid.data_ptr()
-    by = [changes.new_empty(3, *pages, len(changes), *shape) for _ in range(2)]
-    by.append(None if opl is None else changes.new_empty(*pages, len(changes), *shape))
+    by = [changes.new_empty((3, *pages, len(changes), *shape)) for _ in range(2)]
+    by.append(None if opl is None else changes.new_empty((*pages, len(changes), *shape)))
     call.changed = _pointers(*by)
     if start is not None:
         start = [None if part is None else part.contiguous() for part in start]
         call.at_start = _pointers(*start)
     _run("tangents", call, table)
     return Pushed(*ends, valid, *by)
+
+
+def moved(task: Task) -> Rays:
+    """The rays behind the last surface with their derivatives by the variables that rays or table carry."""
+    count = next(len(part.tangents) for part in task.inputs if isinstance(part, MovingTensor))
+    tangents = [None if part is None else tangents_of(part, count) for part in task.inputs]
+    inputs = [None if part is None else value_of(part) for part in task.inputs]
+    start = None
+    if any(isinstance(part, MovingTensor) for part in task.inputs[:3]):
+        start = *(part.movedim(1, 0) for part in tangents[:2]), tangents[2]
+    end = push(Task(task.structure, task.valid, (*inputs,)), tangents[3], start)
+    return Rays(
+        with_tangents(end.position, end.by_position.movedim(1, 0)),
+        with_tangents(end.direction, end.by_direction.movedim(1, 0)),
+        end.valid,
+        None if end.opl is None else with_tangents(end.opl, end.by_opl),
+    )
 
 
 def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:

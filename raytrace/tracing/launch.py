@@ -30,16 +30,16 @@ from raytrace.maths.numerics import (
     detached,
     dot,
     dot_2,
-    is_any,
     safe_divide,
     safe_sqrt,
     select,
     unit,
     value,
-    varies,
     with_batch_axes,
 )
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.tangents import varies
+from raytrace.maths.transforms import is_any
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,

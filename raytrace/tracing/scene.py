@@ -15,7 +15,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import afford_rays
-from raytrace.maths.numerics import broadcast_shape, value, varies
+from raytrace.maths.numerics import broadcast_shape, value
+from raytrace.maths.tangents import varies
+from raytrace.maths.transforms import in_transform
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
@@ -126,14 +128,14 @@ class Memo:
 
 def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:
     """The rays of field and pupil points at the image surface; everything broadcasts."""
-    if memo is None or torch._C._are_functorch_transforms_active():
+    if memo is None or in_transform():
         return trace_lens(bundle[0], _launched(bundle), bundle[2])
     return trace_surfaces(**_rest(bundle, memo.front(bundle, recorded=False), memo))
 
 
 def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
     """The crossings of the rays with every surface after the object."""
-    if memo is None or torch._C._are_functorch_transforms_active():
+    if memo is None or in_transform():
         return list(lens_steps(bundle[0], _launched(bundle), bundle[2]))
     front = memo.front(bundle, recorded=True)
     return [*front.crossings, *steps(**_rest(bundle, front, memo))]
@@ -322,7 +324,7 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
         rays = trace_scene(scene, disc)
         return rays.position[:2], [], rays.valid
     shape = (*scene.shape, disc.shape[-1])
-    if scene.memo is None or torch._C._are_functorch_transforms_active():
+    if scene.memo is None or in_transform():
         lens, _, wavelength, _ = bundle = _bundle(scene, disc)
         numbers = [k for k, surface in enumerate(lens.surfaces) if k and surface.apertures]
         hits, met = points_at(lens, _launched(bundle), wavelength, (*numbers, len(lens.surfaces) - 1))

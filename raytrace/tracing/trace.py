@@ -2,8 +2,8 @@
 
 The trace is a generator: to record, draw or find where a ray failed, consume `steps`; to resume from stored rays, pass
 them with the remaining surfaces. `trace_surfaces` and `trace_lens` return the last rays only, through the compiled
-engine where that is available and pays. `hit_jacobian` has the derivatives of the last hits by all variables in one
-pass: in the compiled engine each ray carries its derivatives from surface to surface, and no graph is made.
+engine where that is available and pays. Numbers that carry derivatives by variables (`maths.tangents`) hand them to the
+rays: in the compiled engine each ray carries its derivatives from surface to surface, and no graph is made.
 """
 
 import dataclasses
@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import detached, dot, value
+from raytrace.maths.transforms import is_wrapped
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
 from raytrace.system.lens import Lens, media
@@ -348,7 +348,7 @@ def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
         return True
     if all(map(is_round, surfaces)):
         return False
-    if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
+    if any(isinstance(n, Tensor) and is_wrapped(n) for n in pytree.tree_leaves(lens)):
         # Values are hidden inside a transform.
         phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
         return any(not kind.is_round and not kind.slopes for kind in phases)
@@ -383,31 +383,6 @@ def need_axis(lens: Lens, what: str, instead: str = "") -> None:
     raise Bent(f"{message}; {instead}" if instead else message)
 
 
-def hit_jacobian(
-    surfaces: Sequence[Surface],
-    rays: Rays,
-    variables: Sequence[Tensor],
-    *,
-    indices: Sequence[Tensor],
-    wavelength: Tensor | None = None,
-) -> Tensor:
-    """∂(x, y)/∂v (V, 2, ...) of the hits on the last surface by every entry of the variables, in their order.
-
-    variables: tensors that require a gradient, which numbers of the surfaces or indices are or depend on; V counts all
-    their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0] held fixed.
-    Failed rays have derivatives 0. Raises ValueError for surfaces that the compiled trace does not support (height
-    maps, more than 16 terms), and for numbers of a lens that vary along the last axis of the rays.
-    """
-    known = all(map(is_expressible, surfaces))
-    task = task_of(surfaces, rays, indices=indices, wavelength=wavelength) if known else None
-    if task is None:
-        raise ValueError(
-            "no Jacobian for height maps, more than 16 terms, numbers of another dtype than "
-            "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
-        )
-    return pushed(surfaces, task, _changes(task.inputs[3], variables)).by_position[:2].transpose(0, 1)
-
-
 def pushed(
     surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
 ) -> Pushed:
@@ -437,19 +412,6 @@ def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
 def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
     own, indices, gap = with_numbers(task.structure, surfaces, table, task.valid.shape[:-1])
     return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
-
-
-def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
-    """∂table/∂v (V, rows, K)."""
-    every = torch.eye(table.numel(), dtype=table.dtype, device=table.device)
-    found = torch.autograd.grad(
-        table.reshape(-1), list(variables), every, retain_graph=True, is_grads_batched=True, allow_unused=True
-    )
-    columns = [
-        table.new_zeros(v.numel(), table.numel()) if g is None else g.reshape(table.numel(), -1).T
-        for v, g in zip(variables, found, strict=True)
-    ]
-    return torch.cat(columns).reshape(-1, *table.shape)
 
 
 def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:

@@ -21,6 +21,7 @@ from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table, masked, number, rows
 from raytrace.maths.sampling import Grid, centres, grid
+from raytrace.maths.transforms import in_transform
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
@@ -204,7 +205,7 @@ def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveSc
         numbers += [t for t in parts if t is not None]
         kind = (type(element.profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
         structure = (structure, *kind)
-    if torch._C._are_functorch_transforms_active() or any(n.requires_grad for n in numbers):
+    if in_transform() or any(n.requires_grad for n in numbers):
         memo.made += 1
         return make(scene, plan, None)
     with torch.no_grad():

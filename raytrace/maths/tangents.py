@@ -1,0 +1,690 @@
+"""Tensors that carry their derivatives by n variables: vector forward mode, in one pass through any code of torch.
+
+    x = with_tangents(value, tangents)      value (...), tangents (n, ...)
+    y = torch.sqrt(x * x + 1)               tangents_of(y)  (n, ...): ∂y/∂v of all n variables
+
+A function of torch acts on the values, and its differential on the tangents of all variables at once, so that formulas
+of optics stand once, on tensors, and derivatives by the numbers of a lens take one pass. Functions without a row in
+RULES are differentiated by torch's own forward mode, with the same result in more time. Under `torch.no_grad()` and in
+`values_alone()` results carry no tangents, as they have no graph.
+
+Source: Griewank & Walther, Evaluating Derivatives, 2008, ch. 3 (vector forward mode).
+"""
+
+import contextlib
+import contextvars
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.utils import _pytree as pytree
+
+from raytrace.maths.transforms import has_forward_derivative, is_wrapped, plain_functions
+
+_stopped: contextvars.ContextVar[bool] = contextvars.ContextVar("stopped", default=False)
+
+
+class MovingTensor(Tensor):
+    """A tensor (...) with `tangents` (n, ...), its derivatives by n variables."""
+
+    tangents: Tensor
+
+    # As of the tangents, which torch reads without asking this class.
+    shape = property(lambda self: self.tangents.shape[1:])
+    dtype = property(lambda self: self.tangents.dtype)
+    device = property(lambda self: self.tangents.device)
+    ndim = property(lambda self: self.tangents.dim() - 1)
+
+    def dim(self) -> int:
+        return self.tangents.dim() - 1
+
+    def is_floating_point(self) -> bool:
+        return self.tangents.is_floating_point()
+
+    @classmethod
+    def __torch_function__(cls, function, types, arguments=(), options=None):
+        options = options or {}
+        with plain_functions():
+            if _stopped.get() or not torch.is_grad_enabled():
+                return _values(function(*arguments, **options))
+            rule = RULES.get(function)
+            return _by_torch(function, arguments, options) if rule is None else rule(*arguments, **options)
+
+    def __repr__(self) -> str:
+        with plain_functions():
+            return f"{self.as_subclass(Tensor)!r} with derivatives by {len(self.tangents)} variables"
+
+
+def with_tangents(value: Tensor, tangents: Tensor) -> MovingTensor:
+    """The tensor (...) with derivatives (n, ...) by n variables."""
+    moving = value.as_subclass(MovingTensor)
+    moving.tangents = tangents
+    return moving
+
+
+def tangents_of(number: Tensor, count: int) -> Tensor:
+    """The derivatives (n, ...) of a tensor (...) by `count` variables; 0 where it carries none."""
+    return number.tangents if isinstance(number, MovingTensor) else number.new_zeros(count, *number.shape)
+
+
+def value_of(number: Tensor) -> Tensor:
+    """The tensor without its derivatives by variables."""
+    if not isinstance(number, MovingTensor):
+        return number
+    with plain_functions():
+        return number.as_subclass(Tensor)
+
+
+def varies(number: Tensor | float | None) -> bool:
+    """Whether a derivative by this number may be requested: backward, forward, or by a transform of torch.func.
+
+    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
+    """
+    if not isinstance(number, Tensor):
+        return False
+    if isinstance(number, MovingTensor) or number.requires_grad or is_wrapped(number):
+        return True
+    return has_forward_derivative(number)
+
+
+@contextlib.contextmanager
+def values_alone() -> Iterator[None]:
+    """Within the block, results carry no derivatives by variables: for searches whose steps nobody differentiates."""
+    token = _stopped.set(True)
+    try:
+        yield
+    finally:
+        _stopped.reset(token)
+
+
+def _values(result):
+    """What a function returns, without tangents."""
+    if isinstance(result, MovingTensor):
+        return result.as_subclass(Tensor)
+    if isinstance(result, (tuple, list)) and any(isinstance(entry, MovingTensor) for entry in result):
+        return type(result)(map(_values, result))
+    return result
+
+
+# -- rules -------------------------------------------------------------------------------------------------------------
+
+
+def _under(tangents: Tensor, dim: int) -> Tensor:
+    """Tangents (n, ...) with so many axes behind the first, for values of `dim` axes."""
+    missing = dim + 1 - tangents.dim()
+    return tangents.reshape(len(tangents), *(1,) * missing, *tangents.shape[1:]) if missing > 0 else tangents
+
+
+def _full(tangents: Tensor, value: Tensor) -> Tensor:
+    """Tangents with all axes of the value."""
+    shape = len(tangents), *value.shape
+    return tangents if tangents.shape == shape else _under(tangents, value.dim()).expand(shape)
+
+
+def _sum(value: Tensor, parts: Sequence[tuple[Tensor, object]]) -> MovingTensor:
+    """The value with tangents Σ dx ∂y/∂x of parts (x, ∂y/∂x), those that move; ∂y/∂x None: 1."""
+    total = None
+    for x, slope in parts:
+        if isinstance(x, MovingTensor):
+            tangents = _under(x.tangents, value.dim())
+            tangents = tangents if slope is None else tangents * slope
+            total = tangents if total is None else total + tangents
+    return with_tangents(value, _full(total, value))
+
+
+def _add(a, b, *, alpha=1):
+    return _sum(torch.add(a, b, alpha=alpha), ((a, None), (b, None if alpha == 1 else alpha)))
+
+
+def _subtract(a, b, *, alpha=1):
+    return _sum(torch.sub(a, b, alpha=alpha), ((a, None), (b, -alpha)))
+
+
+def _multiply(a, b):
+    return _sum(a * b, ((a, b), (b, a)))
+
+
+def _divide(a, b, *, rounding_mode=None):
+    if rounding_mode is not None:
+        return torch.div(a, b, rounding_mode=rounding_mode)
+    ratio = a / b
+    inverse = 1 / b
+    return _sum(ratio, ((a, inverse), (b, -ratio * inverse)))
+
+
+def _power(x, exponent):
+    value = torch.pow(x, exponent)
+    by_x = exponent * torch.pow(x, exponent - 1) if isinstance(x, MovingTensor) else None
+    by_exponent = (
+        value * (torch.log(x) if isinstance(x, Tensor) else math.log(x)) if isinstance(exponent, MovingTensor) else None
+    )
+    return _sum(value, ((x, by_x), (exponent, by_exponent)))
+
+
+def _add_product(x, a, b, *, value=1):
+    return _sum(torch.addcmul(x, a, b, value=value), ((x, None), (a, value * b), (b, value * a)))
+
+
+def _angle(y, x):
+    square = x * x + y * y
+    return _sum(torch.atan2(y, x), ((y, x / square), (x, -y / square)))
+
+
+def _length_of_two(a, b):
+    length = torch.hypot(a, b)
+    safe = torch.where(length == 0, torch.ones_like(length), length)
+    return _sum(length, ((a, a / safe), (b, b / safe)))
+
+
+def _extreme(function: Callable) -> Callable:
+    """The larger or smaller of two; equal ones have half of the derivative each, as in torch."""
+
+    def rule(a, b):
+        value = function(a, b)
+        share = torch.where(a == b, 0.5, (a == value).to(value.dtype))
+        return _sum(value, ((a, share), (b, 1 - share)))
+
+    return rule
+
+
+def _where(condition, a, b):
+    value, zero = torch.where(condition, a, b), 0.0
+    count = next(len(x.tangents) for x in (a, b) if isinstance(x, MovingTensor))
+    parts = [_under(x.tangents, value.dim()) if isinstance(x, MovingTensor) else zero for x in (a, b)]
+    chosen = torch.where(condition, *parts)
+    return with_tangents(
+        value, chosen.expand(count, *value.shape) if chosen.dim() <= value.dim() else _full(chosen, value)
+    )
+
+
+def _complex(real, imaginary):
+    value = torch.complex(real, imaginary)
+    count = next(len(x.tangents) for x in (real, imaginary) if isinstance(x, MovingTensor))
+    parts = [_full(tangents_of(x, count), value) for x in (real, imaginary)]
+    return with_tangents(value, torch.complex(*parts))
+
+
+def _contracted(equation, *operands):
+    """The rule of einsum: multilinear, an axis of variables goes with each operand in turn."""
+    operands = operands[0] if len(operands) == 1 and isinstance(operands[0], (list, tuple)) else operands
+    terms, arrow, result = equation.replace(" ", "").partition("->")
+    if not arrow:
+        return _by_torch(torch.einsum, (equation, *operands), {})
+    letter = next(c for c in "zyxwvutsrqponmlkjihgfedcba" if c not in equation)
+    values, total = [*map(_values, operands)], 0.0
+    for place, operand in enumerate(operands):
+        if isinstance(operand, MovingTensor):
+            each = [*terms.split(",")]
+            each[place] = letter + each[place]
+            moved = [*values[:place], operand.tangents, *values[place + 1 :]]
+            total = total + torch.einsum(f"{','.join(each)}->{letter}{result}", *moved)
+    return with_tangents(torch.einsum(equation, *values), total)
+
+
+def _absolute(x):
+    return _by_torch(torch.abs, (x,), {}) if x.tangents.is_complex() else _through(torch.abs, _UNARY["abs"])(x)
+
+
+def _transformed(function: Callable) -> Callable:
+    """The rule of a Fourier transform of torch.fft, linear, over axes counted from the last by default."""
+
+    def rule(x, n=None, dim=None, norm=None, **options):
+        last = "s" if function.__name__.endswith(("2", "n")) else "n"
+        axes = {} if dim is None else {"dim": dim}
+        if dim is None and function.__name__.endswith("n"):
+            axes = {"dim": tuple(range(-(x.tangents.dim() - 1), 0))}
+        moved = {key: _shifted(value) for key, value in axes.items()}
+        options |= {last: options.pop("s", n), "norm": norm}
+        return with_tangents(
+            function(x.as_subclass(Tensor), **options, **axes), function(x.tangents, **options, **moved)
+        )
+
+    return rule
+
+
+def _through(function: Callable, slope: Callable[[Tensor, Tensor], object]) -> Callable:
+    """The rule of a function of one tensor; slope(x, y): its derivative."""
+
+    def rule(x, **options):
+        value = function(x, **options)
+        return with_tangents(value, x.tangents * slope(_values(x), value))
+
+    return rule
+
+
+def _clamped(x, min=None, max=None):
+    value = torch.clamp(x, min, max)
+    if isinstance(min, MovingTensor) or isinstance(max, MovingTensor):
+        return _by_torch(torch.clamp, (x, min, max), {})
+    return with_tangents(value, x.tangents * (value == x))
+
+
+def _shifted(dim):
+    """Axes of values as axes of tangents."""
+    if isinstance(dim, (tuple, list)):
+        return type(dim)(map(_shifted, dim))
+    return dim + 1 if dim >= 0 else dim
+
+
+def _linear(function: Callable, *, axes: Sequence[str] = ("dim",), first: int | None = None) -> Callable:
+    """The rule of a linear function of one tensor: the same of the tangents, whose axes are moved by one.
+
+    axes: names of options that are axes; first: the place of the first argument that is one, all behind it are, too.
+    """
+
+    def rule(x, *arguments, **options):
+        value = function(x, *arguments, **options)
+        shifted = arguments if first is None else (*arguments[:first], *map(_shifted, arguments[first:]))
+        moved = {name: _shifted(option) if name in axes else option for name, option in options.items()}
+        tangents = function(x.tangents, *shifted, **moved)
+        if isinstance(value, (tuple, list)):
+            return tuple(map(with_tangents, value, tangents))
+        return with_tangents(value, tangents)
+
+    return rule
+
+
+def _shape_of(arguments) -> tuple[int, ...]:
+    return tuple(arguments[0]) if len(arguments) == 1 and not isinstance(arguments[0], int) else arguments
+
+
+def _reshape(x, *shape, **options):
+    value = x.reshape(*shape, **options)
+    return with_tangents(value, x.tangents.reshape(len(x.tangents), *value.shape))
+
+
+def _expand(x, *shape, **options):
+    value = x.expand(*shape, **options)
+    return with_tangents(value, _full(x.tangents, value))
+
+
+def _flipped(x, dims):
+    return with_tangents(x.flip(dims), x.tangents.flip(_shifted(dims)))
+
+
+def _flatten(x, start_dim=0, end_dim=-1):
+    value = x.flatten(start_dim, end_dim)
+    return with_tangents(value, x.tangents.reshape(len(x.tangents), *value.shape))
+
+
+def _unbind(x, dim=0):
+    values, tangents = x.unbind(dim), x.tangents.unbind(_shifted(dim))
+    return tuple(map(with_tangents, values, tangents))
+
+
+def _sum_over(x, dim=None, keepdim=False, *, dtype=None):
+    value = x.sum(dtype=dtype) if dim is None else x.sum(dim, keepdim, dtype=dtype)
+    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
+    dim = tuple(range(x.dim())) if len(dim) == 0 else dim
+    moved = x.tangents if x.dim() == 0 else x.tangents.sum(_shifted(dim), keepdim, dtype=dtype)
+    return with_tangents(value, moved)
+
+
+def _mean_over(x, dim=None, keepdim=False, *, dtype=None):
+    value = x.mean(dtype=dtype) if dim is None else x.mean(dim, keepdim, dtype=dtype)
+    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
+    moved = x.tangents if x.dim() == 0 else x.tangents.mean(_shifted(dim), keepdim, dtype=dtype)
+    return with_tangents(value, moved)
+
+
+def _cumulated(x, dim, *, dtype=None):
+    return with_tangents(x.cumsum(dim, dtype=dtype), x.tangents.cumsum(_shifted(dim), dtype=dtype))
+
+
+def _joined(function: Callable) -> Callable:
+    """The rule of `stack` and `cat`."""
+
+    def rule(tensors, dim=0):
+        tensors = list(tensors)
+        value = function(tensors, dim)
+        count = next(len(x.tangents) for x in tensors if isinstance(x, MovingTensor))
+        return with_tangents(value, function([tangents_of(x, count) for x in tensors], _shifted(dim)))
+
+    return rule
+
+
+def _broadcast(*tensors):
+    tensors = tensors[0] if len(tensors) == 1 and not isinstance(tensors[0], Tensor) else tensors
+    values = torch.broadcast_tensors(*tensors)
+    return tuple(
+        with_tangents(value, _full(x.tangents, value)) if isinstance(x, MovingTensor) else _values(value)
+        for x, value in zip(tensors, values, strict=True)
+    )
+
+
+def _entries(x, place):
+    if not isinstance(x, MovingTensor):
+        return _values(x[_values(place)])
+    place = place if isinstance(place, tuple) else (place,)
+    return with_tangents(x[place], x.tangents[(slice(None), *place)])
+
+
+def _converted(x, *arguments, **options):
+    value = x.to(*arguments, **options)
+    if not _is_continuous(value):
+        return value
+    return with_tangents(value, x.tangents.to(dtype=value.dtype, device=value.device))
+
+
+def _copied(x, dim, index, source):
+    """The rule of index_copy."""
+    value = torch.index_copy(x, dim, index, source)
+    count = next(len(part.tangents) for part in (x, source) if isinstance(part, MovingTensor))
+    moved = torch.index_copy(tangents_of(x, count), _shifted(dim), index, tangents_of(source, count))
+    return with_tangents(value, moved)
+
+
+def _gathered(x, dim, index):
+    if not isinstance(x, MovingTensor):
+        return torch.gather(x, dim, _values(index))
+    value = torch.gather(x, dim, index)
+    places = index.expand(len(x.tangents), *index.shape)
+    return with_tangents(value, torch.gather(x.tangents, _shifted(dim), places))
+
+
+def _chosen_along(function: Callable) -> Callable:
+    """The rule of amax and amin over axes: the mean of the derivatives of all entries equal to it, as in torch."""
+
+    def rule(x, dim=(), keepdim=False):
+        value = function(x, dim, keepdim)
+        dim = tuple(range(x.dim())) if dim == () else (dim,) if isinstance(dim, int) else tuple(dim)
+        kept = function(x, dim, True)
+        is_it = (_values(x) == kept).to(value.dtype)
+        share = is_it / is_it.sum(dim, True)
+        return with_tangents(value, (x.tangents * share).sum(_shifted(dim), keepdim) if x.dim() else x.tangents)
+
+    return rule
+
+
+def _chosen(function: Callable) -> Callable:
+    """The rule of max and min: of one tensor, along an axis, or of two tensors."""
+
+    def rule(x, *arguments, **options):
+        if not arguments and not options:
+            return _chosen_along(torch.amax if function is torch.max else torch.amin)(x)
+        if arguments and isinstance(arguments[0], Tensor):
+            return _extreme(torch.maximum if function is torch.max else torch.minimum)(x, arguments[0])
+        result = function(x, *arguments, **options)
+        dim = options.get("dim", arguments[0] if arguments else None)
+        keepdim = options.get("keepdim", arguments[1] if len(arguments) > 1 else False)
+        places = result.indices if keepdim else result.indices.unsqueeze(dim)
+        tangents = torch.gather(x.tangents, _shifted(dim), places.expand(len(x.tangents), *places.shape))
+        return type(result)(
+            (with_tangents(result.values, tangents if keepdim else tangents.squeeze(_shifted(dim))), result.indices)
+        )
+
+    return rule
+
+
+def _norm(x, ord=2, dim=None, keepdim=False, **options):
+    if ord not in (2, None) or dim is None:
+        return _by_torch(torch.linalg.vector_norm, (x, ord, dim, keepdim), options)
+    length = torch.linalg.vector_norm(x, 2, dim, True)
+    safe = torch.where(length == 0, torch.ones_like(length), length)
+    dim = (dim,) if isinstance(dim, int) else tuple(dim)
+    moved = (x.tangents * (x / safe)).sum(_shifted(dim), keepdim)
+    return with_tangents(torch.linalg.vector_norm(x, 2, dim, keepdim), moved)
+
+
+def _product(a, b):
+    """a @ b of matrices, or of batches of them."""
+    value = a @ b
+    if a.dim() < 2 or b.dim() < 2:
+        return _by_torch(torch.matmul, (a, b), {})
+    total = 0.0
+    if isinstance(a, MovingTensor):
+        total = total + _under(a.tangents, value.dim()) @ _values(b)
+    if isinstance(b, MovingTensor):
+        total = total + _values(a) @ _under(b.tangents, value.dim())
+    return with_tangents(value, total)
+
+
+def _by_torch(function: Callable, arguments: tuple, options: dict):
+    """By torch's forward derivatives, one for each variable; of functions without derivatives their values alone."""
+    name = getattr(function, "__name__", "")
+    if (name.endswith("_") and not name.endswith("__")) or name in ("__setitem__", "__set__"):
+        raise NotImplementedError(f"{name} changes a tensor in place, which then would lose derivatives by variables")
+    leaves, form = pytree.tree_flatten((list(arguments), options))
+    result = _values(function(*arguments, **options))
+    floats = [leaf for leaf in pytree.tree_leaves(result) if isinstance(leaf, Tensor) and _is_continuous(leaf)]
+    if not floats or getattr(function, "__name__", "") in ("__get__", "__set__"):
+        return result
+    if ((name := getattr(function, "__name__", "")).endswith("_") and not name.endswith("__")) or name == "__setitem__":
+        raise NotImplementedError(f"{name} changes a tensor in place, which has no derivatives by variables there")
+    moving = [place for place, leaf in enumerate(leaves) if isinstance(leaf, MovingTensor)]
+    if not moving or _stopped.get() or not torch.is_grad_enabled():
+        return result
+
+    slopes = []
+    for k in range(len(leaves[moving[0]].tangents)):
+        with forward_ad.dual_level():
+            given = [*map(_values, leaves)]
+            for place in moving:
+                given[place] = forward_ad.make_dual(given[place], leaves[place].tangents[k].contiguous())
+            positional, named = pytree.tree_unflatten(given, form)
+            slopes.append(pytree.tree_map_only(Tensor, _forward_derivative, function(*positional, **named)))
+    flat, tree = pytree.tree_flatten(result)
+    columns = zip(*map(pytree.tree_leaves, slopes), strict=True)
+    parts = [
+        with_tangents(value, torch.stack(column)) if _is_continuous(value) else value
+        for value, column in zip(flat, columns, strict=True)
+    ]
+    return pytree.tree_unflatten(parts, tree)
+
+
+def _is_continuous(number: Tensor) -> bool:
+    return number.is_floating_point() or number.is_complex()
+
+
+def _forward_derivative(number: Tensor) -> Tensor:
+    """The forward derivative that a tensor carries."""
+    tangent = forward_ad.unpack_dual(number).tangent
+    return torch.zeros_like(number) if tangent is None else tangent.clone()
+
+
+def applied(function: type[torch.autograd.Function], *arguments, slopes: Callable | None = None):
+    """A function with derivatives of its own, which torch's functions do not see.
+
+    slopes(*arguments): of one that acts entry by entry, its derivatives by the first arguments; else it has a `jvp`.
+    """
+    if not any(isinstance(argument, MovingTensor) for argument in arguments):
+        return function.apply(*arguments)
+    with plain_functions():
+        if slopes is None or not torch.is_grad_enabled():
+            return _by_torch(function.apply, arguments, {})
+        values = [*map(_values, arguments)]
+        return _sum(function.apply(*values), [*zip(arguments, slopes(*values), strict=False)])
+
+
+def _no_array(x, *arguments, **options):
+    raise RuntimeError("a tensor with derivatives by variables has no array: its numbers are those of x.detach()")
+
+
+def _constant(function: Callable) -> Callable:
+    """The rule of functions whose result does not depend on the entries, or is outside of the graph."""
+    return lambda *arguments, **options: _values(function(*arguments, **options))
+
+
+_UNARY = {
+    "sqrt": lambda x, y: 0.5 / y,
+    "rsqrt": lambda x, y: -0.5 * y / x,
+    "square": lambda x, y: 2 * x,
+    "reciprocal": lambda x, y: -y * y,
+    "neg": lambda x, y: -1.0,
+    "abs": lambda x, y: torch.sign(x),
+    "exp": lambda x, y: y,
+    "log": lambda x, y: 1 / x,
+    "log10": lambda x, y: 1 / (x * math.log(10)),
+    "sin": lambda x, y: torch.cos(x),
+    "cos": lambda x, y: -torch.sin(x),
+    "tan": lambda x, y: 1 + y * y,
+    "asin": lambda x, y: torch.rsqrt(1 - x * x),
+    "acos": lambda x, y: -torch.rsqrt(1 - x * x),
+    "atan": lambda x, y: 1 / (1 + x * x),
+    "sinh": lambda x, y: torch.cosh(x),
+    "cosh": lambda x, y: torch.sinh(x),
+    "tanh": lambda x, y: 1 - y * y,
+    "erf": lambda x, y: 2 / math.sqrt(math.pi) * torch.exp(-x * x),
+    "deg2rad": lambda x, y: math.pi / 180,
+    "rad2deg": lambda x, y: 180 / math.pi,
+}
+
+_MOVES = {
+    "unsqueeze": 0,
+    "squeeze": 0,
+    "movedim": 0,
+    "transpose": 0,
+    "swapaxes": 0,
+    "narrow": 0,
+    "select": 0,
+    "diff": 1,
+    "roll": 1,
+}
+
+#: Rules by function of torch: what a function returns with its tangents.
+RULES: dict[Callable, Callable] = {}
+
+
+def _row(names: Sequence[str], rule: Callable | None, *, of_first: bool = False) -> None:
+    """A rule for a function of torch, of tensors and of the operators; of_first: of its first argument alone."""
+    for name in names:
+        for home in (torch, Tensor, torch.linalg):
+            if (function := getattr(home, name, None)) is not None:
+                RULES[function] = _of_first(function, rule) if of_first else rule
+
+
+def _of_first(function: Callable, rule: Callable) -> Callable:
+    """The rule of a function that is differentiable by its first argument; others only tell sizes and places."""
+
+    def chosen(x, *arguments, **options):
+        if isinstance(x, MovingTensor):
+            return rule(x, *map(_values, arguments), **options)
+        return _values(function(x, *map(_values, arguments), **options))
+
+    return chosen
+
+
+for _name, _slope in _UNARY.items():
+    _row([_name], _through(getattr(torch, _name), _slope), of_first=True)
+for _name, _first in _MOVES.items():
+    _row(
+        [_name],
+        _linear(getattr(torch, _name), first=_first, axes=("dim", "dim0", "dim1", "source", "destination", "dims")),
+    )
+_row(["__neg__"], _through(torch.neg, _UNARY["neg"]), of_first=True)
+_row(["abs", "__abs__", "absolute"], _absolute, of_first=True)
+_row(["add", "__add__", "__radd__"], _add)
+_row(["sub", "subtract", "__sub__"], _subtract)
+_row(["__rsub__", "rsub"], lambda a, b: _subtract(b, a) if isinstance(b, Tensor) else _sum(b - a, ((a, -1.0),)))
+_row(["mul", "multiply", "__mul__", "__rmul__"], _multiply)
+_row(["div", "divide", "true_divide", "__truediv__", "__div__"], _divide)
+_row(["__rtruediv__", "__rdiv__"], lambda a, b: _divide(b, a))
+_row(["pow", "__pow__"], _power)
+_row(["flip"], lambda x, *dims: _flipped(x, _shape_of(dims)), of_first=True)
+_row(["__rpow__"], lambda a, b: _power(b, a))
+_row(["addcmul"], _add_product)
+_row(["atan2", "arctan2"], _angle)
+_row(["hypot"], _length_of_two)
+_row(["maximum"], _extreme(torch.maximum))
+_row(["minimum"], _extreme(torch.minimum))
+_row(["max"], _chosen(torch.max))
+_row(["min"], _chosen(torch.min))
+_row(["amax"], _chosen_along(torch.amax), of_first=True)
+_row(["amin"], _chosen_along(torch.amin), of_first=True)
+_row(["clamp", "clip"], _clamped)
+_row(["clamp_min"], lambda x, min: _clamped(x, min=min))
+_row(["clamp_max"], lambda x, max: _clamped(x, max=max))
+_row(["reshape", "view"], _reshape, of_first=True)
+_row(["expand"], _expand, of_first=True)
+_row(["expand_as"], lambda x, other: _expand(x, other.shape) if isinstance(x, MovingTensor) else x.expand(other.shape))
+_row(["flatten"], _flatten, of_first=True)
+_row(["unbind"], _unbind, of_first=True)
+_row(["stack"], _joined(torch.stack))
+_row(["cat", "concatenate", "concat"], _joined(torch.cat))
+_row(["broadcast_tensors"], _broadcast)
+_row(["sum"], _sum_over, of_first=True)
+_row(["mean"], _mean_over, of_first=True)
+_row(["cumsum"], _cumulated, of_first=True)
+_row(["gather"], _gathered)
+_row(["index_copy"], _copied)
+_row(["vector_norm"], _norm)
+_row(["matmul", "__matmul__"], _product)
+_row(["__getitem__"], _entries)
+_row(["to"], _converted, of_first=True)
+_row(["double"], lambda x: _converted(x, torch.float64), of_first=True)
+_row(["float"], lambda x: _converted(x, torch.float32), of_first=True)
+_row(["clone", "contiguous"], lambda x, **options: with_tangents(x.clone(), x.tangents))
+_row(["detach"], lambda x: x.as_subclass(Tensor).detach())
+_row(
+    [
+        *(
+            "gt",
+            "lt",
+            "ge",
+            "le",
+            "eq",
+            "ne",
+            "__gt__",
+            "__lt__",
+            "__ge__",
+            "__le__",
+            "__eq__",
+            "__ne__",
+            "greater",
+            "less",
+        ),
+        *("isfinite", "isnan", "isinf", "isclose", "allclose", "equal", "any", "all", "argmax", "argmin", "argsort"),
+        *("item", "tolist", "__bool__", "__float__", "__int__", "__len__", "numel", "nelement", "size", "stride"),
+        *("is_contiguous", "element_size", "is_complex", "searchsorted", "bucketize", "nonzero"),
+        "zeros_like",
+        "ones_like",
+        "full_like",
+        "empty_like",
+        "new_zeros",
+        "new_ones",
+        "new_tensor",
+        "new_full",
+        "new_empty",
+        "sign",
+        "floor",
+        "ceil",
+        "round",
+        "trunc",
+        "heaviside",
+    ],
+    None,
+)
+for _function in [function for function, rule in RULES.items() if rule is None]:
+    RULES[_function] = _constant(_function)
+for _property in ("requires_grad", "grad_fn", "is_leaf", "is_meta", "is_cuda", "layout", "is_sparse", "is_quantized"):
+    RULES[getattr(Tensor, _property).__get__] = _constant(getattr(Tensor, _property).__get__)
+for _name in ("fft", "ifft", "rfft", "irfft", "fft2", "ifft2", "rfft2", "irfft2", "fftn", "ifftn"):
+    RULES[getattr(torch.fft, _name)] = _of_first(getattr(torch.fft, _name), _transformed(getattr(torch.fft, _name)))
+for _name in ("fftshift", "ifftshift"):
+    _function = getattr(torch.fft, _name)
+    RULES[_function] = _of_first(_function, _linear(_function, axes=("dim",), first=0))
+for _function in (
+    torch.real,
+    torch.imag,
+    torch.conj,
+    Tensor.real.__get__,
+    Tensor.imag.__get__,
+    Tensor.conj,
+    torch.view_as_real,
+    torch.view_as_complex,
+):
+    RULES[_function] = _linear(_function)
+RULES[torch.complex], RULES[torch.einsum] = _complex, _contracted
+RULES[Tensor.data.__get__] = _constant(Tensor.data.__get__)
+RULES[Tensor.numpy] = RULES[Tensor.__array__] = RULES[Tensor.data_ptr] = _no_array
+RULES[torch.functional.broadcast_tensors] = _broadcast
+RULES[torch.where] = _where
+RULES[Tensor.where] = lambda x, condition, other: _where(condition, x, other)
+RULES[Tensor.unflatten] = lambda x, dim, sizes: _reshape(x, x.as_subclass(Tensor).unflatten(dim, sizes).shape)
+RULES[Tensor.T.__get__] = lambda x: with_tangents(
+    x.as_subclass(Tensor).T,
+    x.tangents.movedim(tuple(range(1, x.tangents.dim())), tuple(range(x.tangents.dim() - 1, 0, -1))),
+)
+RULES[Tensor.mT.__get__] = lambda x: with_tangents(x.as_subclass(Tensor).mT, x.tangents.mT)

@@ -1,0 +1,175 @@
+"""Derivatives by the design variables of a lens, of rays, merit functions, and any function of a lens, in one pass.
+
+The lens is made of tensors that carry their derivatives by all variables (`maths.tangents`), those that solves and
+pickups bring about included, and the quantity is computed from it once, as without derivatives: by the compiled trace
+where that carries the rays, else by torch. Nothing is held fixed: rays are launched and aimed anew with every variable.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import Dual, value
+from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.tangents import MovingTensor, tangents_of, value_of
+from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
+from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.system.lens import Lens, aligned, wavelengths_of
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.rays import Rays
+from raytrace.tracing.launch import rays
+from raytrace.tracing.trace import trace_lens
+from raytrace.words import did_you_mean, named_value
+
+
+@value
+class Jacobian(Result):
+    """A quantity of a lens and its derivatives by n design variables.
+
+    value: (...) of the quantity; derivatives: (n, ...), in the unit of the quantity per unit of the variable (mm of
+    thicknesses and decentres, 1/mm of curvatures, degrees of tilts); variables: their names, as thickness_6; numbers:
+    (n,) their values. quantity: its name.
+    """
+
+    value: Tensor
+    derivatives: Tensor
+    variables: tuple[str, ...]
+    numbers: Tensor
+    quantity: str
+
+    COLUMNS = (
+        Column("variable", form="<"),
+        Column("number", form=".9g"),
+        Column("rms", form=".6g", heading="RMS of the derivatives"),
+        Column("largest", form=".6g", heading="largest derivative"),
+    )
+
+    def columns(self) -> dict[str, Tensor]:
+        each = self.derivatives.detach().reshape(len(self.variables), -1)
+        return {
+            "variable": torch.arange(len(self.variables)),
+            "number": self.numbers,
+            "rms": each.square().mean(-1).sqrt(),
+            "largest": each.abs().amax(-1),
+        }
+
+    def words(self) -> dict[str, Sequence[str]]:
+        return {"variable": self.variables}
+
+    def tables(self) -> list[Table]:
+        columns = {**self.columns(), "variable": [*self.variables]}
+        shape = " × ".join(map(str, self.value.shape)) or "one number"
+        return [Table(columns, [f"derivatives of {self.quantity} ({shape}) by {len(self.variables)} variables"])]
+
+    def document(self) -> dict:
+        return {
+            "analysis": "jacobian",
+            "quantity": self.quantity,
+            "variables": [*self.variables],
+            "numbers": self.numbers.tolist(),
+            "value": self.value.detach().tolist(),
+            "derivatives": self.derivatives.detach().tolist(),
+        }
+
+
+def _landing_points(end: Rays) -> Tensor:
+    return end.position[:2]
+
+
+def _directions(end: Rays) -> Tensor:
+    return end.direction
+
+
+def _paths(end: Rays) -> Tensor:
+    return end.opl
+
+
+#: Quantities of rays behind the lens, by the name of `of`.
+OF_RAYS: dict[str, Callable[[Rays], Tensor]] = {
+    "landing points": _landing_points,
+    "directions": _directions,
+    "paths": _paths,
+}
+
+
+def jacobian(
+    lens: Lens,
+    vary: str | Sequence[str | Vary] | None = None,
+    *,
+    of: str | Callable[[Lens], Tensor] = "landing points",
+    fields: Tensor | Sequence | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    pupil: Tensor | tuple[Tensor, Tensor] | None = None,
+    merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
+) -> Jacobian:
+    """A quantity of a lens and its derivatives by all design variables, in one pass.
+
+    vary: variables, pickups and solves, as of `optimize`; by default those of the file. of: "landing points" (2, F, W,
+    P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm, less the axial ray's, of the
+    rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,) of a merit function as of
+    `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor (...), as
+    lambda lens: rt.spot(lens).whole.rms_radius. Derivatives are exact to rounding; those of failed rays are 0. Raises
+    BadVariables, TypeError, ValueError.
+    """
+    free = freedom(lens, vary)
+    model = Model(free.lens, free.variables, free.solves)
+    if of == "merit":
+        quantity, derivatives = _of_merit(model, lens, merit)
+    else:
+        if callable(of):
+            function = of
+        elif of in OF_RAYS:
+            function = _of_rays(OF_RAYS[of], fields, wavelengths, pupil)
+        else:
+            known = (*OF_RAYS, "merit")
+            raise ValueError(
+                f"jacobian: `of` is {named_value(of)}; expected {', '.join(known)} or a function of a lens"
+                + (did_you_mean(of, known) if isinstance(of, str) else "")
+            )
+        quantity, derivatives = derivatives_of(function, moving_lens(model), len(model.variables))
+    return Jacobian(
+        quantity,
+        derivatives,
+        tuple(map(name_of, model.variables)),
+        torch.as_tensor(model.start),
+        of if isinstance(of, str) else getattr(of, "__name__", "a function").replace("<lambda>", "a function"),
+    )
+
+
+def moving_lens(model: Model, variables: np.ndarray | None = None) -> Lens:
+    """The lens at variables (n,), by default its own, whose numbers carry their derivatives by all of them."""
+    at = model.start if variables is None else np.asarray(variables, dtype=float)
+    view = model.views[model.lens.current_configuration - 1]
+    return view.state(Dual(at, np.eye(len(at)))).moving_lens(clips=True)
+
+
+def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:
+    """The value (...) of a function of a lens that moves, and its derivatives (n, ...). Raises TypeError."""
+    with torch.enable_grad():
+        number = function(lens)
+    if not isinstance(number, Tensor):
+        raise TypeError(
+            f"jacobian: `of` returns {named_value(number)}; expected a tensor, as lambda lens: rt.spot(lens).whole.rms_radius"
+        )
+    if not isinstance(number, MovingTensor):
+        return number.detach(), number.new_zeros(count, *number.shape)
+    return value_of(number).detach(), tangents_of(number, count).detach()
+
+
+def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> Callable[[Lens], Tensor]:
+    def function(lens: Lens) -> Tensor:
+        colours = wavelengths_of(lens, wavelengths)
+        launched = rays(lens, fields=fields, pupil=pupil, wavelengths=colours)
+        return quantity(trace_lens(aligned(lens, 3), launched, colours[:, None]))
+
+    return function
+
+
+def _of_merit(model: Model, lens: Lens, merit) -> tuple[Tensor, Tensor]:
+    """The residuals (m,) of a merit function, whose squares sum up to M², and their derivatives (n, m)."""
+    function = merit_for(lens, merit)
+    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
+    evaluated = Evaluation(model, function.rows, **options)(model.start, derivatives=True)
+    return torch.from_numpy(evaluated.residuals), torch.from_numpy(evaluated.jacobian.T.copy())

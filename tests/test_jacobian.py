@@ -1,0 +1,152 @@
+"""`rt.jacobian`: derivatives by design variables against differences, and against the gradients of torch's graph."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+import raytrace as rt
+from raytrace.optimization.jacobian import OF_RAYS
+from raytrace.optimization.variables import Model, freedom
+from raytrace.system.lens import aligned
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.trace import trace_lens
+
+FIELDS, PUPIL = [0.0, 6.0], rt.gauss_rings(2)
+
+
+def model_of(lens: rt.Lens, vary: str) -> Model:
+    free = freedom(lens, vary)
+    return Model(free.lens, free.variables, free.solves)
+
+
+def rays_behind(lens: rt.Lens, name: str) -> torch.Tensor:
+    launched = rt.rays(lens, fields=FIELDS, pupil=PUPIL)
+    return OF_RAYS[name](trace_lens(aligned(lens, 3), launched, lens.wavelengths[:, None]))
+
+
+def assert_differences(of, lens: rt.Lens, vary: str, derivatives: torch.Tensor, close: float = 1e-5) -> None:
+    """Central differences of a function of the lens by every variable, relative to the largest of each."""
+    model = model_of(lens, vary)
+    for number, slope in enumerate(derivatives):
+        step = np.zeros(len(model.start))
+        step[number] = 1e-6 * max(abs(model.start[number]), 0.1)
+        ends = [of(model.lens_at(model.start + sign * step)) for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step[number])
+        scale = float(derivatives.abs().max()) * 1e-6 + float(slope.abs().max())
+        assert float((difference - slope).abs().max()) <= close * scale
+
+
+def assert_gradients(of, lens: rt.Lens, vary: str, close: float = 1e-11) -> None:
+    """The gradient of a weighted sum of a function by torch's graph, and the same sum of the Jacobian."""
+    found = rt.jacobian(lens, vary, of=of)
+    view = model_of(lens, vary).views[lens.current_configuration - 1].clipping
+    leaves, moved = view.leaves()
+    value = of(moved)
+    weights = torch.rand(value.shape, generator=torch.Generator().manual_seed(4), dtype=value.dtype)
+    by = torch.autograd.grad((weights * value).sum(), list(leaves.values()), allow_unused=True)
+    expected = torch.stack([torch.zeros((), dtype=value.dtype) if g is None else g for g in by])
+    assert_close(found.value, value.detach(), rtol=1e-12, atol=1e-14)
+    sums = (weights * found.derivatives).reshape(len(by), -1).sum(-1)
+    assert_close(sums, expected, rtol=close, atol=close * float(expected.abs().max()))
+
+
+COOKE, GAUSS = rt.read_lens("cooke_triplet"), rt.read_lens("double_gauss")
+ASPHERE = COOKE.replace(1, conic=-0.4, coefficients=[0.0, 1e-6])
+
+KINDS = {
+    "curvature and thickness": (COOKE, "curvature thickness"),
+    "conic and asphere": (ASPHERE, "conic:1 a4:1 sensor"),
+    "tilt and decentre": (COOKE, "tilt:3 decentre:4"),
+    "glass and aperture": (COOKE, "index:1,3 abbe_number:1 aperture"),
+    "solve and pickup": (COOKE, "curvature:1-3 curvature:6=f_number(6) thickness:3=2*thickness:1"),
+    "real aiming": (GAUSS.at(ray_aiming="real"), "curvature:1-3 thickness:4,5"),
+    "real aiming of a tilted lens": (GAUSS.at(ray_aiming="real"), "tilt:2 decentre:9 curvature:1"),
+    "clipped": (
+        COOKE.replace(1, semi_diameter=7.0, apertures=(rt.Aperture("circular", (0.0, 7.0)),)),
+        "curvature thickness",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OF_RAYS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_of_rays_are_their_differences(kind, name):
+    lens, vary = KINDS[kind]
+    found = rt.jacobian(lens, vary, of=name, fields=FIELDS, pupil=PUPIL)
+    model = model_of(lens, vary)  # with solves as they come out, and model glasses
+    assert_close(found.value, rays_behind(model.lens_at(model.start), name), rtol=0, atol=1e-12)
+    assert_differences(lambda lens: rays_behind(lens, name), lens, vary, found.derivatives)
+
+
+@pytest.mark.parametrize("kind", ["curvature and thickness", "real aiming", "tilt and decentre"])
+def test_both_engines_have_the_same_derivatives(kind):
+    lens, vary = KINDS[kind]
+    each = []
+    for engine in ("eager", "compiled"):
+        with trace_engine(engine):
+            each.append(rt.jacobian(lens, vary, fields=FIELDS, pupil=PUPIL).derivatives)
+    assert_close(*each, rtol=1e-10, atol=1e-10)
+
+
+ANALYSES = {
+    "first order": lambda lens: rt.first_order(lens).effective_focal_length,
+    "spot": lambda lens: rt.spot(lens).whole.rms_radius,
+    "distortion": lambda lens: rt.distortion(lens, samples=3).f_tan,
+    "field curvature": lambda lens: rt.field_curvature(lens, samples=3).tangential,
+    "Seidel sums": lambda lens: rt.seidel(lens).contributions,
+    "paraxial kernel": lambda lens: rt.psf(lens, "paraxial", fields=[0.0], size=11).kernel,
+    "Gaussian kernel": lambda lens: rt.psf(lens, "gaussian", fields=[5.0], size=11).kernel,
+    "geometric MTF": lambda lens: rt.mtf(lens, frequencies=[20.0], geometric=True).tangential,
+    "focus": lambda lens: rt.focus(lens).sensor_distance,
+    "a number of the lens": lambda lens: 2 * lens.surfaces[1].curvature,
+}
+SLOW = {
+    "wavefront": lambda lens: rt.wavefront(lens, fields=[5.0]).opd,
+    "Strehl ratio": lambda lens: rt.wavefront(lens, fields=[5.0]).strehl,
+    "DRT kernel": lambda lens: rt.psf(lens, "drt", fields=[5.0], size=11).kernel,
+    "wave kernel": lambda lens: rt.psf(lens, "wave", fields=[5.0], size=11).kernel,
+    "Fourier kernel": lambda lens: rt.psf(lens, "fourier", fields=[0.0], size=11).kernel,
+    "MTF": lambda lens: rt.mtf(lens, fields=[5.0], frequencies=[20.0]).tangential,
+    "relative illumination": lambda lens: rt.relative_illumination(lens, samples=3).illumination,
+}
+
+
+@pytest.mark.parametrize("name", [*ANALYSES, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_derivatives_of_an_analysis_are_its_gradients(name):
+    of = (ANALYSES | SLOW)[name]
+    assert_gradients(lambda lens: of(lens).nan_to_num(), COOKE, "curvature:1,2,6 thickness:6")
+
+
+def test_residuals_of_a_merit_function_have_the_jacobian_of_the_optimiser():
+    found = rt.jacobian(COOKE, "curvature", of="merit", merit="spot")
+    assert_close(found.value.norm(), rt.evaluate(COOKE, merit="spot").merit, rtol=1e-12, atol=0)
+    step = 1e-7
+    moved = [
+        rt.jacobian(
+            COOKE.replace(1, curvature=COOKE.surfaces[1].curvature + sign * step), "curvature", of="merit", merit="spot"
+        )
+        for sign in (1, -1)
+    ]
+    difference = (moved[0].value - moved[1].value) / (2 * step)
+    assert_close(found.derivatives[0], difference, rtol=1e-4, atol=1e-4 * float(difference.abs().max()))
+
+
+def test_the_result_prints_and_is_a_document():
+    found = rt.jacobian(COOKE, "curvature:1 sensor", fields=FIELDS)
+    assert found.variables == ("curvature_1", "thickness_7")
+    assert found.derivatives.shape == (2, 2, 2, 3, 144)
+    text = str(found)
+    assert "curvature_1" in text
+    assert "landing points" in text
+    assert found.to_frame()["variable"].tolist() == ["curvature_1", "thickness_7"]
+    assert np.asarray(found.document()["derivatives"]).shape == (2, 2, 2, 3, 144)
+
+
+def test_wrong_quantities_are_refused():
+    with pytest.raises(ValueError, match="did you mean directions"):
+        rt.jacobian(COOKE, "curvature", of="direction")
+    with pytest.raises(TypeError, match="expected a tensor"):
+        rt.jacobian(COOKE, "curvature", of=lambda lens: 3)
+    with pytest.raises(rt.BadVariables if hasattr(rt, "BadVariables") else ValueError, match="no variables"):
+        rt.jacobian("cooke_triplet")
