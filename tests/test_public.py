@@ -361,8 +361,8 @@ def assert_alike(one, other) -> None:
         assert one == (pytest.approx(other, rel=1e-9, abs=1e-9) if isinstance(other, float) else other)
 
 
-#: Options that a command needs for a lens that has no tolerances of its own.
-NEEDED = {"tolerance": {"limits": "radius=0.1%", "trials": 20}}
+#: Options that a command needs for a lens that has no tolerances or variables of its own.
+NEEDED = {"jacobian": {"vary": "curvature:1"}, "tolerance": {"limits": "radius=0.1%", "trials": 20}}
 
 
 @pytest.mark.parametrize(

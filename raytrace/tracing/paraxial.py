@@ -237,7 +237,7 @@ def system_matrix(
     µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
     powers, gaps = _powers_and_gaps(surfaces, indices, wavelength)
-    return _matrices(powers, gaps[:-1], indices[0])[-1]
+    return _matrices(powers, gaps[:-1], indices[0], -1)[0]
 
 
 def _powers_and_gaps(surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None) -> tuple:
@@ -247,21 +247,24 @@ def _powers_and_gaps(surfaces: Sequence[Surface], indices: Sequence[Tensor], wav
     return [power(surface, before, behind, wavelength) for surface, before, behind in pairs], gaps
 
 
-def _matrices(powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor) -> list[tuple[Tensor, ...]]:
-    """(A, B, C, D) up to before each surface and at last behind the last one: `ynu` of two rays at once."""
+def _matrices(
+    powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor, *before: int
+) -> list[tuple[Tensor, ...]]:
+    """(A, B, C, D) up to before some surfaces, from 0, -1 behind the last one: `ynu` of two rays at once."""
     axes = max(number.dim() for number in (like, *powers, *gaps))
     y, one = like.new_tensor([1.0, 0.0]).reshape(2, *[1] * axes), torch.ones_like(like)
-    return [(*(one * y).unbind(0), *(one * omega).unbind(0)) for y, omega in ynu(y, y.flip(0), powers, gaps)]
+    rays = ynu(y, y.flip(0), powers, gaps)
+    return [(*(one * rays[k][0]).unbind(0), *(one * rays[k][1]).unbind(0)) for k in before]
 
 
 def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
     """The system matrices of a lens; n: signed indices (...) from the object's to that before the image."""
     surfaces, stop = lens.surfaces[1:-1], lens.stop - 1
     powers, gaps = _powers_and_gaps(surfaces, n, wavelength)
-    matrices = _matrices(powers, gaps[:-1], n[0])
     # The stop seen from the front (transfer to its vertex) and from the back.
-    _, B, _, D = _matrices(powers[stop:], gaps[stop:-1], n[0])[-1]
-    return Gaussian(*matrices[-1], matrices[stop][:2], (B, D), n[0], n[-1])
+    whole, front = _matrices(powers, gaps[:-1], n[0], -1, stop)
+    ((_, B, _, D),) = _matrices(powers[stop:], gaps[stop:-1], n[0], -1)
+    return Gaussian(*whole, front[:2], (B, D), n[0], n[-1])
 
 
 @shared

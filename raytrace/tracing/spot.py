@@ -5,7 +5,6 @@ Arrivals: where every ray of a spot meets the sensor, from which field, colour a
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
@@ -69,7 +68,7 @@ def spot_of_points(
     """
     shape = points.shape[1:]
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(shape)
-    size = max(1, _PIECE // max(1, math.prod(shape[1:])))
+    size = max(1, _PIECE // max(1, shape[1:].numel()))
     if len(shape) == 1 or shape[0] <= size:
         figures = _statistics(points, valid, weights, about)
     else:
