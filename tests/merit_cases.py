@@ -8,7 +8,7 @@ from test_seidel import SYSTEMS
 
 import raytrace as rt
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Solve, Vary
 
 LENSES = {
@@ -37,7 +37,9 @@ def model_of(name):
     inside = range(1, len(lens.surfaces) - 1)
     usual = [Vary(k, "curvature") for k in inside if lens.surfaces[k].curvature is not None]
     usual += [Vary(k, "thickness") for k in (inside, range(0, len(lens.surfaces) - 1))[is_near(name)]]
-    return Model(lens, VARY.get(name) or tuple(v for v in usual if (v.surface, v.quantity) not in solved), solves)
+    return DesignVariables(
+        lens, VARY.get(name) or tuple(v for v in usual if (v.surface, v.quantity) not in solved), solves
+    )
 
 
 def lens_of(name):

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Aperture, Surface
@@ -342,4 +342,4 @@ def vignetting_aperture(radius: float) -> tuple[Aperture, ...]:
 
 def values(lens: Lens, asked: Sequence[Row], **how) -> np.ndarray:
     """Values (R,) of rows of a merit function."""
-    return Evaluation(Model(lens), asked, **how)(np.zeros(0)).values
+    return Evaluation(DesignVariables(lens), asked, **how)(np.zeros(0)).values

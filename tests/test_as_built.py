@@ -7,7 +7,7 @@ import torch
 
 import raytrace as rt
 from raytrace.maths.numerics import Dual
-from raytrace.optimization.variables import Model, freedom
+from raytrace.optimization.variables import design_variables
 from raytrace.system.lens import with_sensor_distance
 from raytrace.tolerancing.as_built import design, hadamard
 from raytrace.tolerancing.study import moments
@@ -27,8 +27,8 @@ def cooke_in_colours():
 
 
 def states(lens, vary):
-    free = freedom(lens, vary)
-    model = Model(free.lens, free.variables, free.solves)
+    free = design_variables(lens, vary)
+    model = free
     return model.start, lambda x: model.views[0].state(x)
 
 

@@ -14,7 +14,7 @@ from raytrace.materials.glass import model_glass
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.optimize import NotReached
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 
 REFUSED = {
@@ -169,7 +169,7 @@ EDGES = {
 def test_a_surface_that_closes_before_its_edge_is_a_violation_that_points_inside(operand, sign):
     for part, conic in ((1.016, None), (1.3, None), (0.8, 1.0)):
         curvature = sign * part / 10
-        model = Model(concave(curvature, conic), (Vary(2, "curvature"),))
+        model = DesignVariables(concave(curvature, conic), (Vary(2, "curvature"),))
         evaluation = Evaluation(model, [EDGES[operand]])
         found = evaluation(model.start, derivatives=True)
         q = part**2 * (1 if conic is None else 2)
@@ -177,7 +177,7 @@ def test_a_surface_that_closes_before_its_edge_is_a_violation_that_points_inside
         slope = found.residuals[0] * found.jacobian[0, 0] * sign
         assert np.isfinite(slope)
         assert slope > 0  # less curvature, less violation
-    model = Model(concave(0.09), (Vary(2, "curvature"),))
+    model = DesignVariables(concave(0.09), (Vary(2, "curvature"),))
     assert Evaluation(model, [EDGES[operand]])(model.start).merit == 0  # where it reaches it
 
 
@@ -189,7 +189,7 @@ def test_edges_are_smooth_across_where_a_surface_closes(operand):
     )
     values = []
     for part in (0.99, 0.9999, 0.99995, 0.99997, 0.9999999, 1.00005, 1.01, 1.5):
-        model = Model(concave(part / 10), (Vary(2, "curvature"),))
+        model = DesignVariables(concave(part / 10), (Vary(2, "curvature"),))
         evaluation, x, h = Evaluation(model, [row]), model.start, 1e-9
         found = evaluation(x, derivatives=True)
         ahead, back = evaluation(x + h), evaluation(x - h)

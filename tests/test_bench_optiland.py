@@ -7,7 +7,7 @@ import torch
 from scripts import script
 
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 
 pytest.importorskip("optiland", reason="needs the extra [bench]")
 peers = script("bench_optiland")
@@ -25,7 +25,7 @@ def test_both_programs_find_the_same_merit(name, moved):
     for how in ("rays", "spots"):
         posed = peers.posed(problem.optic(), problem.rows, problem.variables, how)
         assert float(posed.sum_squared()) == pytest.approx(here, rel=1e-9)
-    rows = Evaluation(Model(problem.lens, problem.variables), problem.rows)
+    rows = Evaluation(DesignVariables(problem.lens, problem.variables), problem.rows)
     assert rows(rows.model.start).merit ** 2 == pytest.approx(here, rel=1e-9)
     assert problem.lens.optimization_data.merit == problem.rows
     assert problem.lens.optimization_data.variables == problem.variables

@@ -16,7 +16,7 @@ from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.optimize import reached
 from raytrace.optimization.problem import WORDS, BadHold, Problem, conditions_of
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Fields, is_round_about_axis
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.f_number import working_f_number
@@ -27,7 +27,7 @@ from raytrace.tracing.trace import trace_lens
 def value(lens, hold):
     (one,) = conditions_of(lens, hold)
     assert one.row.weight == 0
-    return float(Evaluation(Model(lens), [one.row])(np.zeros(0)).values[0])
+    return float(Evaluation(DesignVariables(lens), [one.row])(np.zeros(0)).values[0])
 
 
 def chief_height(lens):
@@ -152,7 +152,7 @@ ZOO = {
 def test_a_condition_reports_the_number_of_the_analysis_of_its_name(name):
     lens = ZOO[name](rt.read_lens(name))
     conditions = conditions_of(lens, ["distortion<=9%" if word == "distortion" else f"{word}<=1e9" for word in WORDS])
-    model = Model(lens, (Vary(1, "curvature"),))
+    model = DesignVariables(lens, (Vary(1, "curvature"),))
     problem = Problem(model, [Row("EFFL", target=1.0, weight=1.0)], conditions)
     numbers = {one.name: one.reached for one in reached(problem, model.start, lower=model.start, upper=model.start)}
     assert [*numbers] == [*WORDS] == [*ANALYSES]

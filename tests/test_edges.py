@@ -12,7 +12,7 @@ from problems import double_gauss, lens, number, scalar, surface, vector
 import raytrace as rt
 from raytrace.maths.numerics import to
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import SystemAperture
 from raytrace.system.optimization_data import Vary
 from raytrace.system.surface import Aperture
@@ -223,7 +223,7 @@ def test_a_merit_function_of_a_clipped_spot_has_the_derivatives_of_the_light():
     def size(glass):
         return rt.spot(glass, fields=[10.0]).rms_radius[0, 0]
 
-    model = Model(glass, (Vary(0, "aperture"), Vary(5, "thickness"), Vary(6, "thickness")))
+    model = DesignVariables(glass, (Vary(0, "aperture"), Vary(5, "thickness"), Vary(6, "thickness")))
     evaluation = Evaluation(model, [rt.Row(rt.Measure("size", size), weight=1.0)])
     found = evaluation(model.start, derivatives=True)
     expected = slopes_by_differences(evaluation, model.start, 1e-4)

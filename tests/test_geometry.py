@@ -14,7 +14,7 @@ from raytrace.imaging.variables import limits_of, violation
 from raytrace.materials.glass import MIRROR, model_glass
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.boundaries import AT_RIM
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
@@ -125,9 +125,9 @@ def test_edges_are_at_the_common_rim_for_checks_boundaries_and_training():
     assert rims(heights, ends, np.array([False, True, False, True, False, False]))[1:4].tolist() == [10.0, 7.0, 7.0]
     # Boundaries of a default merit function, of one surface each.
     rows = [Row(name, (k, k), AT_RIM, target=1.0, weight=1.0) for name, k in (("MNEG", 1), ("MNEA", 2), ("MNEG", 3))]
-    values = Evaluation(Model(made), rows)(np.zeros(0)).values
+    values = Evaluation(DesignVariables(made), rows)(np.zeros(0)).values
     assert values == pytest.approx([min(1.0, edge) for edge in (first, air, second)], rel=1e-12)
-    own = Evaluation(Model(made), [Row("ETVA", (1, 0)), Row("ETVA", (1, 0), AT_RIM)])(np.zeros(0)).values
+    own = Evaluation(DesignVariables(made), [Row("ETVA", (1, 0)), Row("ETVA", (1, 0), AT_RIM)])(np.zeros(0)).values
     assert own == pytest.approx([3.0 + sphere(-0.03, 8.0) - sphere(0.02, 10.0), first], rel=1e-12)
     # The check: glass that is thick where light passes, and crosses at its rim.
     assert 3.0 + sphere(-0.03, 8.0) - sphere(0.02, 10.0) > 1 > 0.5 > first

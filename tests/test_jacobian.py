@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 import raytrace as rt
 from raytrace.optimization.jacobian import OF_RAYS
-from raytrace.optimization.variables import Model, freedom
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system.lens import aligned
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.trace import trace_lens
@@ -15,9 +15,9 @@ from raytrace.tracing.trace import trace_lens
 FIELDS, PUPIL = [0.0, 6.0], rt.gauss_rings(2)
 
 
-def model_of(lens: rt.Lens, vary: str) -> Model:
-    free = freedom(lens, vary)
-    return Model(free.lens, free.variables, free.solves)
+def model_of(lens: rt.Lens, vary: str) -> DesignVariables:
+    free = design_variables(lens, vary)
+    return free
 
 
 def rays_behind(lens: rt.Lens, name: str) -> torch.Tensor:

@@ -10,7 +10,7 @@ import pytest
 import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 
 FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 
@@ -31,7 +31,7 @@ def cases():
 @functools.cache
 def evaluation(name: str) -> Evaluation:
     lens = read_lens(FOLDER / name)
-    model = Model(lens, lens.optimization_data.variables, lens.optimization_data.solves)
+    model = DesignVariables(lens, lens.optimization_data.variables, lens.optimization_data.solves)
     return Evaluation(model, lens.optimization_data.merit, unit=lens.optimization_data.unit)
 
 

@@ -6,7 +6,7 @@ import torch
 
 from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit, Evaluation
-from raytrace.optimization.variables import Model, freedom, with_numbers_of
+from raytrace.optimization.variables import design_variables, with_numbers_of
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.trace import trace_lens
 
@@ -31,8 +31,8 @@ def residuals(lens, rows) -> torch.Tensor:
 def test_the_jacobian_is_that_of_autograd():
     lens = read_lens("double_gauss").at(wavelengths=[0.4861327, 0.5875618, 0.6562725])
     rows = [row for row in DefaultMerit("spot", rings=6, arms=6).rows(lens) if row.operand == "TRAC"]
-    free = freedom(lens, "curvature thickness")
-    model = Model(free.lens, free.variables, free.solves)
+    free = design_variables(lens, "curvature thickness")
+    model = free
     found = Evaluation(model, rows)(model.start, derivatives=True)
     leaf = torch.tensor(model.start, requires_grad=True)
     at = {(one.surface, one.quantity): number for one, number in zip(free.variables, leaf, strict=True)}

@@ -14,7 +14,7 @@ from raytrace.analysis.seidel import OF_WAVEFRONT
 from raytrace.files import shipped
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.operand import BadRow, Conventions
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
 
@@ -39,7 +39,7 @@ def test_seidel_sums_are_those_of_the_verb(name):
 
 
 def values_of_lens(lens, rows):
-    return Evaluation(Model(lens), rows)(np.zeros(0)).values
+    return Evaluation(DesignVariables(lens), rows)(np.zeros(0)).values
 
 
 def test_spherical_aberration_of_another_wavelength():
@@ -82,7 +82,7 @@ def test_distortion_in_lengths():
     lens = lens_of("colours").at(fields=[0.0, 20.0])
     part, length, height = values_of_lens(lens, rows)
     assert height - height / (1 + part / 100) == pytest.approx(length, rel=1e-9)
-    inches = Evaluation(Model(lens), rows[1:2], unit=25.4)(np.zeros(0)).values
+    inches = Evaluation(DesignVariables(lens), rows[1:2], unit=25.4)(np.zeros(0)).values
     assert inches == pytest.approx([length / 25.4], rel=1e-12)
 
 
@@ -144,13 +144,13 @@ def test_other_readings():
     conventions = Conventions(colour="second", seidel="wavefront", f_theta="axis included")
     first, other = (
         values_of_lens(lens, rows),
-        Evaluation(Model(lens), rows, conventions=conventions)(np.zeros(0)).values,
+        Evaluation(DesignVariables(lens), rows, conventions=conventions)(np.zeros(0)).values,
     )
     assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT[:5]], rel=1e-12)
     theta = np.deg2rad(20.0) * np.arange(1, 30) / 29
     y = values_of_lens(lens, [Row("REAY", (8, 2), (0.0, k / 29, 0.0, 0.0)) for k in range(1, 30)])
     off = 100 * np.abs(y / (theta * (y @ theta) / (theta @ theta)) - 1).max()
-    computed = Evaluation(Model(lens), [Row("DISC", (0, 2))], conventions=conventions)(np.zeros(0)).values
+    computed = Evaluation(DesignVariables(lens), [Row("DISC", (0, 2))], conventions=conventions)(np.zeros(0)).values
     assert computed == pytest.approx([off], rel=1e-10)
 
 
@@ -194,7 +194,7 @@ def test_rows_that_a_lens_cannot_have(case):
     lens = LENSES["near"] if file is None else rt.read_lens(shipped("lenses") / "examples" / f"{file}.zmx")
     lens = dataclasses.replace(lens, fields=height) if case == "heights" else lens
     with pytest.raises(BadRow, match=f"^row 1 of the merit function: {message}"):
-        Evaluation(Model(lens), rows)
+        Evaluation(DesignVariables(lens), rows)
 
 
 @pytest.mark.skipif(not STORED.exists(), reason="needs the development files in ../shared")

@@ -10,7 +10,7 @@ import raytrace as rt
 from raytrace.optimization.merit import Circle, Evaluation, UnknownOperand
 from raytrace.optimization.operands.arithmetic import ARITHMETIC
 from raytrace.optimization.operands.operand import BadRow
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -145,7 +145,7 @@ def shifted():
 def test_rows_of_other_configurations():
     """The focal length of one over that of another, and what it moves by, from either."""
     zoom = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 16.0]})
-    model = Model(zoom, (Vary(1, "curvature"), Vary(6, "thickness", configuration=2, operand=0)))
+    model = DesignVariables(zoom, (Vary(1, "curvature"), Vary(6, "thickness", configuration=2, operand=0)))
     rows = [Row("CONF", (1, 0)), Row("DIVI", (3, 5), weight=1.0), Row("EFFL"), Row("CONF", (2, 0)), Row("EFFL")]
     found = Evaluation(model, rows)(model.start, derivatives=True)
     lengths = [float(rt.first_order(one).effective_focal_length) for one in zoom.configurations]

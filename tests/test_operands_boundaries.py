@@ -21,7 +21,7 @@ from raytrace.optimization.lens_state import Bundle
 from raytrace.optimization.merit import LOST, Evaluation
 from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
 from raytrace.optimization.operands.operand import Conventions, EvaluationContext, Planner
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import media
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
@@ -228,7 +228,7 @@ def rows_of(found) -> list[Row]:
 )
 def case(request):
     found = LENSES[request.param]()
-    model = Model(found, VARY[request.param])
+    model = DesignVariables(found, VARY[request.param])
     rows = rows_of(found)
     return model, rows, Evaluation(model, rows)
 
@@ -261,7 +261,7 @@ def test_derivatives_of_every_row_are_those_of_finite_differences(case):
 def test_edges_at_the_rim_are_those_of_the_sags_there(name):
     """Of every gap, by its definition, and the derivatives by differences, those of the heights included."""
     found, sizes = LENSES[name](), semi_diameters(LENSES[name]())
-    model, last = Model(found, VARY[name]), len(found.surfaces) - 1
+    model, last = DesignVariables(found, VARY[name]), len(found.surfaces) - 1
     kept, glassy = found.surfaces[0].glass, []
     for one in found.surfaces:
         kept = kept if one.is_mirror or one.is_break else one.glass
@@ -304,7 +304,7 @@ def test_edges_at_the_rim_are_those_of_the_sags_there(name):
 )
 def test_semi_diameters_are_the_same_by_either_engine(name, engine):
     found = LENSES[name]()
-    model = Model(found, VARY[name])
+    model = DesignVariables(found, VARY[name])
     row = Row("MNSD", (1, 20), target=1e3, weight=1.0)
     computed = Evaluation(model, [row])(model.start, derivatives=True)
     sizes = [s for s, own in list(zip(semi_diameters(found), found.surfaces, strict=True))[1:-1] if not own.is_break]
@@ -329,7 +329,7 @@ def test_rows_of_real_files_are_those_of_an_independent_program(name):
     oracle = {one["row"]: one for one in next(one for one in files if one["file"] == path.name)["values"]}
     found = rt.read_lens(path)
     rows = found.optimization_data.merit
-    computed = Evaluation(Model(found), rows, skip_unknown=True)(np.zeros(0)).values
+    computed = Evaluation(DesignVariables(found), rows, skip_unknown=True)(np.zeros(0)).values
     mine = [number for number, row in enumerate(rows, 1) if row.operand in BOUNDARIES and number in oracle]
     assert len(mine) >= 2
     for number in mine:
@@ -376,7 +376,7 @@ def test_semi_diameters_are_those_that_opticstudio_stored():
             found, sizes = rt.read_lens(path), stored(path)
         except UnknownGlass:
             continue
-        model, current = Model(found), found.current_configuration
+        model, current = DesignVariables(found), found.current_configuration
         planner = Planner(model.views[current - 1], found.primary_wavelength - 1, Conventions())
         own = planner.shared(SemiDiameters)
         own.ask(range(1, len(found.surfaces)))
@@ -398,7 +398,7 @@ def plate(thickness: float):
 
 
 def test_a_boundary_row_is_continuous_and_constant_where_it_complies():
-    model = Model(plate(3.0), (Vary(1, "thickness"),))
+    model = DesignVariables(plate(3.0), (Vary(1, "thickness"),))
     evaluation = Evaluation(model, [Row("MNCG", (1, 2), target=4.0, weight=1.0)])
     computed = [evaluation(np.array([t]), derivatives=True) for t in (3.0, 4.0 - 1e-9, 4.0, 4.0 + 1e-9, 7.0)]
     assert [one.residuals[0] for one in computed] == pytest.approx([-1.0, -1e-9, 0.0, 0.0, 0.0], abs=1e-15)
@@ -407,14 +407,16 @@ def test_a_boundary_row_is_continuous_and_constant_where_it_complies():
 
 def test_other_readings_take_the_largest_lack_and_signed_thicknesses():
     thick = automatic(lens([surface(None, 3.0, 1.5), surface(None, 1.0, 1.6), surface(None, 20.0)]))
-    model = Model(thick, (Vary(1, "thickness"), Vary(2, "thickness")))
+    model = DesignVariables(thick, (Vary(1, "thickness"), Vary(2, "thickness")))
     rows = [Row("MNCG", (1, 3), target=4.0, weight=1.0), Row("MXCG", (1, 3), target=0.5, weight=1.0)]
     computed = Evaluation(model, rows, conventions=Conventions(boundary="largest"))(model.start, derivatives=True)
     assert computed.values == pytest.approx([1.0, 3.0])
     assert computed.jacobian == pytest.approx(np.sqrt(0.5) * np.array([[0.0, 1.0], [1.0, 0.0]]))
     back = automatic(lens([surface(None, 5.0, MIRROR), surface(None, -7.0)]))
     computed = [
-        Evaluation(Model(back), [Row("MNCA", (1, 1), target=1.0)], conventions=convention)(np.zeros(0)).values[0]
+        Evaluation(DesignVariables(back), [Row("MNCA", (1, 1), target=1.0)], conventions=convention)(
+            np.zeros(0)
+        ).values[0]
         for convention in (Conventions(), Conventions(behind_mirrors="signed"))
     ]
     assert computed == [-5.0, 1.0]
@@ -424,17 +426,17 @@ def test_a_surface_that_is_not_there_is_named():
     with pytest.raises(
         ValueError, match=r"row 1 of the merit function: CTGT .* surface 9: this lens has surfaces 0 to 3"
     ):
-        Evaluation(Model(plate(3.0)), [Row("CTGT", (9, 0), target=4.0, weight=1.0)])
+        Evaluation(DesignVariables(plate(3.0)), [Row("CTGT", (9, 0), target=4.0, weight=1.0)])
 
 
 def test_rows_that_comply_stay_in_the_sum_of_weights():
     rows = [Row("MNCG", (1, 2), target=4.0, weight=1.0), Row("MXCG", (1, 2), target=9.0, weight=3.0)]
-    assert Evaluation(Model(plate(3.0)), rows)(np.zeros(0)).merit == pytest.approx(np.sqrt(1.0 / 4.0))
+    assert Evaluation(DesignVariables(plate(3.0)), rows)(np.zeros(0)).merit == pytest.approx(np.sqrt(1.0 / 4.0))
 
 
 def test_rows_in_another_unit_have_the_values_of_that_unit():
     row = Row("MNCG", (1, 2), target=0.5, weight=1.0)
-    computed = Evaluation(Model(plate(5.08), (Vary(1, "thickness"),)), [row], unit=25.4)(
+    computed = Evaluation(DesignVariables(plate(5.08), (Vary(1, "thickness"),)), [row], unit=25.4)(
         np.array([5.08]), derivatives=True
     )
     assert computed.values[0] == pytest.approx(0.2, rel=1e-14)
@@ -443,34 +445,36 @@ def test_rows_in_another_unit_have_the_values_of_that_unit():
 
 def test_a_range_without_surfaces_is_its_target():
     computed = Evaluation(
-        Model(plate(3.0)), [Row("MNCA", (1, 1), target=4.0, weight=1.0), Row("MNCG", (0, 0), target=2.0)]
+        DesignVariables(plate(3.0)), [Row("MNCA", (1, 1), target=4.0, weight=1.0), Row("MNCG", (0, 0), target=2.0)]
     )
     assert computed(np.zeros(0)).values.tolist() == [4.0, 2.0]
 
 
 def test_infinite_distances_comply_with_a_least_thickness():
     afocal = plate(3.0).replace(2, thickness=float("inf"))
-    assert Evaluation(Model(afocal), [Row("MNCA", (1, 2), target=4.0, weight=1.0)])(np.zeros(0)).values[0] == 4.0
+    assert (
+        Evaluation(DesignVariables(afocal), [Row("MNCA", (1, 2), target=4.0, weight=1.0)])(np.zeros(0)).values[0] == 4.0
+    )
 
 
 def test_rays_are_traced_only_where_a_row_needs_an_automatic_semi_diameter(monkeypatch):
     found = LENSES["double gauss"]()
     monkeypatch.setattr(Bundle, "marks", lambda *_: pytest.fail("traced"))
     rows = [Row("MNCA", (1, 20), target=1.0, weight=1.0), Row("MXCV", (1, 20), target=0.01, weight=1.0)]
-    model = Model(found)
+    model = DesignVariables(found)
     assert np.isfinite(Evaluation(model, rows)(model.start).values).all()
     edge = [Row("MNEG", (3, 3), target=1.0, weight=1.0)]
     assert np.isfinite(Evaluation(model, edge)(model.start).values).all()
     whole = dataclasses.replace(found, optimization_data=None)
     assert whole.surfaces[1].semi_diameter
-    assert np.isfinite(Evaluation(Model(whole), [Row("MNEG", (1, 9), weight=1.0)])(np.zeros(0)).values).all()
+    assert np.isfinite(Evaluation(DesignVariables(whole), [Row("MNEG", (1, 9), weight=1.0)])(np.zeros(0)).values).all()
 
 
 def test_rays_are_traced_once_for_all_rows_of_a_moment(monkeypatch):
     found, calls, marks = LENSES["double gauss"](), [], Bundle.marks
     monkeypatch.setattr(Bundle, "marks", lambda *given: calls.append(1) or marks(*given))
     rows = [Row(name, (1, 20), target=1.0, weight=1.0) for name in ("MNEG", "MNEA", "MNET", "MXET", "MXSD", "TTGT")]
-    Evaluation(Model(found), rows)(np.zeros(0))
+    Evaluation(DesignVariables(found), rows)(np.zeros(0))
     assert len(calls) == 1
 
 
@@ -481,7 +485,7 @@ def test_rays_that_are_lost_leave_the_size_to_the_others():
         aperture=("entrance_pupil_diameter", 2.0),
         field=fields("angle", (0.0, 50.0)),
     )
-    model = Model(automatic(ball, margin=(0.0, 0.0)), (Vary(2, "curvature"), Vary(1, "thickness")))
+    model = DesignVariables(automatic(ball, margin=(0.0, 0.0)), (Vary(2, "curvature"), Vary(1, "thickness")))
     row = Row("MNSD", (2, 3), target=3.0, weight=1.0)
     computed = Evaluation(model, [row])(model.start, derivatives=True)
     alone = dataclasses.replace(model.lens, fields=fields())
@@ -491,7 +495,7 @@ def test_rays_that_are_lost_leave_the_size_to_the_others():
         by = [Evaluation(model, [row])(model.start + s * step).residuals[0] for s in (1, -1)]
         assert computed.jacobian[0, number] == pytest.approx((by[0] - by[1]) / 2e-6, abs=1e-7)
     gone = dataclasses.replace(model.lens, fields=fields("angle", (50.0,)))
-    computed = Evaluation(Model(gone, model.variables), [row])(model.start, derivatives=True)
+    computed = Evaluation(DesignVariables(gone, model.variables), [row])(model.start, derivatives=True)
     assert computed.lost[0]
     assert computed.merit == LOST
     assert not computed.jacobian.any()

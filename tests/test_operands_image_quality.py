@@ -13,7 +13,7 @@ from raytrace.io import LensFileWarning
 from raytrace.maths.sampling import gauss_rings, square
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.operand import BadRow, Measure
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
@@ -117,7 +117,7 @@ VARIABLES = (Vary(1, "curvature"), Vary(4, "thickness"), Vary(6, "curvature"), V
 @pytest.mark.parametrize("operand", ["RSCE", "RSCH", "RWCE", "RWCH", "RSRE", "RSRH", "RWRE", "RWRH"])
 def test_derivatives_of_rms(operand, target):
     """With a target of 0 the row is a vector: JᵀJ is not compared, but Jᵀr, the slope of the row's square."""
-    model = Model(clipped(0.7), VARIABLES)
+    model = DesignVariables(clipped(0.7), VARIABLES)
     asked = [Row(operand, (4, 0), (*FIELD, 0, 0), target, 1.0), Row(operand, (3, 1), (0.3, 0.2, 0, 0), target, 2.0)]
     evaluation = Evaluation(model, asked)
     found = evaluation(model.start, derivatives=True)
@@ -137,7 +137,7 @@ def test_a_beam_that_loses_a_ray_is_lost_and_on_a_grid_those_that_arrive_count()
     front = {"radius": 20.0, "thickness": 3.0, "glass": 1.5}
     lens = rt.lens([front, {"radius": np.inf, "thickness": 36.0}], stop=1, entrance_pupil_diameter=44.0)
     asked = [Row(name, (6, 1), weight=1.0) for name in ("RSCE", "RWCE", "RSRE", "RWRE")]
-    model = Model(lens, (Vary(1, "curvature"), Vary(2, "thickness")))
+    model = DesignVariables(lens, (Vary(1, "curvature"), Vary(2, "thickness")))
     found = Evaluation(model, asked)(model.start, derivatives=True)
     assert found.lost.tolist() == [True, True, False, False]
     assert np.isfinite(found.jacobian).all()
@@ -204,7 +204,7 @@ def test_strehl_is_that_of_the_wavefront_map():
 def test_derivatives_of_modulation(operand):
     """Those of the Strehl ratio hold the best point of the image where it was, which no first derivative feels."""
     lens = clipped(0.9) if operand != "STRH" else rt.read_lens(SHARP)
-    model = Model(lens, (Vary(1, "curvature"), Vary(len(lens.surfaces) - 2, "thickness")))
+    model = DesignVariables(lens, (Vary(1, "curvature"), Vary(len(lens.surfaces) - 2, "thickness")))
     asked = [
         in_columns(operand, field=f, wavelength=w)
         for f, w in ((1, 2 if operand != "STRH" else 1), (len(lens.fields.x), 1))
@@ -264,7 +264,7 @@ def test_any_function_of_a_lens_is_a_row(name):
     lens, function = rt.read_lens("cooke_triplet"), FUNCTIONS[name]
     last = len(lens.surfaces) - 2
     solves = (Solve(3, "curvature", "pickup", source=1, scale=-1.0),)
-    model = Model(lens, (Vary(1, "curvature"), Vary(last, "thickness")), solves)
+    model = DesignVariables(lens, (Vary(1, "curvature"), Vary(last, "thickness")), solves)
     asked = [Row(Measure(name, function), target=0.1, weight=2.0), Row(function, weight=1.0), Row("EFFL", weight=1.0)]
     evaluation = Evaluation(model, asked)
     found = evaluation(model.start, derivatives=True)
@@ -303,7 +303,7 @@ def test_lengths_of_a_measure_are_in_the_unit_of_the_rows():
 
 def test_a_function_that_has_no_number_at_first_is_an_error_and_later_a_lost_row():
     lens = rt.read_lens("cooke_triplet")
-    model = Model(lens, (Vary(len(lens.surfaces) - 2, "thickness"),))
+    model = DesignVariables(lens, (Vary(len(lens.surfaces) - 2, "thickness"),))
 
     def near(lens: rt.Lens) -> torch.Tensor:
         if float(lens.surfaces[-2].thickness.detach()) > 60.0:
@@ -345,6 +345,6 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
 def test_a_lens_too_blurred_for_the_mtf_is_nan_where_an_earlier_one_has_it():
     lens = rt.read_lens("double_gauss")
     row = Row("MTFA", (1, 0), (1.0, 40.0, 0.0, 0.0), weight=1.0)
-    evaluation = Evaluation(Model(lens, (Vary(11, "thickness"),)), [row])
+    evaluation = Evaluation(DesignVariables(lens, (Vary(11, "thickness"),)), [row])
     assert 0 < evaluation(np.array([57.3])).values[0] < 1
     assert np.isnan(evaluation(np.array([90.0])).values[0])

@@ -9,7 +9,7 @@ from merit_cases import LENSES, check_derivatives, values_of
 import raytrace as rt
 from raytrace.files import shipped
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -32,7 +32,7 @@ def rows_of(lens, operand):
 @pytest.mark.parametrize("name", ROUND)
 def test_incidence_is_that_of_the_verb(name):
     lens = LENSES[name] if name != "colours" else rt.read_lens("cooke_triplet").at(wavelengths=[0.5876])
-    model = Model(lens)
+    model = DesignVariables(lens)
     found = rt.incidence(lens, fields=lens.fields.y)
     angles, valid = found.angle[:, 0].abs().reshape(-1), found.valid[:, 0].reshape(-1)
     computed = Evaluation(model, rows_of(lens, "RAID"))(model.start).values
@@ -47,7 +47,7 @@ def test_incidence_on_tilted_surfaces():
     image = len(lens.surfaces) - 1
     keeps = [k for k, surface in enumerate(lens.surfaces) if surface.is_mirror] + [image]
     ray = (0.0, 0.6, 0.3, 0.5)
-    evaluation = Evaluation(Model(lens), [Row(o, (k, 0), ray) for o in ("RAID", "RAED") for k in keeps])
+    evaluation = Evaluation(DesignVariables(lens), [Row(o, (k, 0), ray) for o in ("RAID", "RAED") for k in keeps])
     in_front, behind = evaluation(np.zeros(0)).values.reshape(2, -1)
     assert len(keeps) > 1
     assert in_front.max() > 40
@@ -58,7 +58,7 @@ def test_the_law_of_refraction():
     """n sin i = n' sin i', by RAID and RAED; RAIN and RAEN are their cosines."""
     lens = LENSES["near"]
     ray = (0.0, 0.8, 0.3, 0.6)
-    n = Model(lens).views[0].indices[lens.primary_wavelength - 1]
+    n = DesignVariables(lens).views[0].indices[lens.primary_wavelength - 1]
     for k in (1, 3, 5, 8):
         i, e, ci, ce = values_of("near", [Row(o, (k, 0), ray) for o in ("RAID", "RAED", "RAIN", "RAEN")])
         assert n[k - 1] * math.sin(math.radians(i)) == pytest.approx(n[k] * math.sin(math.radians(e)), rel=1e-12)
@@ -88,7 +88,7 @@ def test_derivatives_of_incidence(name):
 def test_derivatives_of_incidence_on_tilted_surfaces():
     lens = rt.read_lens(shipped("lenses") / "examples" / "folded_relay.zmx")
     breaks = [k for k, surface in enumerate(lens.surfaces) if surface.is_break]
-    model = Model(lens, (Vary(breaks[0], "tilt_x"), Vary(breaks[0] + 1, "thickness")))
+    model = DesignVariables(lens, (Vary(breaks[0], "tilt_x"), Vary(breaks[0] + 1, "thickness")))
     rows = [Row("RAID", (len(lens.surfaces) - 1, 0), (0.0, 0.5, 0.1, 0.4), weight=1.0)]
     evaluation, x = Evaluation(model, rows), model.start
     found = evaluation(x, derivatives=True)

@@ -12,7 +12,7 @@ import raytrace as rt
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row, Vary
 
 
@@ -93,7 +93,7 @@ def test_derivatives_of_modulation_of_a_few_rings(name, few):
     lens = vignetted() if name == "vignetted" else rt.read_lens("cooke_triplet")
     lens = lens.at(fields=[(3.0, 10.0)]) if name == "skew" else lens
     last = len(lens.surfaces) - 2
-    model = Model(lens, (Vary(1, "curvature"), Vary(last, "thickness")))
+    model = DesignVariables(lens, (Vary(1, "curvature"), Vary(last, "thickness")))
     evaluation = Evaluation(model, rows(lens, 10.0, 25.0, sections="TA"))
     found = evaluation(model.start, derivatives=True)
     expected = slopes_by_differences(evaluation, model.start, 1e-5)

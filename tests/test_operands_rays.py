@@ -9,7 +9,7 @@ from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 import raytrace as rt
 from raytrace.optimization.merit import LOST, Evaluation
 from raytrace.optimization.operands.rays import RAYS
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import Row
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -65,7 +65,7 @@ def test_directions_behind_a_telescope_are_those_of_its_defocus():
     surfaces = [dict(thickness=first + second + defocus, phase=ideal[0]), dict(thickness=20.0, phase=ideal[1])]
     lens = rt.lens(surfaces, stop=1, entrance_pupil_diameter=2 * radius, fields=[0], wavelengths=[0.55])
     rows = [Row(o, (0, 1), (0.0, 0.0, 0.0, py)) for o in ("ANAC", "ANAR", "ANCY", "ANAY") for py in (0.5, 1.0)]
-    found = Evaluation(Model(lens), rows)(np.zeros(0)).values.reshape(4, 2)
+    found = Evaluation(DesignVariables(lens), rows)(np.zeros(0)).values.reshape(4, 2)
     slope = defocus * radius * np.array([0.5, 1.0]) / (first * second)
     assert found[:2] == pytest.approx(np.tile(np.sin(np.arctan(slope)), (2, 1)), rel=1e-10)
     assert found[2:] == pytest.approx(np.tile(np.sin(np.arctan(slope)), (2, 1)), rel=1e-10)

@@ -16,7 +16,7 @@ import raytrace as rt
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.operand import BadRow, Conventions
 from raytrace.optimization.operands.wavefront import Fit
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import media
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.launch import rays_of_field, vignette
@@ -296,7 +296,7 @@ def test_derivatives_with_failed_rays(operand, conventions):
     asked = rows(operand, fields=[(0.0, 0.7), (0.4, 0.6)], points=[*POINTS, LOST])
     integers = {"OPTH": lambda w: (last, w), "PLEN": lambda w: (2, last)}.get(operand, lambda w: (0, w))
     asked = [Row(operand, integers(row.integers[1]), row.numbers, weight=row.weight) for row in asked]
-    model = Model(lens, VARIABLES)
+    model = DesignVariables(lens, VARIABLES)
     evaluation = Evaluation(model, asked, conventions=conventions)
     found = evaluation(model.start, derivatives=True)
     assert 0 < found.lost.sum() < len(asked) / 2
@@ -310,7 +310,7 @@ def test_derivatives_with_failed_rays(operand, conventions):
 def test_derivatives_of_a_path_from_an_object_that_moves():
     """The launch moves with the object, the entrance pupil and the focal length."""
     lens = rt.with_object_distance(rt.read_lens("cooke_triplet"), torch.tensor(300.0).double())
-    model = Model(lens, (Vary(0, "thickness"), Vary(1, "curvature"), Vary(2, "thickness")))
+    model = DesignVariables(lens, (Vary(0, "thickness"), Vary(1, "curvature"), Vary(2, "thickness")))
     numbers = (0.3, 0.5, 0.4, -0.6)
     asked = [Row("OPTH", (s, 3), numbers, weight=1.0) for s in (1, 3, 7)] + [Row("OPDC", (0, 1), numbers, weight=1.0)]
     evaluation = Evaluation(model, asked)
@@ -322,7 +322,7 @@ def test_derivatives_of_a_path_from_an_object_that_moves():
 def test_derivatives_of_a_bent_lens():
     lens = rt.read_lens("cooke_triplet")
     bent = folded(lens, len(lens.surfaces) - 2, tilt_x=35.0)
-    model = Model(bent, (Vary(1, "curvature"), Vary(2, "thickness"), Vary(6, "curvature")))
+    model = DesignVariables(bent, (Vary(1, "curvature"), Vary(2, "thickness"), Vary(6, "curvature")))
     evaluation = Evaluation(model, rows("OPDC", wavelengths=(2,), fields=[(0.0, 0.5)]))
     found = evaluation(model.start, derivatives=True)
     expected = slopes_by_differences(evaluation, model.start) * evaluation.factors[:, None]

@@ -17,7 +17,7 @@ from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOpt
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize_report
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
-from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.optimization.variables import design_variables, name_of
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
@@ -136,8 +136,8 @@ def test_an_interrupt_keeps_the_best():
 
 
 def problem_of(lens, vary, **options):
-    free = freedom(lens, vary)
-    return Problem(Model(free.lens, free.variables, free.solves), DefaultMerit().rows(lens), **options)
+    free = design_variables(lens, vary)
+    return Problem(free, DefaultMerit().rows(lens), **options)
 
 
 def test_a_triplet_becomes_sharper_and_the_merit_is_that_of_the_lens_it_gives(triplet):
@@ -203,8 +203,8 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
 
 def test_boundaries_are_known_on_both_sides_and_add_up_to_their_rows(triplet):
     rows = DefaultMerit(glass_thickness=(4.0, 8.0), air_thickness=(1.0, 9.0), edge=3.0).rows(triplet)
-    free = freedom(triplet, "curvature thickness")
-    problem = Problem(Model(free.lens, free.variables, free.solves), rows)
+    free = design_variables(triplet, "curvature thickness")
+    problem = Problem(free, rows)
     x = problem.model.start
     found, state = problem.evaluated(x, True), problem.state(x, True)
     assert (state.sides.excess < 0).any()
@@ -385,8 +385,8 @@ def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(kno
         assert found.merit_after <= max(1.0001 * known["mf_stored"], best)
     else:
         assert found.merit_after <= 1.0001 * best
-    free = freedom(lens)
-    model = Model(free.lens, free.variables, free.solves)
+    free = design_variables(lens)
+    model = free
     factors = script("bench_optimise").factors(known, [name_of(one) for one in free.variables])
     moved = rt.optimize(model.lens_at(model.start * factors), seconds=20)
     assert moved.merit_before == pytest.approx(known["from_perturbed"]["mf_start"], rel=1e-3)

@@ -27,7 +27,7 @@ from raytrace.optimization.glass_choice import (
 from raytrace.optimization.least_squares import Sides, State, least_squares
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem, conditions_of
-from raytrace.optimization.variables import freedom, without_glass
+from raytrace.optimization.variables import design_variables, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.compiled import prepare
@@ -44,7 +44,7 @@ def triplet():
 
 def choice_of(lens, words="curvature thickness glass", **options) -> Choice:
     function = merit_for(lens, MERIT)
-    free, surfaces = without_glass(freedom(lens, words), words)
+    free, surfaces = without_glass(design_variables(lens, words), words)
     far = np.full(len(free.variables), np.inf)
     pool = pool_of(lens, catalogs_of(lens))
     return Choice(free, surfaces, pool, function.rows, conditions_of(lens, "efl=100"), (-far, far), **options)
@@ -191,7 +191,7 @@ def test_it_is_reproducible(triplet, found):
 
 def test_which_glasses_vary(triplet):
     words = "curvature glass:3"
-    assert without_glass(freedom(triplet, words), words)[1] == (3,)
+    assert without_glass(design_variables(triplet, words), words)[1] == (3,)
     substitute = (Solve(1, "glass", "substitute"),)
     pickup = (Solve(6, "glass", "pickup", source=1),)
     for kept, expected in (((), (1, 3, 6)), (substitute, (1,)), (pickup, (1, 3))):
@@ -199,11 +199,11 @@ def test_which_glasses_vary(triplet):
         lens = dataclasses.replace(
             lens, optimization_data=OptimizationData(variables=(Vary(1, "curvature"),), kept=kept)
         )
-        free, surfaces = without_glass(freedom(lens, "glass"), "glass")
+        free, surfaces = without_glass(design_variables(lens, "glass"), "glass")
         assert surfaces == expected
         assert free.variables == (Vary(1, "curvature"),)
     with pytest.raises(BadVariables, match="nothing but glasses"):
-        without_glass(freedom(triplet, "glass"), "glass")
+        without_glass(design_variables(triplet, "glass"), "glass")
 
 
 def test_a_glass_that_is_picked_up_follows(triplet):

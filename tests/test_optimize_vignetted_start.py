@@ -10,7 +10,7 @@ import raytrace as rt
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import Problem
-from raytrace.optimization.variables import Model, bounds_of, freedom
+from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables
 
 #: Factors of the curvatures of the double Gauss, with which most of its rays are lost.
 BENT = (1.15, 0.58, 0.67, -0.95, 2.44, 1.0, 1.12, 1.41, 0.0, 0.16, 1.51)
@@ -28,8 +28,8 @@ def bent():
 
 
 def problem_of(lens, bounds="thickness:0.5..90"):
-    free = freedom(lens, "curvature thickness")
-    model = Model(free.lens, free.variables, free.solves)
+    free = design_variables(lens, "curvature thickness")
+    model = free
     lower, upper = bounds_of(free.lens, free.variables, bounds)
     return Problem(model, rt.Merit.default(lens, "spot").rows), {"lower": lower, "upper": upper}
 
@@ -38,8 +38,10 @@ def test_an_opening_scales_pupil_and_field_of_every_ray():
     lens = rt.read_lens("double_gauss")
     rows = rt.Merit.default(lens, "spot").rows
     narrowed = [dataclasses.replace(row, numbers=tuple(0.4 * n for n in row.numbers)) for row in rows]
-    narrow = Evaluation(Model(lens, opening=0.4), rows)(np.zeros(0)).values
-    assert narrow == pytest.approx(Evaluation(Model(lens), narrowed)(np.zeros(0)).values, rel=1e-12, nan_ok=True)
+    narrow = Evaluation(DesignVariables(lens, opening=0.4), rows)(np.zeros(0)).values
+    assert narrow == pytest.approx(
+        Evaluation(DesignVariables(lens), narrowed)(np.zeros(0)).values, rel=1e-12, nan_ok=True
+    )
 
 
 def test_a_start_that_loses_most_rays_is_opened_until_all_pass():

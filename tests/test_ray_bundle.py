@@ -11,7 +11,7 @@ from raytrace.files import shipped
 from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import Dual
 from raytrace.optimization.lens_state import Bundle, rays_by_torch
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import with_field_kind
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.tracing.launch import launch
@@ -83,7 +83,7 @@ def cases():
 
 def bundle_of(lens, name):
     solves = SOLVES if name not in VARY and len(lens.surfaces) > 9 else ()
-    model = Model(lens, VARY.get(name, USUAL), solves)
+    model = DesignVariables(lens, VARY.get(name, USUAL), solves)
     bundle = Bundle(model.views[0], len(lens.surfaces) - 1)
     for field in FIELDS:
         for wavelength in range(len(lens.wavelengths)):

@@ -30,7 +30,7 @@ from raytrace.optimization.search_tasks import (
     length_of,
     space_of,
 )
-from raytrace.optimization.variables import Model, bounds_of, freedom
+from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables
 
 PLANE = float("inf")
 PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem
@@ -59,8 +59,8 @@ def found(plate):
 @pytest.mark.parametrize("glasses", [(1.6,), (1.6, 1.8), (1.6, 1.8, 1.5, 1.7)])
 def test_starts_have_the_focal_length_and_the_sensor_at_the_paraxial_focus(glasses):
     lens = plates(*glasses)
-    free = freedom(lens, "curvature thickness")
-    model = Model(free.lens, free.variables)
+    free = design_variables(lens, "curvature thickness")
+    model = DesignVariables(free.lens, free.variables)
     space = space_of(model, bounds_of(free.lens, free.variables, "sensor:1..500"), 50.0)
     points = [model.start, *space.sobol(1, 16, seed=0)]
     brought = 0
@@ -77,8 +77,8 @@ def test_starts_have_the_focal_length_and_the_sensor_at_the_paraxial_focus(glass
 
 
 def test_starts_are_spread_evenly_and_are_the_same_in_any_order(plate):
-    free = freedom(plate, "curvature thickness")
-    model = Model(free.lens, free.variables)
+    free = design_variables(plate, "curvature thickness")
+    model = DesignVariables(free.lens, free.variables)
     space = space_of(model, bounds_of(free.lens, free.variables), 50.0)
     blocks = [space.sobol(k, 8, seed=3) for k in range(8)]
     assert np.array_equal(space.sobol(5, 8, seed=3), blocks[5])
@@ -109,7 +109,7 @@ def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeyp
 
 def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():
     lens = rt.read_lens("cooke_triplet")
-    model, own = Model(lens), float(rt.first_order(lens).effective_focal_length)
+    model, own = DesignVariables(lens), float(rt.first_order(lens).effective_focal_length)
     rows = DefaultMerit().rows(lens)
     assert length_of(model, rows, 1.0, ()) == pytest.approx(own)
     aimed = (*rows, rt.Row("EFFL", target=3.0, weight=1.0))
@@ -185,7 +185,7 @@ def test_the_best_singlet_is_that_of_a_scan_over_its_bending(plate, found):
 
 def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
     lens = rt.read_lens("cooke_triplet")
-    free = freedom(lens, "curvature thickness:2,4 sensor curvature:6=-curvature:1")
+    free = design_variables(lens, "curvature thickness:2,4 sensor curvature:6=-curvature:1")
     rows = (
         *DefaultMerit().rows(lens),
         rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1),
@@ -222,7 +222,7 @@ def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
 def best_triplet():
     """What is asked of a triplet, and the lens at its minimum."""
     lens = rt.read_lens("cooke_triplet")
-    free = freedom(lens, "curvature thickness")
+    free = design_variables(lens, "curvature thickness")
     rows, held = tuple(DefaultMerit(rings=2).rows(lens)), conditions_of(lens, "efl=100")
     bounds = bounds_of(free.lens, free.variables, "thickness:1..30 sensor:60..120")
     asked = SearchProblem(free, rows, held, bounds, (2.0, 8.0), (0.5, 30.0), PLAIN)
@@ -435,8 +435,8 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
     """Of a plate f = ∞ without a derivative, in a row and in a search, where the power that f has is held."""
     rows = [dict(radius=torch.inf, thickness=4, glass="N-BK7"), dict(radius=torch.inf, thickness=95)]
     plate = rt.lens(rows, stop=1, entrance_pupil_diameter=10, fields=[0, 1])
-    free = freedom(plate, "curvature sensor")
-    model = Model(free.lens, free.variables)
+    free = design_variables(plate, "curvature sensor")
+    model = DesignVariables(free.lens, free.variables)
     for name in ("EFFL", "ISFN"):
         found = Evaluation(model, [rt.Row(name, (0, 1) if name == "EFFL" else (0, 0), weight=1.0)])(
             model.start, derivatives=True

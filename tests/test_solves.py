@@ -12,7 +12,7 @@ import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
 from raytrace.maths.numerics import Dual, slope_of, value_of
 from raytrace.optimization.lens_state import SOLVES
-from raytrace.optimization.variables import Model, freedom
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system import configurations
 from raytrace.system.configurations import ScaledPath
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
@@ -35,7 +35,7 @@ RULES = {
 
 
 def moment_of(solves, x=None, *, duals=False, lens=None):
-    model = Model(rt.read_lens("double_gauss") if lens is None else lens, VARY, solves)
+    model = DesignVariables(rt.read_lens("double_gauss") if lens is None else lens, VARY, solves)
     x = model.start * np.array([1.02, 0.97, 1.01]) if x is None else x
     return model, x, model.views[0].state(Dual(x, np.eye(len(x))) if duals else x)
 
@@ -154,7 +154,7 @@ def test_a_real_ray_meets_the_image_at_the_height_of_its_solve(part):
 def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(height):
     lens = rt.read_lens("double_gauss")
     lens = dataclasses.replace(lens, optimization_data=OptimizationData(semi_diameter_margin=(5.0, 0.1)))
-    model = Model(lens, (VARY[0], VARY[2]), (Solve(3, "thickness", "edge_thickness", (2.0, height)),))
+    model = DesignVariables(lens, (VARY[0], VARY[2]), (Solve(3, "thickness", "edge_thickness", (2.0, height)),))
     x = model.start * np.array([1.02, 1.01])
     here = model.lens_at(x)
     at = height or semi_diameters(here)[3]
@@ -166,7 +166,7 @@ def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(he
 
 def test_a_real_ray_that_is_lost_has_no_thickness():
     lens = rt.read_lens("double_gauss").at(f_number=0.5)
-    model = Model(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.0, 1.0)),))
+    model = DesignVariables(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.0, 1.0)),))
     found = model.views[0].state(Dual(model.start, np.eye(3))).numbers[11, "thickness"]
     assert np.isnan(found.value)
 
@@ -176,7 +176,9 @@ def test_a_glass_that_is_picked_up_follows_every_number_of_it():
     glass = model_glass(*(torch.tensor(n, dtype=torch.float64) for n in (1.62, 56.0)))
     lens = lens.replace(1, glass=glass).at(wavelengths=[0.5876, 0.4861])
     variables = Vary(1, "index"), Vary(1, "abbe_number")
-    model = Model(lens, variables, (Solve(3, "glass", "pickup", source=1), Solve(9, "glass", "pickup", source=3)))
+    model = DesignVariables(
+        lens, variables, (Solve(3, "glass", "pickup", source=1), Solve(9, "glass", "pickup", source=3))
+    )
     x = np.array([1.65, 50.0])
     here, view = model.lens_at(x), model.views[0]
     for k in (3, 9):
@@ -206,7 +208,7 @@ def zoom():
 def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations():
     lens = zoom()
     follows = Solve(3, "thickness", "pickup", (0.0,), 1, 2.0, 0.1, configuration=2, operand=0)
-    model = Model(lens, (Vary(3, "thickness", 1, 0), Vary(1, "curvature", 2, 1)), (follows,))
+    model = DesignVariables(lens, (Vary(3, "thickness", 1, 0), Vary(1, "curvature", 2, 1)), (follows,))
     x = np.array([5.0, 0.012])
     first, second = (view.state(Dual(x, np.eye(2))).numbers for view in model.views)
     assert (value_of(first[3, "thickness"]), value_of(first[8, "thickness"])) == (5.0, 6.5)
@@ -226,12 +228,14 @@ def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations(
 
 def test_numbers_changed_by_an_operand_are_named_once():
     lens = zoom()
-    found = freedom(lens, "thickness:3,8")
+    found = design_variables(lens, "thickness:3,8")
     assert found.variables == (Vary(3, "thickness", 1, 0), Vary(3, "thickness", 2, 0))
     follows = Solve(3, "thickness", "pickup", (0.0,), 1, configuration=2, operand=0)
     lens = dataclasses.replace(lens, optimization_data=OptimizationData(solves=(follows,)))
-    assert [one for one in freedom(lens, "thickness").variables if one.surface == 3] == [Vary(3, "thickness", 1, 0)]
-    assert freedom(lens, "thickness:3").solves == ()
+    assert [one for one in design_variables(lens, "thickness").variables if one.surface == 3] == [
+        Vary(3, "thickness", 1, 0)
+    ]
+    assert design_variables(lens, "thickness:3").solves == ()
 
 
 @pytest.mark.parametrize(
@@ -247,5 +251,5 @@ def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
         pytest.skip("the files are in ../shared")
     lens = rt.read_lens(CORPUS / "zmx" / path)
     (solve,) = (one for one in lens.optimization_data.solves if one.kind == kind)
-    found = Model(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]
+    found = DesignVariables(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]
     assert value_of(found) == pytest.approx(float(lens.surfaces[solve.surface].thickness), rel=near)

@@ -9,7 +9,7 @@ import pytest
 import raytrace as rt
 from raytrace.materials.glass import abbe_number, nd
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model, VariedGlass, bounds_of, freedom, name_of
+from raytrace.optimization.variables import DesignVariables, VariedGlass, bounds_of, design_variables, name_of
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables
 
@@ -20,7 +20,7 @@ def zoom(lens):
 
 
 def names(lens, vary):
-    return [name_of(one) for one in freedom(lens, vary).variables]
+    return [name_of(one) for one in design_variables(lens, vary).variables]
 
 
 def test_a_kind_alone_means_every_surface_where_it_makes_sense(lens):
@@ -44,8 +44,8 @@ def test_surfaces_and_groups(lens):
 
 def test_absent_terms_vary_from_zero(lens):
     """Terms of an asphere, a conic and a pose are 0 at the start, and the lens is what it was."""
-    found = freedom(lens, "a4:3 a8:3 conic:3 tilt:5 curvature:6")
-    model = Model(found.lens, found.variables, found.solves)
+    found = design_variables(lens, "a4:3 a8:3 conic:3 tilt:5 curvature:6")
+    model = found
     np.testing.assert_array_equal(model.start, np.zeros(6))
     assert found.lens.surfaces[3].coefficients.tolist() == [0, 0, 0, 0]
     moved = model.start + np.array([1e-6, 1e-12, -0.1, 0.01, 0.02, 1e-4])
@@ -60,9 +60,9 @@ def test_pose_and_shape_of_the_image_vary(lens):
     """With the derivatives of differences, of rays on the image, their path and their wavefront."""
     words = "tilt:12 decentre:12 tilt_z:12 z:12 curvature:12 conic:12"
     lens = lens.replace(12, tilt_x=1.0, x=0.1, curvature=1e-3)
-    found = freedom(lens, words)
+    found = design_variables(lens, words)
     assert [name_of(one) for one in found.variables][:4] == ["tilt_x_12", "tilt_y_12", "x_12", "y_12"]
-    model = Model(found.lens, found.variables)
+    model = DesignVariables(found.lens, found.variables)
     rays = [rt.Row(name, (12, 1), (0.3, 1.0, 0.2, 0.5), weight=1.0) for name in ("REAX", "REAY", "REAZ", "RAID")]
     evaluation = Evaluation(model, [*rays, rt.Row("OPDC", (0, 1), (0.0, 1.0, 0.2, 0.5), weight=1.0)])
     step = 1e-5
@@ -90,9 +90,9 @@ def test_the_image_of_a_tilted_lens_follows_scheimpflug():
 def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
     """It has the same index, dispersion and partial dispersion, and one warning for each surface says so."""
     with pytest.warns(VariedGlass, match="varies as a model glass, whose index is off by") as said:
-        found = freedom(lens, "index abbe_number:3")
+        found = design_variables(lens, "index abbe_number:3")
     assert len(said) == len(found.variables) - 1 == 6
-    model = Model(found.lens, found.variables)
+    model = DesignVariables(found.lens, found.variables)
     for number, k in zip(model.start, (1, 3, 4, 7, 8, 10), strict=False):
         assert number == pytest.approx(float(nd(lens.surfaces[k].glass)), rel=1e-12)
     assert model.start[-1] == pytest.approx(float(abbe_number(lens.surfaces[3].glass)), rel=1e-12)
@@ -105,27 +105,27 @@ def test_numbers_that_differ_between_configurations_vary_in_each(zoom):
     assert names(zoom, "thickness:6@2") == ["thickness_6@2"]
     assert names(zoom, "thickness@2") == ["thickness_6@2", "thickness_11@2"]
     assert names(zoom, "sensor") == ["thickness_11@1", "thickness_11@2"]
-    model = Model(zoom, freedom(zoom, "thickness:5,6").variables)
+    model = DesignVariables(zoom, design_variables(zoom, "thickness:5,6").variables)
     assert model.start == pytest.approx([float(zoom.surfaces[5].thickness), 12.4281, 16.0])
 
 
 def test_solves_and_pickups(lens):
-    (pickup,) = freedom(lens, "thickness curvature:4 = - 2 * curvature:3 + 0.001").solves
+    (pickup,) = design_variables(lens, "thickness curvature:4 = - 2 * curvature:3 + 0.001").solves
     assert (pickup.surface, pickup.quantity, pickup.kind) == (4, "curvature", "pickup")
     assert (pickup.source, pickup.scale, pickup.offset) == (3, -2.0, 0.001)
-    (solve,) = freedom(lens, "thickness curvature:11=f_number(4)").solves
+    (solve,) = design_variables(lens, "thickness curvature:11=f_number(4)").solves
     assert (solve.kind, solve.numbers) == ("f_number", (4.0,))
-    (solve,) = freedom(lens, "curvature sensor=marginal_height(0)").solves
+    (solve,) = design_variables(lens, "curvature sensor=marginal_height(0)").solves
     assert (solve.surface, solve.quantity, solve.numbers) == (11, "thickness", (0.0, 0.0))
-    found = freedom(lens, "curvature curvature:4=-curvature:3")
+    found = design_variables(lens, "curvature curvature:4=-curvature:3")
     assert "curvature_4" not in [name_of(one) for one in found.variables]
-    both = freedom(lens, "curvature thickness:5,7=thickness:2").solves
+    both = design_variables(lens, "curvature thickness:5,7=thickness:2").solves
     assert [(one.surface, one.source) for one in both] == [(5, 2), (7, 2)]
 
 
 def test_a_lens_keeps_its_solves(lens):
-    found = freedom(lens, "curvature:1,3 curvature:5=-curvature:3 curvature:11=f_number(2.5)")
-    model = Model(found.lens, found.variables, found.solves)
+    found = design_variables(lens, "curvature:1,3 curvature:5=-curvature:3 curvature:11=f_number(2.5)")
+    model = found
     at = model.lens_at(model.start * [1.01, 0.99])
     assert float(at.surfaces[5].curvature) == -float(at.surfaces[3].curvature)
     at = at.at(object_distance=float("inf"))
@@ -139,12 +139,12 @@ def test_variables_of_the_file_apply_unless_specified_otherwise(lens):
 
     solve = Solve(11, "thickness", "marginal_height", (0.0, 0.0))
     lens = dataclasses.replace(lens, optimization_data=OptimizationData((Vary(1, "curvature"),), (solve,)))
-    own = freedom(lens)
+    own = design_variables(lens)
     assert (names(lens, None), own.solves) == (["curvature_1"], (solve,))
-    assert freedom(lens, "curvature").solves == (solve,)
+    assert design_variables(lens, "curvature").solves == (solve,)
     assert "thickness_11" not in names(lens, "thickness")
-    assert freedom(lens, "sensor").solves == ()
-    (other,) = freedom(lens, "curvature sensor=thickness:1").solves
+    assert design_variables(lens, "sensor").solves == ()
+    (other,) = design_variables(lens, "curvature sensor=thickness:1").solves
     assert other.kind == "pickup"
 
 
@@ -174,16 +174,16 @@ def test_variables_of_the_file_apply_unless_specified_otherwise(lens):
 )
 def test_impossible_variables_are_refused(lens, vary, said):
     with pytest.raises(BadVariables, match=re.escape(said)):
-        freedom(lens, vary)
+        design_variables(lens, vary)
 
 
 def test_without_variables_in_the_file_words_are_asked_for(lens):
     with pytest.raises(BadVariables, match="`vary` names them"):
-        freedom(rt.lens([dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=95)], stop=1, f_number=5))
+        design_variables(rt.lens([dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=95)], stop=1, f_number=5))
 
 
 def test_bounds_by_kind_surface_and_configuration(zoom):
-    found = freedom(zoom, "thickness:5,6 sensor curvature:3 tilt:4")
+    found = design_variables(zoom, "thickness:5,6 sensor curvature:3 tilt:4")
     low, high = bounds_of(found.lens, found.variables, "thickness:2..15 thickness_6@2:14..20 sensor:50,60 tilt:-1..1")
     ranges = dict(zip(map(name_of, found.variables), zip(low, high, strict=True), strict=True))
     inf = np.inf
@@ -202,7 +202,7 @@ def test_bounds_by_kind_surface_and_configuration(zoom):
     assert high[5] == 0
     with pytest.raises(BadVariables, match="did you mean curvature_3"):
         bounds_of(found.lens, found.variables, "curvatur_3:0,1")
-    free = freedom(zoom, [*["curvature:3", "thickness:5"]])
+    free = design_variables(zoom, [*["curvature:3", "thickness:5"]])
     own = [Vary(3, "curvature", bounds=(0.01, 0.05)), free.variables[1]]
     low, high = bounds_of(zoom, own, "thickness:1..")
     assert (low.tolist(), high.tolist()) == ([0.01, 1.0], [0.05, inf])

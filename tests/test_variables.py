@@ -26,7 +26,7 @@ from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables, name_of
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import BadLimits, BadVariables, parameter_paths, parse_bounds, parse_range
@@ -408,7 +408,7 @@ def test_every_number_of_a_shape_can_be_varied_by_its_name():
 def test_variable_syntax_is_that_of_optimize():
     """Kinds without surfaces, numbers that are 0 in the lens, and tilts, whose unit is 1 mm at the edge."""
     lens = read_lens("cooke_triplet")
-    free = freedom(lens, "curvature thickness a4:3 tilt:2 index:1")
+    free = design_variables(lens, "curvature thickness a4:3 tilt:2 index:1")
     variables = Variables(lens, "curvature thickness a4:3 tilt:2 index:1")
     assert set(variables.names) == {name_of(one) for one in free.variables}
     with torch.no_grad():
@@ -425,7 +425,7 @@ def test_variable_syntax_is_that_of_optimize():
 
 def test_variables_and_words_may_be_given_together():
     lens = rt.read_lens("cooke_triplet")
-    free = freedom(lens, [rt.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
+    free = design_variables(lens, [rt.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
     assert [(one.surface, one.quantity) for one in free.variables] == [(1, "curvature"), (3, "conic"), (2, "thickness")]
     assert free.variables[0].bounds == (0.01, 0.05)
     assert float(free.lens.surfaces[3].conic) == 0
@@ -453,7 +453,7 @@ def test_rays_and_pupils_have_derivatives_by_the_system_aperture(case):
     lens = beam(*case)
     rows = [Row("REAY", (surface, 1), (0.0, *point), weight=1.0) for surface in (5, 11) for point in POINTS]
     rows += [Row("EPDI", weight=1.0), Row("WFNO", weight=1.0)]
-    model = Model(lens, tuple(Vary(*at) for at in ((0, "aperture"), (4, "thickness"), (5, "thickness"))))
+    model = DesignVariables(lens, tuple(Vary(*at) for at in ((0, "aperture"), (4, "thickness"), (5, "thickness"))))
     assert [name_of(one) for one in model.variables] == ["aperture", "thickness_4", "thickness_5"]
     evaluation = Evaluation(model, rows)
     found = evaluation(model.start, derivatives=True)
@@ -503,4 +503,4 @@ def test_the_system_aperture_is_a_parameter():
 @pytest.mark.parametrize("word", ["aperture:3", "aperture@2"])
 def test_the_system_aperture_has_no_surface_and_no_configuration(word):
     with pytest.raises(BadVariables, match="aperture"):
-        freedom(read_lens("double_gauss"), word)
+        design_variables(read_lens("double_gauss"), word)

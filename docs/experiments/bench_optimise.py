@@ -28,7 +28,7 @@ from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
-from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables, name_of
 from raytrace.pages import digits, listing
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
@@ -86,8 +86,8 @@ def _of_file(name: str, bar) -> FileRow:
         warnings.simplefilter("ignore")
         lens = read_lens(name)
     known = _oracle(Path(name))
-    free = freedom(lens)
-    model = Model(free.lens, free.variables, free.solves)
+    free = design_variables(lens)
+    model = free
     moved = model.lens_at(model.start * factors(known, [name_of(variable) for variable in free.variables]))
     stored, from_moved = (optimize(start, seconds=MOST) for start in (lens, moved))
     bar.update(1)
@@ -125,8 +125,8 @@ def _name_here(variable: str) -> str:
 def _jacobian(lens: Lens, repeats: int) -> tuple[float, float, int, int]:
     """Median seconds of a default merit function of 6 rings and 6 arms, and of it with its derivatives."""
     lens = lens.at(wavelengths=[0.5876, 0.4861, 0.6563])
-    free = freedom(lens, "curvature thickness")
-    model = Model(free.lens, free.variables[:20], free.solves)
+    free = design_variables(lens, "curvature thickness")
+    model = DesignVariables(free.lens, free.variables[:20], free.solves)
     problem = Problem(model, DefaultMerit("spot", rings=6).rows(lens))
     medians = []
     for derivatives in (False, True):

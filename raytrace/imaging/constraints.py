@@ -22,7 +22,7 @@ from raytrace.optimization.glass_choice import Pool
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, State
 from raytrace.optimization.optimize import EXACT, NotReached
 from raytrace.optimization.problem import Condition, Problem
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.words import calling_level
@@ -39,7 +39,7 @@ Limits = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray | None]]
 
 
 class GlassLimits:
-    """Model glasses within the convex hull of catalog glasses, as further limits.
+    """DesignVariables glasses within the convex hull of catalog glasses, as further limits.
 
     start: numbers (k,) of the model glass behind each surface; columns: (n,) variables as pairs (surface, number of the
     glass), None for others.
@@ -106,7 +106,7 @@ class Constraints:
         upper: np.ndarray,
         limits: Limits | None = None,
     ):
-        self.problem = Problem(Model(lens, tuple(variables)), [*_rays(lens)], conditions)
+        self.problem = Problem(DesignVariables(lens, tuple(variables)), [*_rays(lens)], conditions)
         self.conditions, self.limits = tuple(conditions), limits
         self.unit, self.lower, self.upper = unit, lower, upper
         self._ends = lower, upper  # of the variables that move

@@ -42,6 +42,7 @@ from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     APERTURE,
     GLASS,
+    Address,
     BadHold,
     bounds_of,
     constraint_words,
@@ -50,8 +51,8 @@ from raytrace.optimization.variables import (
     split_constraint,
     split_words,
     varied,
-    with_aperture,
     with_modelled,
+    with_numbers_of,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
 from raytrace.system.lens import Lens, field_points, media
@@ -258,6 +259,10 @@ class Variable:
     def name(self) -> str:
         return self.kind if self.kind in ("sensor", "aperture") else f"{self.kind}_{self.surface}"
 
+    @property
+    def address(self) -> Address:
+        return self.surface, "thickness" if self.kind == "sensor" else self.kind
+
 
 @dataclass(frozen=True)
 class Held:
@@ -399,20 +404,17 @@ class Variables(Owned):
     def _power(self, lens: Lens, variable: Variable) -> tuple[Tensor, Tensor]:
         """The power at 0 of a variable, and its change to 1; 1/mm."""
         zero = torch.zeros_like(lens.surfaces[-2].thickness)
-        at_zero, at_one = (first_order(_with_value(lens, variable, zero + k)).power for k in range(2))
+        at_zero, at_one = (first_order(_with_values(lens, [variable], [zero + k])).power for k in range(2))
         return at_zero, at_one - at_zero
 
     def forward(self) -> Lens:
         """The lens with the current values of its variables."""
         lens = self._free()
-        return lens if self.held is None else _with_value(lens, self.held.by, self._solved(lens))
+        return lens if self.held is None else _with_values(lens, [self.held.by], [self._solved(lens)])
 
     def _free(self) -> Lens:
         """The lens without its solved number."""
-        lens = self._modelled
-        for variable in self.variables:
-            lens = _with_value(lens, variable, self.number(variable))
-        return lens
+        return _with_values(self._modelled, self.variables, [self.number(variable) for variable in self.variables])
 
     def _solved(self, lens: Lens) -> Tensor:
         """The solved number () of the lens with all others."""
@@ -568,8 +570,7 @@ class Variables(Owned):
         with torch.set_grad_enabled(derivatives):
             numbers.requires_grad_(derivatives)
             lens = to(self._modelled, dtype=torch.float64, device="cpu")
-            for variable, number in zip(self._all, numbers.unbind(), strict=True):
-                lens = _with_value(lens, variable, number)
+            lens = _with_values(lens, self._all, numbers.unbind())
             each = [*_shortfalls(lens, self.limits)]
         excess = np.array([float(one.detach()) for one in each])
         if not derivatives:
@@ -591,13 +592,10 @@ class Variables(Owned):
         return total + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
 
 
-def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:
-    """The lens with another number of a variable."""
-    if (variable.surface, variable.kind) == APERTURE:
-        return with_aperture(lens, value)
-    surfaces = list(lens.surfaces)
-    surfaces[variable.surface] = with_number(surfaces[variable.surface], variable.path, value)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+def _with_values(lens: Lens, variables: Sequence[Variable], values: Sequence[Tensor]) -> Lens:
+    """The lens with other numbers of variables."""
+    numbers = {variable.address: value for variable, value in zip(variables, values, strict=True)}
+    return with_numbers_of(lens, numbers, {variable.address: variable.path for variable in variables})
 
 
 def _named(lens: Lens, vary: str) -> tuple[tuple[Vary, ...], tuple[str, ...]]:

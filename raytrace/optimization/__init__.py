@@ -1,10 +1,11 @@
 """Optimisation of a lens by its merit function.
 
-variables         variable syntax; `Model`: the lens as a function of its variables
+variables         variable syntax; `DesignVariables`: the lens as a function of its variables
 lens_state        the lens at given variables: numbers, solves, first-order data and rays, with derivatives
 operands/         operands of merit functions, a file a family; `operand`: their definition; `table`: all of them
 merit             default merit functions, merit functions as values, their evaluation with the Jacobian
 merit_of_batch    merit functions of a batch of lenses, with derivatives
+jacobian          derivatives of rays, merit functions and any function of a lens by its variables
 evaluate          the value of a merit function row by row, with its table and figure
 problem           constraint syntax; merit function and constraints as the sum of squares of the solver
 least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B

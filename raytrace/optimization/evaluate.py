@@ -12,7 +12,7 @@ from raytrace.maths.result import Column, Result, Table, rows
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.plotting.style import FAINT, field_colours, new_figure, number_text, styled
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
@@ -234,7 +234,7 @@ def evaluate(
     if lens.count is not None:
         return _of_batch(lens, function, shown)
     options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluation = Evaluation(Model(lens), function.rows, **options)
+    evaluation = Evaluation(DesignVariables(lens), function.rows, **options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
     return MeritResult(
         lens=lens,

@@ -31,7 +31,7 @@ from raytrace.materials.glass import Glass, is_air, model_glass, refractive_inde
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
 from raytrace.optimization.least_squares import State, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.variables import GLASS, Freedom, Model, followers
+from raytrace.optimization.variables import GLASS, DesignVariables, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 
@@ -262,7 +262,7 @@ class Choice:
 
     def __init__(
         self,
-        free: Freedom,
+        model: DesignVariables,
         surfaces: Sequence[int],
         pool: Pool,
         rows: Sequence[Row],
@@ -276,7 +276,7 @@ class Choice:
     ):
         """cycles: of a stage, at most; until: a time of `time.monotonic`; keep: called with the best state while
         glasses are exchanged, and its merit; options: of Problem."""
-        self.free, self.surfaces, self.pool, self.bounds = free, tuple(surfaces), pool, bounds
+        self.model, self.surfaces, self.pool, self.bounds = model, tuple(surfaces), pool, bounds
         self.rows, self.conditions, self.options = rows, conditions, options
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
         self.until, self.started, self.evaluations = until, time.monotonic(), 0
@@ -288,7 +288,7 @@ class Choice:
         """For every surface the glasses and their numbers: of the pool, and its own glass, if of a catalog."""
         found = {}
         for k in self.surfaces:
-            own, names = self.free.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
+            own, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
             new = bool(own.catalog) and (own.listed_name or own.name, own.catalog) not in names
             glasses = (*self.pool.glasses, own) if new else self.pool.glasses
             numbers = [self.pool.numbers, self.pool.numbers_of(own)[None]] if new else [self.pool.numbers]
@@ -297,7 +297,7 @@ class Choice:
 
     def run(self, x: np.ndarray, stored: Stored | None = None) -> Design:
         """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
-        own = {k: self.free.lens.surfaces[k].glass for k in self.surfaces}
+        own = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
         if stored is not None and stored.glasses:
             chosen = own | {k: self._named(k, *one) for k, one in stored.glasses.items()}
             self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
@@ -351,18 +351,18 @@ class Choice:
         numbers = tuple(Vary(k, name) for k in open_ for name in self.pool.names)
         follow = tuple(
             Solve(k, name, "pickup", source=source)
-            for k, source in followers(self.free.lens).items()
+            for k, source in followers(self.model.lens).items()
             for name in self.pool.names
             if source in open_
         )
-        model = Model(
-            with_glasses(self.free.lens, glasses), (*self.free.variables, *numbers), (*self.free.solves, *follow)
+        model = DesignVariables(
+            with_glasses(self.model.lens, glasses), (*self.model.variables, *numbers), (*self.model.solves, *follow)
         )
         return Problem(model, self.rows, self.conditions, **self.options)
 
     def limited(self, problem: Problem, open_: Sequence[int]):
         """The states of a problem with the hull of the glasses as limits."""
-        count, k = len(self.free.variables), self.pool.count
+        count, k = len(self.model.variables), self.pool.count
         slope = np.zeros((0, count + k * len(open_)))
         for j in range(len(open_)):
             rows = np.zeros((len(self.pool.normal), slope.shape[1]))
@@ -393,7 +393,7 @@ class Choice:
             raise KeyboardInterrupt
         self.evaluations += found.evaluations
         self.descended += len(found.cycles)
-        count, k = len(self.free.variables), self.pool.count
+        count, k = len(self.model.variables), self.pool.count
         end = found.state.x
         numbers = {s: end[count + k * j : count + k * (j + 1)] for j, s in enumerate(open_)}
         glasses = design.glasses | {s: self.pool.model(one) for s, one in numbers.items()}
@@ -405,7 +405,7 @@ class Choice:
         modelled = Design(design.x, models, None)
         x = self._start(modelled, self.surfaces)
         state = self.limited(self.problem(models, self.surfaces), self.surfaces)(x, True)
-        count, k = len(self.free.variables), self.pool.count
+        count, k = len(self.model.variables), self.pool.count
         columns = {s: np.arange(count + k * j, count + k * (j + 1)) for j, s in enumerate(self.surfaces)}
         inside = np.arange(count)[(design.x > self.bounds[0]) & (design.x < self.bounds[1])]
         held = len(state.limits) - len(self.pool.normal) * len(self.surfaces)

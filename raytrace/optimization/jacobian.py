@@ -15,7 +15,7 @@ from raytrace.maths.numerics import Dual, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
-from raytrace.optimization.variables import Model, freedom, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables, name_of
 from raytrace.system.lens import Lens, aligned, wavelengths_of
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
@@ -113,8 +113,7 @@ def jacobian(
     lambda lens: rt.spot(lens).whole.rms_radius. Derivatives are exact to rounding; those of failed rays are 0. Raises
     BadVariables, TypeError, ValueError.
     """
-    free = freedom(lens, vary)
-    model = Model(free.lens, free.variables, free.solves)
+    model = design_variables(lens, vary)
     if of == "merit":
         quantity, derivatives = _of_merit(model, lens, merit)
     else:
@@ -138,7 +137,7 @@ def jacobian(
     )
 
 
-def moving_lens(model: Model, variables: np.ndarray | None = None) -> Lens:
+def moving_lens(model: DesignVariables, variables: np.ndarray | None = None) -> Lens:
     """The lens at variables (n,), by default its own, whose numbers carry their derivatives by all of them."""
     at = model.start if variables is None else np.asarray(variables, dtype=float)
     view = model.views[model.lens.current_configuration - 1]
@@ -151,7 +150,8 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
         number = function(lens)
     if not isinstance(number, Tensor):
         raise TypeError(
-            f"jacobian: `of` returns {named_value(number)}; expected a tensor, as lambda lens: rt.spot(lens).whole.rms_radius"
+            f"jacobian: `of` returns {named_value(number)}; expected a tensor, as of lambda lens: "
+            "rt.spot(lens).whole.rms_radius"
         )
     if not isinstance(number, MovingTensor):
         return number.detach(), number.new_zeros(count, *number.shape)
@@ -167,7 +167,7 @@ def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> 
     return function
 
 
-def _of_merit(model: Model, lens: Lens, merit) -> tuple[Tensor, Tensor]:
+def _of_merit(model: DesignVariables, lens: Lens, merit) -> tuple[Tensor, Tensor]:
     """The residuals (m,) of a merit function, whose squares sum up to M², and their derivatives (n, m)."""
     function = merit_for(lens, merit)
     options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}

@@ -44,7 +44,7 @@ from raytrace.optimization.operands.operand import (
     need_all,
 )
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.variables import Model
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
@@ -481,7 +481,7 @@ class Evaluation:
 
     def __init__(
         self,
-        model: Model,
+        model: DesignVariables,
         rows: Sequence[Row],
         *,
         unit: float = 1.0,

@@ -13,7 +13,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.tangents import applied
 from raytrace.optimization.merit import Evaluated, Evaluation, Merit
-from raytrace.optimization.variables import APERTURE, GLASS_NUMBER, Address, Model
+from raytrace.optimization.variables import APERTURE, GLASS_NUMBER, Address, DesignVariables
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import ParameterPath, parameter_paths
@@ -34,7 +34,7 @@ class MeritOfBatch:
         columns = [number.reshape(-1).expand(self.count) for number in found.values()]
         self.by = tuple(k for k, column in enumerate(columns) if column.requires_grad)
         self.numbers = torch.stack(columns, -1) if columns else lens.wavelengths.new_zeros(self.count, 0)
-        model = Model(first, variables=tuple(Vary(*address) for address in self.addresses))
+        model = DesignVariables(first, variables=tuple(Vary(*address) for address in self.addresses))
         options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
         self.evaluation = Evaluation(model, function.rows, **options)
 

@@ -62,7 +62,14 @@ from raytrace.optimization.problem import (
     optimization_data_of,
     typical_of,
 )
-from raytrace.optimization.variables import APERTURE, Model, bounds_of, freedom, name_of, without_glass
+from raytrace.optimization.variables import (
+    APERTURE,
+    DesignVariables,
+    bounds_of,
+    design_variables,
+    name_of,
+    without_glass,
+)
 from raytrace.plotting import style
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_label, field_points
@@ -907,15 +914,14 @@ def optimize(
         if None not in (log, path) and os.path.realpath(log) == os.path.realpath(path):
             raise ValueError(f"{log}: `log` and `{option}` are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
-    free, glasses = without_glass(freedom(lens, vary), vary)
-    names = tuple(name_of(one) for one in free.variables)
-    model = Model(free.lens, free.variables, free.solves)
-    lower, upper = bounds_of(free.lens, free.variables, bounds)
+    model, glasses = without_glass(design_variables(lens, vary), vary)
+    names = tuple(name_of(one) for one in model.variables)
+    lower, upper = bounds_of(model.lens, model.variables, bounds)
     for name, least, most in zip(names, lower, upper, strict=True):
         if not least <= most:
             raise NoProblem(f"`bounds` of {name}: from {least:g} to {most:g} there is nothing")
     settings = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles}
-    of = {**identity(lens), "variables": list(names), "solves": digest(repr(free.solves)), "paths": paths}
+    of = {**identity(lens), "variables": list(names), "solves": digest(repr(model.solves)), "paths": paths}
     of |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
 
     def stored() -> Stored:
@@ -949,7 +955,7 @@ def optimize(
     function = merit_for(lens, merit)
     conditions = conditions_in_unit(lens, hold, function.unit)
     of_rows = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    term = None if as_built is None else as_built.of(free.lens)
+    term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, function.rows, conditions, as_built=term, **of_rows)
     of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
     of |= {} if term is None else {"as built": digest(term.about())}
@@ -982,7 +988,7 @@ def optimize(
             pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
             of_choice = {"cycles": cycles, "until": until, "keep": observer.checkpoint.write_glasses, **of_rows}
             of_choice |= {"as_built": term}
-            choice = Choice(free, glasses, pool, function.rows, conditions, limits, **of_choice)
+            choice = Choice(model, glasses, pool, function.rows, conditions, limits, **of_choice)
             start, problem = choice.run(start, resumed).x, choice.problem(choice.best.glasses, ())
         settings["seconds"] = None if seconds is None else until - time.monotonic()
         descent = best_of_paths(
@@ -1068,7 +1074,12 @@ def _refuse_undefined(problem: Problem, start: Evaluated) -> None:
 
 
 def _lens_at(
-    model: Model, x: np.ndarray, *, rows: Sequence[Row] = (), unit: float = 1.0, bounded: dict[str, tuple] | None = None
+    model: DesignVariables,
+    x: np.ndarray,
+    *,
+    rows: Sequence[Row] = (),
+    unit: float = 1.0,
+    bounded: dict[str, tuple] | None = None,
 ) -> Lens:
     """The lens with its optimisation data; bounded: the bounds of this optimisation, by variable."""
     lens = model.lens_at(x)
@@ -1085,7 +1096,7 @@ def _lens_at(
 def _optimized(
     lens: Lens,
     after: Lens,
-    model: Model,
+    model: DesignVariables,
     names: tuple[str, ...],
     x: np.ndarray,
     descent: BestDescent,

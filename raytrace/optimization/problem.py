@@ -35,7 +35,13 @@ from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit
 from raytrace.optimization.operands.aberrations import unvignetted
 from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.variables import BadHold, Model, constraint_words, has_power, split_constraint
+from raytrace.optimization.variables import (
+    BadHold,
+    DesignVariables,
+    constraint_words,
+    has_power,
+    split_constraint,
+)
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor
@@ -343,7 +349,7 @@ class Problem:
 
     def __init__(
         self,
-        model: Model,
+        model: DesignVariables,
         rows: Sequence[Row],
         conditions: Sequence[Condition] = (),
         *,
@@ -470,7 +476,9 @@ class FunctionMerit:
     without evaluating.
     """
 
-    def __init__(self, model: Model, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()):
+    def __init__(
+        self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()
+    ):
         self.view = model.views[model.lens.current_configuration - 1]
         self.function, self.evaluations, self.evaluated = function, 0, [*evaluated]
         self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
@@ -488,7 +496,7 @@ class FunctionMerit:
         return value, slope
 
 
-def optimization_data_of(model: Model, rows: Sequence[Row], unit: float) -> OptimizationData:
+def optimization_data_of(model: DesignVariables, rows: Sequence[Row], unit: float) -> OptimizationData:
     """Optimisation data of a lens whose file has none; all semi-diameters that it has stay specified."""
     given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
     return OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
@@ -506,7 +514,7 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
         yield dataclasses.replace(one.row, weight=-1.0), RELATIONS[one.relation]
 
 
-def typical_of(model: Model) -> np.ndarray:
+def typical_of(model: DesignVariables) -> np.ndarray:
     """Large changes (n,) of the variables: for beams h wide h in thickness, 1/10h in curvature; or inf."""
     state = model.views[model.lens.current_configuration - 1].state(model.start)
     h = 0.5 * float(state.entrance_pupil_diameter)

@@ -39,7 +39,7 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.variables import Freedom
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
@@ -53,7 +53,7 @@ _ACTIVE = 1e-9  # up to which a limit counts as reached
 # -- surfaces for a meniscus -------------------------------------------------------------------------------------------
 
 
-def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
+def surfaces_of(free: DesignVariables, named: Sequence[int] = ()) -> tuple[int, ...]:
     """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
@@ -69,7 +69,7 @@ def surfaces_of(free: Freedom, named: Sequence[int] = ()) -> tuple[int, ...]:
     return tuple(dict.fromkeys(named))
 
 
-def _objection(free: Freedom, k: int) -> str:
+def _objection(free: DesignVariables, k: int) -> str:
     """Why a surface takes no meniscus, "" where it does."""
     lens = free.lens
     if not 1 <= k <= sensor(lens):
@@ -89,7 +89,7 @@ def _objection(free: Freedom, k: int) -> str:
 
 def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
-    made, free = with_meniscus(lens, k), task.free
+    made, free = with_meniscus(lens, k), task.model
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
     old = [_moved(one, k) for one in free.variables]
     own = {one: ends for one, *ends in zip(old, *task.bounds, strict=True)}
@@ -105,7 +105,7 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
         made = replace(made, optimization_data=replace(data, tolerances=()))
     return replace(
         task,
-        free=Freedom(made, variables, solves),
+        model=DesignVariables(made, variables, solves),
         rows=tuple(_row(row, k) for row in task.rows),
         conditions=tuple(replace(one, row=_row(one.row, k)) for one in task.conditions),
         bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
@@ -232,7 +232,7 @@ class Place:
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
         """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
         space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
-        gaps = np.array([one.quantity == "thickness" and one.surface in new for one in self.task.free.variables])
+        gaps = np.array([one.quantity == "thickness" and one.surface in new for one in self.task.model.variables])
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
         problem = self.task.problem(thinned(self.task.rows, self.k, part))
@@ -241,8 +241,8 @@ class Place:
     @property
     def family(self) -> tuple:
         """What lenses have in common whose variables can be compared."""
-        lens = self.task.free.lens
-        variables = tuple((one.surface, one.quantity) for one in self.task.free.variables)
+        lens = self.task.model.lens
+        variables = tuple((one.surface, one.quantity) for one in self.task.model.variables)
         media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
         return media, lens.stop, variables
 

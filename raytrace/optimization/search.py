@@ -50,7 +50,7 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.variables import bounds_of, freedom
+from raytrace.optimization.variables import bounds_of, design_variables
 from raytrace.plotting import style
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
@@ -239,7 +239,7 @@ def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: 
         place = ""
         if folder is not None:
             path = Path(folder) / NEAREST
-            write_lens(_design(task.whole, nearest.x, task.free.lens.name), path)
+            write_lens(_design(task.whole, nearest.x, task.model.lens.name), path)
             place = f", in {path}"
         parts.append(f"the nearest of {len(ends)} descents{place}: {words or 'it is not at its minimum yet'}")
     return NoProblem("; ".join(parts) + ": allow more `starts`, `seconds` or wider `bounds`, or hold less")
@@ -351,7 +351,7 @@ def search(
     warn_of_filling(lens, field_points(None, like=lens))
     started = time.monotonic()
     function = merit_for(lens, merit)
-    free = freedom(lens, vary)
+    free = design_variables(lens, vary)
     if any(one.quantity == "glass" for one in free.variables):
         raise NoProblem(
             "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"

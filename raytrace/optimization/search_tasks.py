@@ -25,7 +25,7 @@ from scipy.stats import qmc
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.variables import Freedom, Model, name_of
+from raytrace.optimization.variables import DesignVariables, name_of
 from raytrace.shards import agreeing, share, total
 from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, text
 from raytrace.system.identity import identity, unlike
@@ -200,7 +200,7 @@ class Space:
     focal_length: mm that starts are scaled to, None where none is known.
     """
 
-    model: Model
+    model: DesignVariables
     lower: np.ndarray
     upper: np.ndarray
     low: np.ndarray
@@ -271,7 +271,11 @@ def _root(function: Callable, points: np.ndarray, distance: Callable) -> float |
 
 
 def space_of(
-    model: Model, bounds: tuple[np.ndarray, np.ndarray], length: float | None, glass: Range = None, air: Range = None
+    model: DesignVariables,
+    bounds: tuple[np.ndarray, np.ndarray],
+    length: float | None,
+    glass: Range = None,
+    air: Range = None,
 ) -> Space:
     """The search space: bounds (n,), infinite ones replaced; length: the focal length in mm, None where it is free.
 
@@ -293,7 +297,7 @@ def space_of(
     return Space(model, lower, upper, np.where(finite, low, start), np.where(finite, high, start), length)
 
 
-def _ends(model: Model, one: Vary, length: float | None, glass: Range, air: Range) -> tuple[float, float]:
+def _ends(model: DesignVariables, one: Vary, length: float | None, glass: Range, air: Range) -> tuple[float, float]:
     """Default bounds of a variable; infinite where there are none."""
     if one.quantity in _SPREAD:
         return _SPREAD[one.quantity]
@@ -320,7 +324,9 @@ def _ends(model: Model, one: Vary, length: float | None, glass: Range, air: Rang
     return scale * least, scale * most if np.isfinite(most) else (0.2 if is_glass else 0.35) * length
 
 
-def length_of(model: Model, rows: Sequence[Row], unit: float, conditions: Sequence[Condition]) -> float | None:
+def length_of(
+    model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition]
+) -> float | None:
     """The focal length in mm that is held, or the target of a row, or that of the lens; None where it has none."""
     for one in conditions:
         if one.row.operand == "EFFL":
@@ -348,17 +354,13 @@ class SearchProblem:
     given; glass, air: ranges of thicknesses, mm; settings: of `Problem`.
     """
 
-    free: Freedom
+    model: DesignVariables
     rows: tuple[Row, ...]
     conditions: tuple[Condition, ...]
     bounds: tuple[np.ndarray, np.ndarray]
     glass: Range
     air: Range
     settings: dict
-
-    @cached_property
-    def model(self) -> Model:
-        return Model(self.free.lens, self.free.variables, self.free.solves)
 
     @cached_property
     def space(self) -> Space:
@@ -376,7 +378,7 @@ class SearchProblem:
     def about(self, seed: int) -> dict:
         """Dependencies of a search, for its journal."""
         return {
-            **identity(self.free.lens),
+            **identity(self.model.lens),
             "variables": [name_of(one) for one in self.model.variables],
             "start": self.model.start.tolist(),
             "bounds": [self.space.lower.tolist(), self.space.upper.tolist()],

@@ -12,15 +12,14 @@ curvature:7=f_number(4)       solve, a row of SOLVED_BY
 thickness:2..15 sensor:57,58  bounds, of `bounds_of`; an open end is left out
 efl=50 total_track<=80        constraints, split by `constraint_words`
 
-`Model` holds a lens, its variables and solves; a `View` is one configuration of it, a `LensState` the view at given
-variables.
+`DesignVariables` are a lens with its variables and solves; a `View` is one configuration of it, a `LensState` the view
+at given variables.
 """
 
 import dataclasses
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -155,16 +154,68 @@ def names_at(surface: Surface, path: tuple) -> list[str]:
     return [name for name, place in known.items() if place.path == fields and place.entry == flat]
 
 
-@dataclass(frozen=True)
-class Freedom:
-    """Variables, solves and pickups, and the lens in which all of these numbers are modelled, also where they are 0."""
+@dataclasses.dataclass(frozen=True)
+class DesignVariables:
+    """The numbers of a lens that move, in all its configurations, and the lens at any of their values.
+
+    lens: at the start, where all these numbers are modelled, also those that are 0; variables, solves: of
+    `OptimizationData`; opening: the fraction of pupil and field that the rays of a merit function fill. Raises
+    UnknownNumber for numbers that the lens does not have.
+    """
 
     lens: Lens
-    variables: tuple[Vary, ...]
+    variables: tuple[Vary, ...] = ()
     solves: tuple[Solve, ...] = ()
+    opening: float = 1.0
+
+    def __post_init__(self):
+        for one in (*self.variables, *self.solves):
+            if not 0 <= one.surface < len(self.lens.surfaces):
+                last = len(self.lens.surfaces) - 1
+                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
+        named = {
+            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
+            for one in self.variables
+        }
+        if len(named) < len(self.variables):
+            raise UnknownNumber("a variable is named twice")
+        object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
+
+    @cached_property
+    def views(self) -> tuple["View", ...]:
+        """The lens in each of its configurations."""
+        return tuple(View(self, number) for number in range(1, len(self.lens.configurations) + 1))
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The current variables (n,)."""
+        numbers = []
+        for one in self.variables:
+            if one.operand is not None:
+                numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
+                continue
+            stored = stored_number(self.lens, (one.surface, one.quantity))
+            numbers.append(0.0 if stored is None else float(stored))
+        return np.array(numbers)
+
+    def lens_at(self, variables: np.ndarray) -> Lens:
+        """The lens with its variables there, and with all that follows from them."""
+        lens = self.lens
+        like = lens.wavelengths
+        operands = list(lens.operands)
+        for configuration in range(1, len(self.lens.configurations) + 1) if operands else ():
+            for k, (variable, scale, offset) in followed(self, configuration).items():
+                numbers = operands[k].numbers.clone()
+                numbers[configuration - 1] = scale * float(variables[variable]) + offset
+                operands[k] = dataclasses.replace(operands[k], numbers=numbers)
+        lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
+        current = self.views[lens.current_configuration - 1]
+        numbers = current.state(np.asarray(variables, dtype=float)).numbers
+        there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
+        return with_numbers_of(lens, there)
 
 
-def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freedom:
+def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> DesignVariables:
     """The variables, solves and pickups of a lens by variable syntax, or by default those of its file.
 
     Solves of the file are kept unless the syntax overrides them: a number that is named varies, and a word without
@@ -175,12 +226,12 @@ def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freed
     if vary is None:
         if data is None or not data.variables:
             raise BadVariables("the file has no variables: `vary` names them, as 'curvature thickness'")
-        return Freedom(lens, data.variables, of_file)
+        return DesignVariables(lens, data.variables, of_file)
     listed = [vary] if isinstance(vary, str) else vary
     variables: dict[str, Vary] = {name_of(one): one for one in listed if not isinstance(one, str)}
     words = split_words([one for one in listed if isinstance(one, str)])
     if variables and not words:
-        return Freedom(lens, tuple(vary), of_file)
+        return DesignVariables(lens, tuple(vary), of_file)
     new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     for word in words:
         if "=" not in word:
@@ -205,7 +256,7 @@ def freedom(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> Freed
             at, passed = after[at], passed + 1
         if passed > len(after):
             raise BadVariables(f"{start[1]}:{start[0]} follows itself, by way of other numbers")
-    return Freedom(with_modelled(lens, (*variables.values(), *new)), tuple(variables.values()), solves)
+    return DesignVariables(with_modelled(lens, (*variables.values(), *new)), tuple(variables.values()), solves)
 
 
 def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
@@ -401,7 +452,7 @@ def _addresses_of(lens: Lens, operand: Operand) -> Iterator[tuple[Address, Scale
 # -- glasses that vary ------------------------------------------------------------------------------------------------
 
 
-def without_glass(free: Freedom, vary: str | Sequence | None) -> tuple[Freedom, tuple[int, ...]]:
+def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[DesignVariables, tuple[int, ...]]:
     """What varies but for glasses, and the surfaces whose glasses do.
 
     Those that the file marks, where words mean all; other numbers of those glasses vary no more. The file's variables
@@ -531,70 +582,10 @@ _AT_ZERO = ("curvature", "conic")
 _POWERS = {"thickness": 1, "curvature": -1}
 
 
-@dataclasses.dataclass(frozen=True)
-class Model:
-    """A lens whose variables move.
-
-    lens: as it is at the start; variables, solves: of `OptimizationData`; opening: the fraction of pupil and field that
-    the rays of a merit function fill. Raises UnknownNumber for numbers that it does not have.
-    """
-
-    lens: Lens
-    variables: tuple[Vary, ...] = ()
-    solves: tuple[Solve, ...] = ()
-    opening: float = 1.0
-
-    def __post_init__(self):
-        for one in (*self.variables, *self.solves):
-            if not 0 <= one.surface < len(self.lens.surfaces):
-                last = len(self.lens.surfaces) - 1
-                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
-        named = {
-            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
-            for one in self.variables
-        }
-        if len(named) < len(self.variables):
-            raise UnknownNumber("a variable is named twice")
-        object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
-
-    @cached_property
-    def views(self) -> tuple["View", ...]:
-        """The lens in each of its configurations."""
-        return tuple(View(self, number) for number in range(1, len(self.lens.configurations) + 1))
-
-    @cached_property
-    def start(self) -> np.ndarray:
-        """The current variables (n,)."""
-        numbers = []
-        for one in self.variables:
-            if one.operand is not None:
-                numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
-                continue
-            stored = stored_number(self.lens, (one.surface, one.quantity))
-            numbers.append(0.0 if stored is None else float(stored))
-        return np.array(numbers)
-
-    def lens_at(self, variables: np.ndarray) -> Lens:
-        """The lens with its variables there, and with all that follows from them."""
-        lens = self.lens
-        like = lens.wavelengths
-        operands = list(lens.operands)
-        for configuration in range(1, len(self.lens.configurations) + 1) if operands else ():
-            for k, (variable, scale, offset) in followed(self, configuration).items():
-                numbers = operands[k].numbers.clone()
-                numbers[configuration - 1] = scale * float(variables[variable]) + offset
-                operands[k] = dataclasses.replace(operands[k], numbers=numbers)
-        lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
-        current = self.views[lens.current_configuration - 1]
-        numbers = current.state(np.asarray(variables, dtype=float)).numbers
-        there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
-        return with_numbers_of(lens, there)
-
-
 class View:
     """A lens in one configuration: what of it moves, and what stays."""
 
-    def __init__(self, model: Model, configuration: int, *, clips: bool = False):
+    def __init__(self, model: DesignVariables, configuration: int, *, clips: bool = False):
         """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
         self.model, self.configuration = model, configuration
         lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
@@ -766,7 +757,7 @@ class View:
         return LensState(self, variables)
 
 
-def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, float, float]]:
+def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
     """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
     operands that pick up the number of another configuration."""
     return {
@@ -776,7 +767,7 @@ def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, f
     }
 
 
-def followed(model: Model, configuration: int) -> dict[int, tuple[int, float, float]]:
+def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int, float, float]]:
     """By operand that moves in a configuration: which variable moves it, by what factor, and what is added to it.
 
     A pickup of another configuration is scale · (number there) + offset, and that may be one, too.

@@ -247,9 +247,7 @@ def _powers_and_gaps(surfaces: Sequence[Surface], indices: Sequence[Tensor], wav
     return [power(surface, before, behind, wavelength) for surface, before, behind in pairs], gaps
 
 
-def _matrices(
-    powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor, *before: int
-) -> list[tuple[Tensor, ...]]:
+def _matrices(powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor, *before: int) -> list[tuple[Tensor, ...]]:
     """(A, B, C, D) up to before some surfaces, from 0, -1 behind the last one: `ynu` of two rays at once."""
     axes = max(number.dim() for number in (like, *powers, *gaps))
     y, one = like.new_tensor([1.0, 0.0]).reshape(2, *[1] * axes), torch.ones_like(like)

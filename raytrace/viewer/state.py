@@ -22,7 +22,7 @@ from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.rays import RAYS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.operands.wavefront import PATH, QUALITY
-from raytrace.optimization.variables import Model, freedom, path_of
+from raytrace.optimization.variables import DesignVariables, design_variables, path_of
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
@@ -286,7 +286,7 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
 def solved(lens: Lens) -> Lens:
     """The lens whose solves and pickups hold."""
     solves = lens.optimization_data.solves if lens.optimization_data else ()
-    return Model(lens, (), solves).lens_at(np.zeros(0)) if solves else lens
+    return DesignVariables(lens, (), solves).lens_at(np.zeros(0)) if solves else lens
 
 
 def aperture_sizes(lens: Lens) -> dict[str, float]:
@@ -325,7 +325,7 @@ def _vary(state: State, event: Mapping) -> State:
     word = f"{event['quantity']}:{event['surface']}"
     chosen = tuple(one for one in state.vary if one != word)
     if event.get("on"):
-        freedom(state.lens, word)
+        design_variables(state.lens, word)
         chosen = (*chosen, word)
     return edited(state, state.lens, chosen)
 
