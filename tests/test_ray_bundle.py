@@ -151,7 +151,7 @@ def test_the_launch_in_numpy_is_that_of_torch(cases, name):
     model, bundle = bundle_of(cases[name], name)
     state = model.views[0].state(Dual(model.start, np.eye(len(model.start))))
     in_numpy = bundle.launched(state)
-    by_torch, _ = rays_by_torch(state, bundle._start_by_torch, bundle.field.shape[1:], backward=bundle._aims_bent)
+    by_torch, _ = rays_by_torch(state, bundle._start_by_torch, bundle.field.shape[1:])
     for one, other in zip((*in_numpy[0], *in_numpy[1], in_numpy[2]), by_torch, strict=True):
         one = one if isinstance(one, Dual) else Dual(one, np.zeros_like(other.slope))
         assert np.allclose(one.value, other.value, rtol=1e-9, atol=1e-9)

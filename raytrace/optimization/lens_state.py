@@ -649,14 +649,23 @@ class Bundle:
     def _template(self):
         """Surfaces, structure and table (W, K) as stored, and the columns of what moves (`_columns`)."""
         view = self.view
+        of_media = {at for addresses in view.glasses.values() for at in addresses}
+        indices = torch.from_numpy(np.abs(view.indices))
+        numbers = {
+            at: torch.tensor(float(n), dtype=torch.float64) for at, n in view.stored.items() if at not in of_media
+        }
+        numbers |= {k: indices[:, k].clone() for k in view.glasses}
+        places, moving, count = {}, {}, sum(number.numel() for number in numbers.values())
+        for at, number in numbers.items():
+            first = len(places) and max(place.stop for place in places.values())
+            places[at] = slice(first, first + number.numel())
+            unit = torch.eye(count, dtype=torch.float64)[:, places[at]].reshape(count, *number.shape)
+            moving[at] = with_tangents(number, unit)
+        media = {k: moving[k] for k in view.glasses}
         with torch.enable_grad():
-            of_media = {at for addresses in view.glasses.values() for at in addresses}
-            shapes = {at: n for at, n in view.stored.items() if at not in of_media}
-            leaves, lens = view.leaves(shapes)
-            n = torch.from_numpy(np.abs(view.indices))
-            media = {k: n[:, k].clone().requires_grad_() for k in view.glasses}
+            lens = view.held({at: number for at, number in moving.items() if at not in media})
             _, structure, table = view.table_of(self.last, lens, media)
-            columns = _columns(table, leaves | media)
+        columns = _columns(table, numbers, places)
         return view.table_of(self.last, view.lens)[0], structure, table.detach().numpy().copy(), columns
 
     @cached_property
@@ -794,15 +803,9 @@ class Bundle:
         return table, changes
 
     def _table_by_torch(self, state: LensState) -> tuple[np.ndarray, np.ndarray]:
-        with torch.enable_grad():
-            leaves, lens = self.view.leaves({at: value_of(n) for at, n in state.numbers.items()})
-            table = self.view.table_of(self.last, lens)[2]
-            by = _by_leaves(table, leaves) if state.count else {}
-        changes = np.zeros((state.count, *table.shape))
-        for at, derivative in by.items():
-            if isinstance(state.numbers[at], Dual):
-                changes += state.numbers[at].slope[:, None, None] * derivative
-        return table.detach().numpy(), changes
+        with torch.set_grad_enabled(state.count > 0):
+            table = self.view.table_of(self.last, state.moving_lens())[2]
+        return table.detach().numpy(), tangents_of(table, state.count).detach().numpy()
 
     def launched(self, state: LensState):
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
@@ -874,26 +877,20 @@ class Bundle:
         return self._as_hits(state, parts, valid)
 
 
-def _by_leaves(table: Tensor, leaves: dict) -> dict:
-    """∂table/∂leaf (W, K), or (W, K, W) of a leaf (W,), of every leaf that it depends on."""
-    every = torch.eye(table.numel(), dtype=table.dtype)
-    if not leaves or not table.requires_grad:
-        return {}
-    by = torch.autograd.grad(table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True)
-    pairs = zip(leaves, by, strict=True)
-    return {at: g.reshape(*table.shape, *leaves[at].shape).numpy() for at, g in pairs if g is not None}
+def _columns(table: Tensor, numbers: dict, places: dict[object, slice]) -> dict | None:
+    """The columns of a table (W, K) that hold a number unchanged, by address; None if one holds a function of a number.
 
-
-def _columns(table: Tensor, leaves: dict) -> dict | None:
-    """The columns that hold a leaf unchanged, by address; None if a column holds a function of a leaf."""
-    columns = {}
-    for at, derivative in _by_leaves(table, leaves).items():
-        leaf = leaves[at].detach().numpy()
-        held = (table.detach().numpy() == (leaf if leaf.ndim == 0 else leaf[:, None])).all(0)
-        unchanged = np.eye(len(table)) if leaf.ndim else np.ones(len(table))
-        by_column = derivative.swapaxes(0, 1)  # (K, W, …)
-        moving = (by_column != 0).reshape(len(by_column), -1).any(-1)
-        if not (held[moving].all() and (by_column[moving] == unchanged).all()):
+    The table carries its derivatives by the entries of all numbers, () or (W,), at their places.
+    """
+    columns, values = {}, table.detach().numpy()
+    by = tangents_of(table, max((place.stop for place in places.values()), default=0)).detach().numpy()
+    for at, number in numbers.items():
+        number, derivative = number.numpy(), by[places[at]]  # (1 or W, W, K)
+        held = (values == (number if number.ndim == 0 else number[:, None])).all(0)
+        unchanged = np.eye(len(values))[:, :, None] if number.ndim else np.ones((1, len(values), 1))
+        moving = (derivative != 0).any((0, 1))
+        if not (held[moving].all() and (derivative[:, :, moving] == unchanged).all()):
             return None
-        columns[at] = np.flatnonzero(moving)
+        if moving.any():
+            columns[at] = np.flatnonzero(moving)
     return columns
