@@ -109,7 +109,7 @@ def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
     if quantity.startswith(GLASS_NUMBER):
         return ParameterPath(("glass", "coefficients"), int(quantity.removeprefix(GLASS_NUMBER)) - 1)
     known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
-    if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
+    if quantity not in known and surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
         entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
         known |= {name: ParameterPath(("glass", "coefficients"), entry) for name, entry in entries}
     if quantity not in known:

@@ -24,6 +24,11 @@ from raytrace.system.surface import SHAPE, Surface
 _PLAIN = 2  # axes of a tensor of one lens at most: heights; more vary from lens to lens, behind that of the entries
 _POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
 
+#: Fields of a surface that are one number, and those that hold several, in the order of the surface.
+_NUMERIC = [field for field in dataclasses.fields(Surface) if field.name in (*SHAPE, "phase", "before", "after")]
+_SINGLE = [field.name for field in _NUMERIC if field.type == Tensor | None and field.name != "coefficients"]
+_OF_SEVERAL = [field.name for field in _NUMERIC if field.name not in (*_SINGLE, "kind")]
+
 
 class ParameterPath(NamedTuple):
     """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
@@ -44,16 +49,16 @@ def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
     behind the surface has its names with "_after", as tilt_x_after.
     """
     paths: dict[str, ParameterPath] = {}
-    for field in dataclasses.fields(Surface):
-        part = getattr(surface, field.name)
-        if field.name == "coefficients":
+    for name in _SINGLE:
+        paths[name] = ParameterPath((name,))
+    for name in _OF_SEVERAL:
+        part = getattr(surface, name)
+        if name == "coefficients":
             paths |= _coefficients(part, KINDS[surface.kind])
-        elif field.name in SHAPE and field.type == Tensor | None:
-            paths[field.name] = ParameterPath((field.name,))
-        elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
-            behind = "_after" if field.name == "after" else ""
+        elif part is not None and dataclasses.is_dataclass(part):
+            behind = "_after" if name == "after" else ""
             for inner in dataclasses.fields(part):
-                paths |= _entries((field.name, inner.name), getattr(part, inner.name), inner.name + behind)
+                paths |= _entries((name, inner.name), getattr(part, inner.name), inner.name + behind)
     return paths
 
 
