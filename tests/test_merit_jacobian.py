@@ -6,7 +6,8 @@ import torch
 
 from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit, Evaluation
-from raytrace.optimization.variables import design_variables, with_numbers_of
+from raytrace.optimization.variables import design_variables
+from raytrace.system.parameter_paths import with_numbers_of
 from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.trace import trace_lens
 

@@ -188,7 +188,8 @@ def test_one_wavelength_is_that_one_alone():
 def test_rays_are_scaled_by_a_perfect_lens_by_default():
     lens = rt.read_lens("cooke_triplet")
     scaled, plain = values(lens, [in_columns("GMTS", plain=p) for p in (0.0, 1.0)])
-    assert scaled / plain == pytest.approx(float(rt.mtf(lens, [20.0]).limit[0]), rel=1e-12)
+    # Of a clear circle on the axis, as OpticStudio scales; `limit` is of the real pupil, by another sum.
+    assert scaled / plain == pytest.approx(float(rt.mtf(lens, [20.0]).limit[0, 0, 0]), rel=1e-3)
 
 
 def test_strehl_is_that_of_the_wavefront_map():

@@ -61,7 +61,7 @@ def test_the_quadrature_of_a_sheared_pupil_is_the_limit_of_the_grid():
     lens = defocused(3.0)
     frequencies = mtf.frequency_range(lens, torch.zeros(2, 1).double(), 21)
     scene = scene_of(lens, torch.zeros(2, 1).double())
-    sheared = torch.stack(mtf._sheared(scene, frequencies))
+    sheared = torch.stack(mtf._sheared(scene, frequencies)())
     shares = mtf.wavelength_shares(lens)
     coarse, fine = (torch.stack(mtf.mtf_on_grid(scene, frequencies, shares, **size)) for size in ({}, {"size": 1280}))
     assert (sheared - coarse).abs().max() < 1.2e-3
@@ -95,7 +95,7 @@ def test_rays_serve_where_diffraction_is_no_matter(monkeypatch):
     lens = mirror(20.0)
     scene = scene_of(lens, torch.zeros(2, 1).double())
     frequencies = mtf.frequency_range(lens, scene.fields, 41)
-    wave = torch.stack(mtf._sheared(scene, frequencies))
+    wave = torch.stack(mtf._sheared(scene, frequencies)())
     for module in (aperture, mtf):
         monkeypatch.setattr(module, "polynomials_of", lambda *_: None)
     found = rt.mtf(lens)
@@ -115,7 +115,7 @@ def test_the_change_by_diffraction_is_predicted(defocus, change):
     lens = mirror(defocus)
     scene = scene_of(lens, torch.zeros(2, 1).double())
     frequencies = mtf.frequency_range(lens, scene.fields, 41)
-    wave, rays = mtf._sheared(scene, frequencies), mtf._geometric(lens, scene.fields, frequencies)
+    wave, rays = mtf._sheared(scene, frequencies)(), mtf._geometric(lens, scene.fields, frequencies)
     assert (wave[0] - rays[0]).abs().max() == pytest.approx(change, rel=0.02)
     assert mtf._change_by_diffraction(scene, frequencies, rays) == pytest.approx(change, rel=0.3)
 

@@ -18,7 +18,7 @@ _POWERS = (-6, -3, -2, 2, 3, 6)  # of ten, between units: mm and µm or m, parts
 _DIGITS = 4  # a printed number with fewer may agree with another one by chance
 _UNITS_UNPRINTED = ("evaluate", "info", "trace")  # units of rows by operand; mm and degrees of a prescription, of CSV
 #: Rays that `spot` saves as CSV, counts of keywords, and numbers each in the unit of its row or its criterion.
-_WITHOUT_LENGTHS = {"Arrivals", "ImportReport", "MeritsOfBatch", "Tolerances", "Toleranced"}
+_WITHOUT_LENGTHS = {"Arrivals", "ImportReport", "Jacobian", "MeritsOfBatch", "Tolerances", "Toleranced"}
 
 
 #: Results of seconds, and their types.
@@ -187,6 +187,7 @@ def test_every_table_is_compared():
         return {kind}.union(*map(below, kind.__subclasses__()))
 
     assert callable(rt.tolerance)  # its results are loaded with it
+    assert callable(rt.jacobian)
     known = {type(computed(name)).__name__ for name in results() if name not in DEAR} | {*DEAR.values()}
     tables = {kind.__name__ for kind in below(Result) - {Result} if "columns" in vars(kind)}
     assert tables == known | _WITHOUT_LENGTHS

@@ -8,9 +8,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import RAY_BYTES, afford
+from raytrace.maths.numerics import is_wrapped
 from raytrace.maths.result import flat
 from raytrace.maths.sampling import gauss_rings
-from raytrace.maths.transforms import is_wrapped
 from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
 from raytrace.tracing.paraxial import first_order, largest_field

@@ -43,12 +43,11 @@ from raytrace.io import write_lens
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import grid, hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
-from raytrace.optimization.variables import GLASS
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
-from raytrace.system.parameter_paths import parse_range
+from raytrace.system.parameter_paths import GLASS, parse_range
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import Tolerances

@@ -40,24 +40,29 @@ from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
-    APERTURE,
-    GLASS,
-    Address,
     BadHold,
     bounds_of,
     constraint_words,
     name_of,
-    path_of,
     split_constraint,
     split_words,
     varied,
     with_modelled,
-    with_numbers_of,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
 from raytrace.system.lens import Lens, field_points, media
 from raytrace.system.optimization_data import Vary
-from raytrace.system.parameter_paths import BadVariables, ParameterPath, number_at, with_number
+from raytrace.system.parameter_paths import (
+    APERTURE,
+    GLASS,
+    Address,
+    BadVariables,
+    ParameterPath,
+    number_at,
+    path_of,
+    with_number,
+    with_numbers_of,
+)
 from raytrace.system.surface import medium_surfaces, sag_at
 from raytrace.tracing.geometry import edge_thickness, rims
 from raytrace.tracing.paraxial import first_order

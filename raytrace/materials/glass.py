@@ -20,8 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.maths.transforms import is_wrapped
+from raytrace.maths.numerics import is_wrapped, safe_divide, safe_sqrt, value
 from raytrace.words import RaytraceWarning, calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 | module    | contents                                                                                       |
 |-----------|------------------------------------------------------------------------------------------------|
 | numerics  | functions that stay finite with their gradients; dual numbers; values, dataclasses of tensors  |
+| tangents  | tensors that carry their derivatives by n variables: vector forward mode in one pass            |
 | sampling  | points and weights on the unit disc (Gauss, hexapolar, Sobol …): table SAMPLINGS; pixel grids   |
 | zernike   | Zernike polynomials: Noll, ANSI and fringe indices, values, gradients, fits                    |
 | bivariate | polynomials in x and y with derivatives                                                        |
@@ -11,5 +12,6 @@
 
 To add a sampling: a function of one size that returns points (2, P) and weights (P,), and a row of SAMPLINGS.
 
-Tests: tests/test_numerics, test_dual and test_value (numerics), test_pupil (sampling), test_zernike, test_result.
+Tests: tests/test_numerics, test_dual, test_value (numerics), test_tangents, test_pupil (sampling), test_zernike,
+test_result.
 """

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.transforms import has_forward_derivative, is_wrapped, plain_functions
+from raytrace.maths.numerics import has_forward_derivative, is_wrapped, plain_functions
 
 _stopped: contextvars.ContextVar[bool] = contextvars.ContextVar("stopped", default=False)
 

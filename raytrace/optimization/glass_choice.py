@@ -31,9 +31,10 @@ from raytrace.materials.glass import Glass, is_air, model_glass, refractive_inde
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
 from raytrace.optimization.least_squares import State, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.variables import GLASS, DesignVariables, followers
+from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.system.parameter_paths import GLASS
 
 _MATTERS = 1e-6  # of the index: what a number of a glass must change of it at the wavelengths, to vary
 

@@ -13,10 +13,10 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.tangents import applied
 from raytrace.optimization.merit import Evaluated, Evaluation, Merit
-from raytrace.optimization.variables import APERTURE, GLASS_NUMBER, Address, DesignVariables
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Vary
-from raytrace.system.parameter_paths import ParameterPath, parameter_paths
+from raytrace.system.parameter_paths import APERTURE, GLASS_NUMBER, Address, ParameterPath, parameter_paths
 
 
 class MeritOfBatch:

@@ -62,18 +62,12 @@ from raytrace.optimization.problem import (
     optimization_data_of,
     typical_of,
 )
-from raytrace.optimization.variables import (
-    APERTURE,
-    DesignVariables,
-    bounds_of,
-    design_variables,
-    name_of,
-    without_glass,
-)
+from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, name_of, without_glass
 from raytrace.plotting import style
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.parameter_paths import APERTURE
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling

@@ -11,10 +11,9 @@ from numpy.polynomial import legendre
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import is_wrapped, safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import Grid, centres, edges, gauss_rings, sobol
 from raytrace.maths.tangents import applied
-from raytrace.maths.transforms import is_wrapped
 from raytrace.psf_models.drt import histogram
 from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import stands_inside

@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import detached, safe_divide
+from raytrace.maths.numerics import detached, is_wrapped, safe_divide
 from raytrace.maths.sampling import Grid
-from raytrace.maths.transforms import is_wrapped
 from raytrace.psf_models.gaussian import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media

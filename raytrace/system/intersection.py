@@ -14,8 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import broadcast_shape, dot, with_batch_axes
-from raytrace.maths.transforms import differentiating
+from raytrace.maths.numerics import broadcast_shape, differentiating, dot, with_batch_axes
 from raytrace.system.phases import kind_of
 from raytrace.system.sag_terms import Relief, Sag, relief
 from raytrace.system.shapes import EVEN, KINDS, Form, size_of_terms

@@ -5,6 +5,7 @@ sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
 2:15                                        least and greatest
 
 `parameter_paths` lists the numbers of a surface of any kind: of its shape, its phase and its poses.
+`with_numbers_of` is the lens with other numbers, by surface and name.
 """
 
 import dataclasses
@@ -16,10 +17,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.materials.glass import is_air
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
+
+#: A number of a lens: of which surface, and which.
+Address = tuple[int, str]
+
+#: The number of the system aperture, a number of the lens that no surface has.
+APERTURE: Address = (0, "aperture")
+
+#: Numbers of the medium behind a surface, where it is a model glass or a constant index.
+GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
+
+#: Name of a coefficient of the dispersion formula of any other medium, counted from 1; of no variable syntax.
+GLASS_NUMBER = "glass_coefficient_"
 
 _PLAIN = 2  # axes of a tensor of one lens at most: heights; more vary from lens to lens, behind that of the entries
 _POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
@@ -99,6 +113,60 @@ def with_number(part, place: ParameterPath, number: Tensor):
         flat = old.reshape(-1)
         number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
     return dataclasses.replace(part, **{name: number})
+
+
+class UnknownNumber(ValueError):
+    """A variable, solve or pickup of a number that the lens does not have."""
+
+
+def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
+    """Where a surface holds a number. Raises UnknownNumber."""
+    if quantity.startswith(GLASS_NUMBER):
+        return ParameterPath(("glass", "coefficients"), int(quantity.removeprefix(GLASS_NUMBER)) - 1)
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
+    if quantity not in known and surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
+        entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
+        known |= {name: ParameterPath(("glass", "coefficients"), entry) for name, entry in entries}
+    if quantity not in known:
+        raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
+    return known[quantity]
+
+
+def with_numbers_of(
+    lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
+) -> Lens:
+    """The lens with other numbers, by address; known: their places, where they have been looked up before."""
+    surfaces = list(lens.surfaces)
+    if APERTURE in numbers:
+        lens = with_aperture(lens, numbers[APERTURE])
+    for (surface, quantity), number in numbers.items():
+        if (surface, quantity) == APERTURE:
+            continue
+        place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
+        surfaces[surface] = with_number(surfaces[surface], place, number)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def with_aperture(lens: Lens, number: Tensor) -> Lens:
+    """The lens with another number of its system aperture."""
+    return dataclasses.replace(lens, aperture=dataclasses.replace(lens.aperture, value=number))
+
+
+def stored_number(lens: Lens, at: Address) -> Tensor | None:
+    """The number at an address; None where a surface does not model it. Raises UnknownNumber."""
+    if at == APERTURE:
+        return lens.aperture.value
+    surface = lens.surfaces[at[0]]
+    return number_at(surface, path_of(surface, at[1], f"surface {at[0]}: "))
+
+
+def names_at(surface: Surface, path: tuple) -> list[str]:
+    """The names by which a surface's number at a path of `configurations` is known."""
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
+    entry = path[-1] if isinstance(path[-1], tuple) else None
+    fields = path[:-1] if entry is not None else path
+    flat = None if entry is None else entry[0] if len(entry) == 1 else None
+    return [name for name, place in known.items() if place.path == fields and place.entry == flat]
 
 
 def modelled(surface: Surface, name: str) -> Surface:

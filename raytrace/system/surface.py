@@ -15,8 +15,7 @@ from torch import Tensor
 
 from raytrace.materials.environment import Environment
 from raytrace.materials.glass import AIR, Glass
-from raytrace.maths.numerics import value
-from raytrace.maths.transforms import is_any
+from raytrace.maths.numerics import is_any, value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
 from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first, without_z

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import has_abbe_number, is_air
-from raytrace.maths.transforms import in_transform
+from raytrace.maths.numerics import in_transform
 from raytrace.system import configurations
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve

@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, in_transform, is_any, safe_divide, with_batch_axes
 from raytrace.maths.sampling import gauss_rings
 from raytrace.maths.tangents import values_alone, varies
-from raytrace.maths.transforms import in_transform, is_any
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at
@@ -50,7 +49,7 @@ def aim_at_stop(
     through(pupil, fraction): rays of a fraction of the field.
     """
     pupil = with_batch_axes(pupil, radius.dim())  # the radius may have an axis of object distances that points lack
-    target, first = turned(pupil), through(pupil[..., :1].detach(), 1.0)
+    target, first = turned(pupil), through((pupil[..., :1] if pupil.dim() > 1 else pupil).detach(), 1.0)
 
     def missed(aim: Tensor, fraction: float, target: Tensor = target) -> tuple[Tensor, Tensor]:
         position, arrives = at_stop(lens, through(aim, fraction), wavelength)

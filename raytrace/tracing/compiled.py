@@ -20,9 +20,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.numerics import broadcast_shape, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, in_forward_mode, in_transform, with_batch_axes
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
-from raytrace.maths.transforms import in_forward_mode, in_transform
 from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.poses import Gap, Turn, passage

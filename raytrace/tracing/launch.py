@@ -30,6 +30,7 @@ from raytrace.maths.numerics import (
     detached,
     dot,
     dot_2,
+    is_any,
     safe_divide,
     safe_sqrt,
     select,
@@ -39,7 +40,6 @@ from raytrace.maths.numerics import (
 )
 from raytrace.maths.sampling import gauss_rings
 from raytrace.maths.tangents import varies
-from raytrace.maths.transforms import is_any
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,

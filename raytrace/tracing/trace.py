@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import detached, dot, value
-from raytrace.maths.transforms import is_wrapped
+from raytrace.maths.numerics import detached, dot, is_wrapped, value
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
 from raytrace.system.lens import Lens, media

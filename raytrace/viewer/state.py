@@ -22,12 +22,12 @@ from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.rays import RAYS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.operands.wavefront import PATH, QUALITY
-from raytrace.optimization.variables import DesignVariables, design_variables, path_of
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Row, Vary
-from raytrace.system.parameter_paths import modelled, parameter_paths, with_number
+from raytrace.system.parameter_paths import modelled, parameter_paths, path_of, with_number
 from raytrace.tracing.geometry import gaps
 from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order

@@ -18,10 +18,9 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import afford, allowed_bytes, forewarn
 from raytrace.files import write_atomically
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_table
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import in_transform, value
 from raytrace.maths.result import Column, Result, Table, masked, number, rows
 from raytrace.maths.sampling import Grid, centres, grid
-from raytrace.maths.transforms import in_transform
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
