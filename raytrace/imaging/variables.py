@@ -37,6 +37,7 @@ from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import safe_divide, to
 from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
@@ -239,7 +240,7 @@ def _floating(values: tuple) -> Tensor:
 
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
-_BLUR_RAYS, _DIFFERENCE = (4, 8), 1e-4  # rays and differences, in sag, of units of blur
+_BLUR_RAYS = 4, 8  # of units of blur
 _NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
@@ -346,30 +347,25 @@ class Variables(Owned):
 
     @torch.no_grad()
     def _rescale(self) -> None:
-        """Units of equal blur: the RMS distance from the centroid by which rays of all fields move, by differences."""
-        like = self.lens.wavelengths
+        """Units of equal blur: the RMS distance from the centroid by which rays of all fields move."""
+        like, count = self.lens.wavelengths, len(self.variables)
         pupil, weights = gauss_rings(*_BLUR_RAYS, dtype=like.dtype, device=like.device)
-        fields = field_points(None, like=self.lens)
-
-        def hits() -> tuple[Tensor, Tensor]:
-            rays = image_rays(self(), pupil, fields=fields)
-            return rays.position[:2], rays.valid
-
-        scaled = {}
-        for variable in self.variables:
-            parameter, ends = self.get_parameter(variable.name), []
-            for shift in (_DIFFERENCE, -_DIFFERENCE):
-                parameter.fill_(shift)
-                ends.append(hits())
-            parameter.zero_()
-            (above, arrives), (below, also) = ends
-            weight = weights * (arrives & also)
-            moved = (above - below) / (2 * _DIFFERENCE)
-            total = weight.sum(-1, keepdim=True)
-            about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), total)
-            blur = safe_divide((weight * about.square().sum(0)).sum(), weight.sum()).sqrt()
-            if float(blur) > _NEGLIGIBLE:
-                scaled[variable.name] = dataclasses.replace(variable, unit=variable.unit / float(blur))
+        units = torch.eye(count, dtype=like.dtype, device=like.device)
+        moving = {
+            variable.name: with_tangents(self.get_parameter(variable.name).detach(), unit)
+            for variable, unit in zip(self.variables, units, strict=True)
+        }
+        with torch.enable_grad():
+            lens = torch.func.functional_call(self, moving, ())
+            rays = image_rays(lens, pupil, fields=field_points(None, like=self.lens))
+        moved, weight = tangents_of(rays.position, count)[:, :2], weights * rays.valid
+        about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), weight.sum(-1, keepdim=True))
+        blur = safe_divide((weight * about.square().sum(1)).sum((1, 2, 3)), weight.sum()).sqrt()
+        scaled = {
+            variable.name: dataclasses.replace(variable, unit=variable.unit / spread)
+            for variable, spread in zip(self.variables, blur.tolist(), strict=True)
+            if spread > _NEGLIGIBLE
+        }
         self.variables = tuple(scaled.get(one.name, one) for one in self.variables)
         self._all = tuple(scaled.get(one.name, one) for one in self._all)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import detached, dot, is_wrapped, value
+from raytrace.maths.tangents import tangents_of, value_of, with_tangents
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
 from raytrace.system.lens import Lens, media
@@ -414,27 +415,20 @@ def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, t
 
 
 def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
-    *rays, table = (part.detach() for part in task.inputs if part is not None)
-    traces_path = len(rays) == 3
-
-    def behind(position: Tensor, direction: Tensor, *others: Tensor) -> tuple:
-        end = _behind(surfaces, task, position, direction, *(others if traces_path else (None, *others)))
-        return (end.position, end.direction, *([end.opl] if traces_path else [])), end.valid
-
-    slopes = []
-    for number, change in enumerate(changes):
-        steps = [
-            torch.zeros_like(part) if start is None else start[k].select(int(k < 2), number)
-            for k, part in enumerate(rays)
-        ]
-        ends, slope, valid = torch.func.jvp(behind, (*rays, table), (*steps, change), has_aux=True)
-        slopes.append(slope)
-    by_position, by_direction, *by_opl = (torch.stack(parts) for parts in zip(*slopes, strict=True))
+    """As `push`, by tensors that carry their derivatives."""
+    *rays, table = (None if part is None else part.detach() for part in task.inputs)
+    if start is not None:
+        moved = start[0].movedim(1, 0), start[1].movedim(1, 0), start[2]
+        rays = [None if part is None else with_tangents(part, by) for part, by in zip(rays, moved, strict=True)]
+    with torch.enable_grad():
+        end = _behind(surfaces, task, *rays, with_tangents(table, changes))
+    by_position, by_direction, by_opl = (
+        None if part is None else tangents_of(part, len(changes)) for part in (end.position, end.direction, end.opl)
+    )
     return Pushed(
-        *ends[:2],
-        ends[2] if traces_path else None,
-        valid,
-        by_position.transpose(0, 1),
-        by_direction.transpose(0, 1),
-        by_opl[0] if traces_path else None,
+        *(None if part is None else value_of(part) for part in (end.position, end.direction, end.opl)),
+        end.valid,
+        by_position.movedim(0, 1),
+        by_direction.movedim(0, 1),
+        by_opl,
     )
