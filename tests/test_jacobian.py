@@ -143,6 +143,19 @@ def test_the_result_prints_and_is_a_document():
     assert np.asarray(found.document()["derivatives"]).shape == (2, 2, 2, 3, 144)
 
 
+def test_a_quantity_without_derivatives_is_reported():
+    with pytest.warns(rt.RaytraceWarning, match="carries no derivatives"):
+        found = rt.jacobian(COOKE, "curvature:1", of=lambda lens: lens.surfaces[2].thickness)
+    assert not found.derivatives.any()
+
+
+@pytest.mark.parametrize("name", ["focal_length", "direction"])
+def test_derivatives_of_a_base_ray_are_its_gradients(name):
+    """Its focal lengths follow from gradients that the function takes itself."""
+    bent = GAUSS.replace(3, tilt_x=1.0)
+    assert_gradients(lambda lens: getattr(rt.base_ray(lens), name), bent, "curvature:1,3 tilt:3 decentre:5")
+
+
 def test_wrong_quantities_are_refused():
     with pytest.raises(ValueError, match="did you mean directions"):
         rt.jacobian(COOKE, "curvature", of="direction")

@@ -94,6 +94,17 @@ def test_derivatives_have_derivatives():
     assert_close(second, 2 * X.sin() * 1 + 4 * X * X.cos() - X**2 * X.sin(), rtol=1e-12, atol=0)
 
 
+def test_gradients_within_a_function_carry_derivatives():
+    """∂/∂v of ∂f/∂s, s not among the variables: a root or a slope that a function finds by gradients of its own."""
+    x, *_ = moving()
+    s = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad((torch.sin(s * x) * x).sum(), s, create_graph=True)
+    assert_close(value_of(slope).detach(), (torch.cos(0.3 * X) * X**2).sum(), rtol=1e-14, atol=0)
+    expected = -torch.sin(0.3 * X) * 0.3 * X**2 + 2 * X * torch.cos(0.3 * X)
+    assert_close(tangents_of(slope, COUNT).detach()[: X.numel()].reshape(3, 4), expected, rtol=1e-13, atol=0)
+    assert not tangents_of(slope, COUNT)[X.numel() :].any()
+
+
 def test_nothing_is_lost_in_silence():
     x, y, _ = moving()
     with pytest.raises(NotImplementedError, match="changes a tensor in place"):

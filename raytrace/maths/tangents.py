@@ -478,6 +478,36 @@ def _is_continuous(number: Tensor) -> bool:
     return number.is_floating_point() or number.is_complex()
 
 
+def _gradient(outputs, inputs, grad_outputs=None, retain_graph=None, create_graph=False, **options):
+    """The rule of `torch.autograd.grad`: the gradients of the values, whose tangents are the gradients of tangents."""
+    outputs = (outputs,) if isinstance(outputs, Tensor) else tuple(outputs)
+    weights = (grad_outputs,) if isinstance(grad_outputs, Tensor) else grad_outputs
+    weights = [None] * len(outputs) if weights is None else [*weights]
+    count = next(len(x.tangents) for x in (*outputs, *weights) if isinstance(x, MovingTensor))
+    how = {**options, "retain_graph": True, "create_graph": create_graph, "allow_unused": True}
+    values = torch.autograd.grad([*map(_values, outputs)], inputs, [*map(_values, weights)], **how)
+    columns = []
+    for k in range(count):
+        terms = [(tangents_of(output, count)[k], _values(w)) for output, w in zip(outputs, weights, strict=True)]
+        terms += [
+            (_values(output), w.tangents[k])
+            for output, w in zip(outputs, weights, strict=True)
+            if isinstance(w, MovingTensor)
+        ]
+        terms = [(term, w) for term, w in terms if term.requires_grad]
+        if terms:
+            moved, shares = zip(*terms, strict=True)
+            columns.append(torch.autograd.grad(moved, inputs, shares, **how))
+        else:
+            columns.append([None] * len(values))
+    return tuple(
+        None
+        if value is None
+        else with_tangents(value, torch.stack([torch.zeros_like(value) if t is None else t for t in tangents]))
+        for value, tangents in zip(values, zip(*columns, strict=True), strict=True)
+    )
+
+
 def _forward_derivative(number: Tensor) -> Tensor:
     """The forward derivative that a tensor carries."""
     tangent = forward_ad.unpack_dual(number).tangent
@@ -677,6 +707,7 @@ for _function in (
 ):
     RULES[_function] = _linear(_function)
 RULES[torch.complex], RULES[torch.einsum] = _complex, _contracted
+RULES[torch.autograd.grad] = _gradient
 RULES[Tensor.data.__get__] = _constant(Tensor.data.__get__)
 RULES[Tensor.numpy] = RULES[Tensor.__array__] = RULES[Tensor.data_ptr] = _no_array
 RULES[torch.functional.broadcast_tensors] = _broadcast

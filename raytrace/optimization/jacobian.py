@@ -5,6 +5,7 @@ pickups bring about included, and the quantity is computed from it once, as with
 where that carries the rays, else by torch. Nothing is held fixed: rays are launched and aimed anew with every variable.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -21,7 +22,11 @@ from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import rays
 from raytrace.tracing.trace import trace_lens
-from raytrace.words import did_you_mean, named_value
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value
+
+
+class NoDerivatives(RaytraceWarning):
+    """A quantity that carries no derivatives by the design variables."""
 
 
 @value
@@ -154,6 +159,12 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
             "rt.spot(lens).whole.rms_radius"
         )
     if not isinstance(number, MovingTensor):
+        warnings.warn(
+            "jacobian: the quantity carries no derivatives, and 0 is returned: it does not depend on the variables, or "
+            "it is computed without them, by detach(), torch.no_grad() or plain numbers",
+            NoDerivatives,
+            stacklevel=calling_level(),
+        )
         return number.detach(), number.new_zeros(count, *number.shape)
     return value_of(number).detach(), tangents_of(number, count).detach()
 
