@@ -57,6 +57,9 @@ FUNCTIONS = {
     "placed": lambda x, y, z: x.new_zeros(5, 4).index_copy(0, PLACES, x)[:3],
     "broadcast": lambda x, y, z: sum(torch.broadcast_tensors(x, y, X)),
     "conversions": lambda x, y, z: x.to(torch.float64).clone().contiguous().double() * float(y.sum().detach()),
+    "parts": lambda x, y, z: sum(x.split(2, -1)).permute(1, 0)[:, [0, 1]] + torch.broadcast_to(y, (2, 4))[:, :2].sum(),
+    "chosen places": lambda x, y, z: x.index_select(1, PLACES).nan_to_num() + x.index_select(-1, PLACES),
+    "vector product": lambda x, y, z: torch.linalg.cross(z, Z, dim=0) + torch.linalg.cross(Z, z[:1], dim=-1),
     "without a rule": lambda x, y, z: torch.lerp(x, y, 0.3) + x.sort(0).values + torch.special.bessel_j0(x.detach()),
 }
 

@@ -300,6 +300,29 @@ def _expand(x, *shape, **options):
     return with_tangents(value, _full(x.tangents, value))
 
 
+def _split(x, split_size, dim=0):
+    parts = zip(torch.split(x, split_size, dim), torch.split(x.tangents, split_size, _shifted(dim)), strict=True)
+    return tuple(with_tangents(*part) for part in parts)
+
+
+def _permuted(x, dims):
+    count = x.tangents.dim() - 1
+    return with_tangents(x.permute(dims), x.tangents.permute(0, *(dim % count + 1 for dim in dims)))
+
+
+def _finite(x, *arguments, **options):
+    return with_tangents(torch.nan_to_num(x, *arguments, **options), x.tangents * torch.isfinite(x))
+
+
+def _crossed(a, b, dim=-1):
+    """The rule of the vector product along an axis."""
+    value = torch.linalg.cross(a, b, dim=dim)
+    count = next(len(x.tangents) for x in (a, b) if isinstance(x, MovingTensor))
+    (a_by, b_by), axis = (_full(tangents_of(x, count), value) for x in (a, b)), dim % value.dim() + 1
+    a, b = (_values(x).expand_as(a_by) for x in (a, b))
+    return with_tangents(value, torch.linalg.cross(a_by, b, dim=axis) + torch.linalg.cross(a, b_by, dim=axis))
+
+
 def _flipped(x, dims):
     return with_tangents(x.flip(dims), x.tangents.flip(_shifted(dims)))
 
@@ -627,7 +650,18 @@ _row(["clamp", "clip"], _clamped)
 _row(["clamp_min"], lambda x, min: _clamped(x, min=min))
 _row(["clamp_max"], lambda x, max: _clamped(x, max=max))
 _row(["reshape", "view"], _reshape, of_first=True)
-_row(["expand"], _expand, of_first=True)
+_row(["expand", "broadcast_to"], _expand, of_first=True)
+_row(["split"], _split, of_first=True)
+_row(
+    ["index_select"],
+    lambda x, dim, index: with_tangents(
+        torch.index_select(x, dim, index), torch.index_select(x.tangents, _shifted(dim), index)
+    ),
+    of_first=True,
+)
+_row(["permute"], lambda x, *dims: _permuted(x, _shape_of(dims)), of_first=True)
+_row(["nan_to_num"], _finite, of_first=True)
+_row(["cross"], _crossed)
 _row(["expand_as"], lambda x, other: _expand(x, other.shape) if isinstance(x, MovingTensor) else x.expand(other.shape))
 _row(["flatten"], _flatten, of_first=True)
 _row(["unbind"], _unbind, of_first=True)
