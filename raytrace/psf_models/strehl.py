@@ -17,6 +17,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.psf_models import dft
 from raytrace.psf_models.wave import Waves, amplitude, half_spread, one_field, phase_along_radius, probe_of, waves
+from raytrace.system.lens import one_lens
 from raytrace.tracing.clear_pupil import is_clipped
 from raytrace.tracing.scene import Scene, beam_share, symmetry
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
@@ -34,7 +35,14 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     It is searched where rays land and 4 λ/NA beyond. First and second derivatives are those of the maximum, which moves
     with the lens. 0 where no light arrives. Raises dft.TooManyPoints where the blur needs too many rays.
     """
-    return torch.cat([_of_field(one_field(scene, f), order) for f in range(scene.shape[1])], 1).to(scene.wavelengths)
+    return torch.cat([_of_lens(scene, d, order) for d in range(scene.shape[0])]).to(scene.wavelengths)
+
+
+def _of_lens(scene: Scene, d: int, order: int) -> Tensor:
+    """The ratios (1, F, W) of one lens or object distance: the sampling of its light is its own."""
+    if scene.shape[0] > 1:
+        scene = dataclasses.replace(scene, lens=one_lens(scene.lens, slice(d, d + 1)))
+    return torch.cat([_of_field(one_field(scene, f), order) for f in range(scene.shape[1])], 1)
 
 
 def _of_field(scene: Scene, order: int) -> Tensor:
