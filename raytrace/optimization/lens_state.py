@@ -146,6 +146,9 @@ SOLVES = {
 _PASSES = 60  # through solves that depend on one another
 _CONVERGED = 1e-15  # relative
 
+#: What a state is made of; all else is computed of it.
+_GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
+
 
 class LensState:
     """view: `variables.View`; variables: (n,) numbers, or a Dual of them."""
@@ -338,17 +341,9 @@ class LensState:
                 break
 
     def _forget(self) -> None:
-        for name in (
-            "thickness",
-            "curvature",
-            "vertex_curvature",
-            "media",
-            "vergence",
-            "field_scale",
-            "entrance_pupil_diameter",
-            "marginal_height",
-        ):
-            self.__dict__.pop(name, None)
+        """Drop what was computed of the numbers, which have changed."""
+        for name in vars(self).keys() - _GIVEN:
+            del vars(self)[name]
         self._kept.clear()
 
     # -- functions of torch ----------------------------------------------------------------------------------------
