@@ -69,8 +69,19 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("name", OF_RAYS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        pytest.param(
+            kind,
+            name,
+            marks=() if name == "landing points" or kind == "clipped" else pytest.mark.slow,
+            id=f"{kind}, {name}",
+        )
+        for kind in KINDS
+        for name in OF_RAYS
+    ],
+)
 def test_derivatives_of_rays_are_their_differences(kind, name):
     lens, vary = KINDS[kind]
     found = rt.jacobian(lens, vary, of=name, fields=FIELDS, pupil=PUPIL)
