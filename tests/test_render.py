@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import sys
 import warnings
 
@@ -508,15 +509,43 @@ def test_wavelengths_over_the_response_are_no_more_than_the_tolerance_needs(trip
     assert counts[0] < counts[1] <= 13
 
 
-def test_a_sensor_far_beyond_the_fields_is_reported_before_the_kernels(triplet, monkeypatch):
-    def computed(*_):
+@pytest.fixture
+def computed(monkeypatch):
+    def kernels(*_, **__):
         raise AssertionError("kernels are computed")
 
-    monkeypatch.setattr(render_module, "_image_circle", computed)
-    large = rt.Sensor(size=(90, 60), pixels=(300, 200), response="rgb")
-    reported = pytest.warns(BeyondFields, match=r"54.1 mm from the axis, 2.4 times .* take a smaller sensor")
-    with reported, pytest.raises(AssertionError, match="kernels are computed"):
-        optics(triplet, large)
+    for name in ("_over_response", "_model_of"):
+        monkeypatch.setattr(render_module, name, kernels)
+    return pytest.raises(AssertionError, match="kernels are computed")
+
+
+def test_a_sensor_far_beyond_the_fields_is_reported_before_the_kernels(triplet, computed):
+    reported = pytest.warns(BeyondFields, match=r"43.3 mm from the axis, 2 times .* take a smaller sensor")
+    with reported, computed:
+        optics(triplet, rt.Sensor(size=(72, 48), pixels=(240, 160), response="rgb"))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "size", "columns"),
+    [
+        ("tessar", (90, 60), 240),
+        pytest.param("cooke_triplet", (90, 60), 240, marks=pytest.mark.slow),
+        pytest.param("cooke_triplet", (90, 60), 1200, marks=pytest.mark.slow),
+        pytest.param("cooke_triplet", (150, 100), 240, marks=pytest.mark.slow),
+    ],
+)
+def test_a_sensor_beyond_what_can_be_computed_is_refused_before_the_kernels(computed, name, size, columns):
+    """The message has the largest sensor of the same pixels, which is computed."""
+    lens = rt.read_lens(name)
+    large = rt.Sensor(size=size, pixels=(columns, columns * 2 // 3), response="rgb")
+    with pytest.raises((OverBudget, WindowTooLarge), match=r"at most about .* mm \(--sensor\) for") as refused:
+        optics(lens, large)
+    width, height = map(float, re.search(r"about ([\d.]+) × ([\d.]+) mm", str(refused.value)).groups())
+    assert 50 < width < size[0]
+    assert height == pytest.approx(width * 2 / 3, rel=1e-2)
+    with computed:
+        optics(lens, dataclasses.replace(large, size=(0.99 * width, 0.99 * width * 2 / 3)))
 
 
 def test_no_error_is_estimated_of_requested_nodes(triplet):

@@ -278,6 +278,9 @@ def test_a_number_that_is_no_number_is_one_message_and_changes_nothing(page):
 
 
 def test_a_lens_that_loses_all_rays_says_where_and_comes_back(page):
+    """Without a field on the axis, where the middle of the beam passes a surface of any curvature."""
+    page.fill('[data-condition="fields"]', "8.4, 11.9")
+    changed(page, lambda: page.press('[data-condition="fields"]', "Enter"))
     changed(page, lambda: typed(page, "radius:1", "0.01"))
     settled(page)
     assert page.inner_text('[data-number="rms-0"]').strip() == "no ray arrives"

@@ -6,6 +6,7 @@ other processes on the machine lengthen the second less.
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -41,7 +42,7 @@ def events(lens: Lens, count: int) -> Iterator[dict]:
     numbers += [(k, "curvature", float(curvature)) for k, curvature in bent]
     for k in range(count):
         surface, quantity, value = numbers[k // 20 % len(numbers)]
-        value *= 1 + 0.01 * np.sin(2 * np.pi * (k % 20) / 20)
+        value *= 1 + 0.01 * math.sin(2 * math.pi * (k % 20) / 20)
         yield {"type": "edit", "surface": surface, "quantity": quantity, "value": value, "drag": True}
 
 
@@ -50,7 +51,8 @@ def measure(arguments: argparse.Namespace) -> None:
     lens = rt.read_lens(arguments.lens)
     session, todo = Session(lens), [*events(lens, arguments.events + FIRST)]
     for event in todo[:FIRST]:
-        session.answer(event)
+        if message := session.answer(event)["message"]:
+            raise ValueError(message)
     fields = shown_fields(lens)
     print(f"{arguments.lens}: {fields.shape[1]} fields, {len(lens.wavelengths)} wavelengths")
     heads = " ".join(f"{f'p{p}, ms':>8}" for p in PERCENTILES)

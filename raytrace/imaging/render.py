@@ -71,8 +71,10 @@ _COARSE = 600  # pixels along the longer side, on which the flux is computed, in
 _ROUNDS = 4
 _PLANES = 8
 _AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
-_EDGE = 0.01  # pixels, to which it is known
+_EDGE, _PARTS = 0.01, 20  # pixels, to which it is known; parts of a range that are searched at once
 _BEYOND_FIELDS = 1.5  # image heights of the largest field, to the corners of a sensor
+_MOST_NUMBERS = 2**27  # of kernels there: about a minute for the blur of a picture of 240 × 160 pixels
+_SIZES = 12  # of sensors among which the largest is searched
 _FAINT = 1e-3  # relative illumination that counts as none: rays hardly find so narrow a beam
 _WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
 _CELLS = 8  # between nodes, in whose middles the interpolation is checked
@@ -288,15 +290,17 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
-    if not is_stop_alone(lens):
-        _warn_beyond_fields(lens, sensor)
     circle = None if is_stop_alone(lens) else _image_circle(lens, sensor, like)
     corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     how = {"lateral_colour": lateral_colour, "elements": elements}
     if wavelengths is not None:
         lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
     sampled = lens
-    if wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1 and not is_stop_alone(lens):
+    over_response = wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1
+    if not is_stop_alone(lens):
+        few = _at_wavelengths(lens, *band(sensor.response), _WAVELENGTHS[0]) if over_response else lens
+        _check_reach(few, sensor, circle, model, size, nodes, distances, lateral_colour, tol)
+    if over_response and not is_stop_alone(lens):
         sampled = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
     weights = sensor.weights(sampled.wavelengths, sampled.wavelength_weights).to(like)
     chosen, reason = _model_of(sampled, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
@@ -322,17 +326,64 @@ def optics(
     )  # fmt: skip
 
 
-def _warn_beyond_fields(lens: Lens, sensor: Sensor) -> None:
-    """Warn BeyondFields of a sensor whose corners lie far beyond the image of the lens's largest field."""
+def _check_reach(
+    lens: Lens,
+    sensor: Sensor,
+    circle: tuple[Tensor, Tensor] | None,
+    model: str | None,
+    size: int | None,
+    nodes: tuple[int, int] | None,
+    distances: Tensor,
+    lateral_colour: bool,
+    tol: float,
+) -> None:
+    """Warn BeyondFields of a sensor whose corners lie far beyond the image of the lens's largest field.
+
+    There the blur grows so fast that the tolerance needs the largest number of nodes. Raises WindowTooLarge or
+    OverBudget, with the largest sensor of the same shape, where kernels of them as large as those of the corners cannot
+    be computed.
+    """
     corner, height = float(torch.hypot(*sensor.corners).max()), _image_height(lens, sensor)
-    if height and corner > _BEYOND_FIELDS * height:
-        warnings.warn(
-            f"the corners of the sensor lie {corner:.3g} mm from the axis, {corner / height:.2g} times the image "
-            f"height of the largest field, {height:.3g} mm: the blur beyond that height may be too large to compute; "
-            "take a smaller sensor (--sensor), or give the lens larger fields",
-            BeyondFields,
-            stacklevel=calling_level(),
-        )
+    if not height or corner <= _BEYOND_FIELDS * height:
+        return
+    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights)
+
+    def check(share: float) -> None:
+        part = dataclasses.replace(sensor, size=tuple(share * side for side in sensor.size))
+        corners = _within(circle, part.corners.to(lens.surfaces[-2].thickness))
+        about = lens, part, model or "gaussian", corners, distances
+        window = size or window_size(*about, lateral_colour=lateral_colour, tol=tol)
+        m, n = nodes or _nodes(part, _MOST_NODES)
+        if len(distances) * len(weights) * m * n * window**2 > _MOST_NUMBERS:
+            raise OverBudget(f"kernels of {window} × {window} pixels at {m} × {n} places of the sensor take minutes")
+        _afford_kernels((m, n), len(distances), weights, window, part)
+
+    place = (
+        f"the corners of the sensor lie {corner:.3g} mm from the axis, {corner / height:.2g} times the image height of "
+        f"the largest field, {height:.3g} mm"
+    )
+    try:
+        check(1.0)
+    except (WindowTooLarge, OverBudget) as error:
+        works = _BEYOND_FIELDS * height / corner
+        for share in np.linspace(works, 1, _SIZES, endpoint=False)[1:].tolist():  # from below: they may fail in between
+            try:
+                check(share)
+            except (WindowTooLarge, OverBudget):
+                break
+            works = share
+        sides = " × ".join(f"{works * side:.3g}" for side in sensor.size)
+        columns, rows = sensor.pixels
+        raise type(error)(
+            f"{place}, and the blur there is too large: take a sensor of at most about {sides} mm (--sensor) for "
+            f"{columns} × {rows} pixels, or give the lens larger fields; {error}"
+        ) from None
+    warnings.warn(
+        f"{place}: the blur beyond that height may take minutes to compute; take a smaller sensor (--sensor), or give "
+        "the lens larger fields",
+        BeyondFields,
+        stacklevel=calling_level(),
+    )
 
 
 def _image_height(lens: Lens, sensor: Sensor) -> float:
@@ -485,22 +536,22 @@ def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Ten
 
     Outside no chief ray arrives, or no light. Of a round lens a single radius.
     """
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
         round_ = is_round_about_axis(lens)
         middle = like.new_zeros(2, 1) if round_ else sensor.landing(lens, like.new_zeros(2, 1)).nan_to_num(0.0)
         angle = torch.arange(1 if round_ else _AZIMUTHS, dtype=like.dtype, device=like.device)
         angle = 2 * math.pi / len(angle) * angle
         ray = torch.stack([torch.sin(angle), torch.cos(angle)])
-        inside, outside = (
-            torch.zeros_like(angle),
-            torch.hypot(*(sensor.corners.to(like) - middle)).max().expand(angle.shape),
-        )
-        if bool(_has_light(lens, sensor, middle + outside * ray).all()):
+        inside, width = torch.zeros_like(angle), torch.hypot(*(sensor.corners.to(like) - middle)).max()
+        parts = torch.arange(1, _PARTS, dtype=like.dtype, device=like.device)[:, None]
+        warnings.simplefilter("ignore", RaytraceWarning)  # of rays outside
+        if bool(_has_light(lens, sensor, middle + width * ray).all()):
             return None
-        for _ in range(math.ceil(math.log2(float(outside.max()) / (_EDGE * sensor.pitch)))):
-            radius = 0.5 * (inside + outside)
-            arrives = _has_light(lens, sensor, middle + radius * ray)
-            inside, outside = torch.where(arrives, radius, inside), torch.where(arrives, outside, radius)
+        for _ in range(math.ceil(math.log(float(width) / (_EDGE * sensor.pitch), _PARTS))):
+            width = width / _PARTS
+            places = middle[..., None] + (inside + width * parts) * ray[:, None]  # (2, parts, A)
+            arrives = _has_light(lens, sensor, places.flatten(1)).unflatten(0, places.shape[1:])
+            inside = inside + width * arrives.long().cumprod(0).sum(0)
         return middle, inside
 
 
@@ -542,6 +593,12 @@ def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) ->
     return sensor.points(column.flatten(), row.flatten())
 
 
+def _nodes(sensor: Sensor, count: int) -> tuple[int, int]:
+    """Numbers of rows and columns of a grid of nodes, `count` of them along the longer side."""
+    columns, rows = sensor.pixels
+    return tuple(max(2, round((count - 1) * side / max(columns, rows)) + 1) for side in (rows, columns))
+
+
 def _grid(
     kernels: FieldKernels,
     circle: tuple[Tensor, Tensor] | None,
@@ -561,11 +618,10 @@ def _grid(
 
     if nodes is not None:
         return kernels_at(_places(sensor, *nodes, like)).unflatten(0, nodes), math.nan
-    columns, rows = sensor.pixels
-    longer, count = max(columns, rows), _FIRST_NODES
+    count = _FIRST_NODES
     with torch.no_grad():
         while True:
-            m, n = (max(2, round((count - 1) * side / longer) + 1) for side in (rows, columns))
+            m, n = _nodes(sensor, count)
             _afford_kernels((m, n), len(kernels.object_distances), kernels.weights, kernels.size, sensor)
             grid = kernels_at(_places(sensor, m, n, like)).unflatten(0, (m, n))
             middles = _places(sensor, m, n, like, 0.5)

@@ -80,18 +80,19 @@ def bilinear(count: int, reach: int, nodes: int, *, like: Tensor) -> Tensor:
     return (1 - (place.clamp(0, nodes - 1) - node).abs()).clamp_min(0)
 
 
-def _spans(weights: Tensor) -> list[tuple[int, int]]:
-    """First and last + 1 position at which each node has a weight."""
-    there = [torch.nonzero(row)[:, 0] for row in weights]
-    return [(int(one[0]), int(one[-1]) + 1) for one in there]
+def _spans(weights: Tensor) -> list[tuple[int, int, int]]:
+    """Number of each node with a weight, and first and last + 1 position at which it has one."""
+    there = enumerate(torch.nonzero(row)[:, 0] for row in weights)
+    return [(node, int(places[0]), int(places[-1]) + 1) for node, places in there if len(places)]
 
 
 def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress, *, in_place: bool) -> Tensor:
     h, w = kernels.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
     total = large.new_zeros(*large.shape[:-2], *shape)
-    for k, (top, bottom) in enumerate(_spans(weights[0])):
-        for n, (left, right) in enumerate(_spans(weights[1])):
+    down, across = map(_spans, weights)
+    for k, top, bottom in down:
+        for n, left, right in across:
             window = weights[0][k, top:bottom, None] * weights[1][n, left:right]
             part = large[..., top:bottom, left:right] * window.to(large.dtype)
             part = _convolved(part, kernels[k, n].to(large.dtype))
@@ -102,7 +103,7 @@ def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress,
                 beyond = left, shape[1] - left - columns, top, shape[0] - top - rows
                 total = total + torch.nn.functional.pad(part, beyond)
             if progress is not None:
-                progress(1, len(weights[0]) * len(weights[1]))
+                progress(1, len(down) * len(across))
     return _inner(total, h, w)
 
 
