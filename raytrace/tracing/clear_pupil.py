@@ -322,7 +322,7 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
         passes, blocked = (step[place] * reach for place in at)
         inside, outside = (scanned.gather(1, place.expand(len(scanned), *place.shape)) for place in at)
         traced = arms * (steps + 1)
-        # Rays close to where the first clearance vanishes along a chord, and halfway; if rays miss a surface, at quarters.
+        # Rays near the zero of the first clearance along a chord, and halfway; at quarters if rays miss a surface.
         quarters = step.new_tensor([0.25, 0.5, 0.75]).reshape(3, 1, 1, 1, 1, 1)
         for _ in range(_ROUNDS):
             missed = outside.argmin(0) == len(outside) - 1
