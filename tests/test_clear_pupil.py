@@ -73,6 +73,14 @@ def test_a_clear_pupil_is_whole_and_a_blocked_one_dark():
     assert bool((dark.inner == 0).all() and (dark.outer == 0).all())
 
 
+@pytest.mark.parametrize("radius", [0.02, 0.5, 3.0])
+def test_edge_is_where_rays_begin_to_miss_a_surface(radius):
+    """A sphere of a radius below that of the pupil; the share of a narrow edge is no smaller than the light's."""
+    ball = lens([surface(1 / radius, 100.0, 1.5)], aperture=("entrance_pupil_diameter", 2 * RADIUS))
+    arms = arms_of(scene(ball, vector(0.0, 0.0)[:, None], vector(math.inf), vector(0.55)), 8)
+    assert float((arms.outer - radius / RADIUS).abs().max()) < 1e-6
+
+
 def test_edge_is_where_the_ray_grazes_the_aperture():
     glass = double_gauss()
     result = scene(

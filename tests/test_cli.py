@@ -835,7 +835,9 @@ def test_a_spot_without_rays_is_a_dash_and_a_warning_says_where_they_end(run, ra
 def test_focus_reports_a_vignetted_field(run):
     both = run("focus", "cooke_triplet", "--field", 0, 80, "--json")
     assert "field 80 degrees, 0.587562 µm: all 576 rays lost: missed surface 2" in both.err
-    assert both.document["sensor_after"] == run("focus", "cooke_triplet", "--json").document["sensor_after"]
+    # The field on the axis has the points of its pupil in another order.
+    alone = run("focus", "cooke_triplet", "--json").document["sensor_after"]
+    assert both.document["sensor_after"] == pytest.approx(alone, rel=1e-14)
     assert run("focus", "cooke_triplet", "--field", 80).error.count("no ray reaches the image") == 1
 
 

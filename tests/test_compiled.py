@@ -64,8 +64,13 @@ def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
     with torch.no_grad(), trace_engine("eager"):
         rays = launch(system, sobol(301)[0].to(dtype))
     compiled, eager = both(lambda: trace_lens(system, rays, system.wavelengths[:, None]))
+    assert torch.equal(compiled.valid, eager.valid)
+    # Rounding of float32 puts each trace at up to 1.6e-6 from the double one of the same numbers, on either side of it.
+    system, rays = (to(t, dtype=torch.float64) for t in (system, rays))
+    with torch.no_grad(), trace_engine("eager"):
+        exact = trace_lens(system, rays, system.wavelengths[:, None])
     size = max(float(s.thickness.abs()) for s in system.surfaces[1:])
-    assert_same_rays(compiled, eager, CLOSE[dtype], max(size, 10.0))
+    assert_same_rays(to(compiled, dtype=torch.float64), exact, CLOSE[dtype], max(size, 10.0))
     assert eager.valid.any()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
-from problems import floats, number
+from problems import floats, number, vector
 from test_hardcases import of_kind
 
 import raytrace as rt
@@ -16,6 +16,7 @@ from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.maths.sampling import hexapolar
 from raytrace.system.rays import Rays
+from raytrace.tracing.ray_failures import LostRays
 from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
 ROUNDING = 2.0**-53
@@ -237,6 +238,22 @@ def test_spots_of_a_batch_are_those_of_its_lenses():
     assert bool(clipped.any())
     assert not bool(clipped.all())
     assert rt.spot(rt.perturbed(lens, rows, torch.zeros(0, len(rows)))).rms_radius.shape == (0, 1, 1)
+
+
+@pytest.mark.parametrize("rings", [2, 3])
+def test_a_field_that_loses_its_rays_changes_no_other(rings):
+    """Few rings, of which every rule has a sum of its own: the fields that lose nothing keep theirs."""
+    triplet = read_lens("cooke_triplet")
+    alone, both = vector(0.0, 8.0), vector(0.0, 8.0, 80.0)
+    with pytest.warns(LostRays):
+        together = rt.spot(triplet, fields=both, rings=rings)
+    with pytest.warns(LostRays):
+        distance = rt.focus(triplet, fields=both, rings=rings).sensor_distance
+    spots = rt.spot(triplet, fields=alone, rings=rings)
+    torch.testing.assert_close(together.rms_radius[:2], spots.rms_radius, rtol=1e-12, atol=0)
+    torch.testing.assert_close(together.centroid[:, :2], spots.centroid, rtol=1e-12, atol=1e-14)
+    focus = rt.focus(triplet, fields=alone, rings=rings).sensor_distance
+    torch.testing.assert_close(distance, focus, rtol=1e-13, atol=0)
 
 
 def test_statistics_of_many_spots_are_those_of_each():

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.system.apertures import Aperture
 from raytrace.system.optimization_data import OptimizationData, Vary
+from raytrace.tracing.spot import image_rays
 from raytrace.viewer import compute
 from raytrace.viewer.session import Optimisation, Session
 from raytrace.viewer.state import initial, limits, merit_of, reduce, shown_fields, variables
@@ -267,8 +269,21 @@ def test_every_kind_of_lens_has_a_document(name):
     assert found["prescription"]["configurations"] == len(lens.configurations)
 
 
-def test_a_lens_that_loses_all_rays_says_where(state):
-    lost = edit(state, "radius", 1, 0.01)  # at 1 mm rays near the axis pass, and `rt.spot` has their spots
+def test_rays_near_the_axis_pass_a_surface_of_any_radius(state):
+    """Of a radius of 10 µm, rays of 4.5e-4 of the beam on the axis: their spot is that of a dense fan."""
+    narrow = edit(state, "radius", 1, 0.01).lens
+    y = (torch.arange(5000, dtype=torch.float64) + 0.5) * 1e-7
+    rays = image_rays(narrow, torch.stack([torch.zeros_like(y), y]), fields=y.new_zeros(2, 1))
+    light = narrow.wavelength_weights[:, None] * torch.where(rays.valid[0], y, 0.0)
+    rms_um = 1e3 * float(((light * rays.position[1, 0] ** 2).sum() / light.sum()).sqrt())
+    found = compute.refresh(initial(narrow))
+    assert found["analyses"]["spots"]["rms"] == [pytest.approx(rms_um, rel=5e-3), None, None]
+    assert len(found["problems"]) == 2
+    assert "missed surface 1" in found["problems"][0]
+
+
+def test_a_lens_that_loses_all_rays_says_where(triplet):
+    lost = initial(triplet.replace(1, apertures=(Aperture("circular", (0.0, 50.0), obscures=True),)))
     found = compute.refresh(lost)
     assert not lost.message
     assert found["analyses"]["spots"]["rms"] == [None] * 3

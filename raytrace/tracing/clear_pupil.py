@@ -32,7 +32,8 @@ from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
 from raytrace.tracing.trace import without_apertures
 
 _SCAN, _COARSER = 32, 8  # steps along an arm in which edges are looked for, and where nothing stands inside the beam
-_NARROW, _NEAR, _ROUNDS = 2**-11, 1 / 32, 8  # an edge is enclosed in 2⁻¹¹ of its arm: slopes are good to 5e-4
+_NARROW, _NEAR, _ROUNDS = 2**-11, 1 / 32, 9  # an edge is enclosed in 2⁻¹¹ of its arm: slopes are good to 5e-4
+_NARROWER = 2**-20  # of an arm, where rays miss a surface: no slope leads on to the edge
 _MOST_PARTS = 3  # clear parts of one arm
 _COARSE = 64  # arms round the pupil between which kinks are looked for
 _NEWTON = 4  # steps to a kink
@@ -62,14 +63,18 @@ class Arms:
 
             ∫ f r dr ≈ (o - i) Σ_n w_n f(r_n) r_n,   r_n = i + (o - i) t_n,   with Gauss-Legendre nodes t_n
 
-        Rings of equal steps in r² (`sampling.gauss_rings`) need opposite arms of the same length: else odd powers of
-        r, roots of r², do not cancel. The weights of a clear pupil sum to 1.
+        Rings of equal steps in r² need opposite arms of the same length: else odd powers of r, roots of r², do not
+        cancel. A pupil that is clear as a whole has them, those of `sampling.gauss_rings`, whatever clips other fields.
+        The weights of a clear pupil sum to 1.
         """
         nodes, weights = (self.inner.new_tensor(t)[:, None] for t in gauss_legendre(rings))
-        inner, length = self.inner[..., None, :], (self.outer - self.inner)[..., None, :]
-        radius = inner + length * 0.5 * (nodes + 1)
+        inner, length, along = self.inner[..., None, :], (self.outer - self.inner)[..., None, :], 0.5 * (nodes + 1)
+        area = (self.share * (self.outer**2 - self.inner**2)).sum(-1)[..., None, None]
+        is_whole = area > 1 - 64 * torch.finfo(area.dtype).eps
+        radius = torch.where(is_whole, length * along.sqrt(), inner + length * along)
+        step = length * torch.where(is_whole, 0.5 * length, radius)  # of r² from ring to ring, per weight
         points = self.origin[..., None, None] + radius * self.unit[..., None, :]
-        return points.flatten(-2), (weights * radius * length * self.share[..., None, :]).flatten(-2)
+        return points.flatten(-2), (weights * step * self.share[..., None, :]).flatten(-2)
 
     def ends(self) -> tuple[Tensor, Tensor]:
         """Pupil points (2, D, F, W, 2 B) at both ends of every part, on the edge; and which parts there are."""
@@ -317,13 +322,17 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
         passes, blocked = (step[place] * reach for place in at)
         inside, outside = (scanned.gather(1, place.expand(len(scanned), *place.shape)) for place in at)
         traced = arms * (steps + 1)
-        for _ in range(_ROUNDS):  # rays close to where the first clearance vanishes along a chord, and halfway
-            wide = (blocked - passes).abs() > _NARROW * reach
+        # Rays near the zero of the first clearance along a chord, and halfway; at quarters if rays miss a surface.
+        quarters = step.new_tensor([0.25, 0.5, 0.75]).reshape(3, 1, 1, 1, 1, 1)
+        for _ in range(_ROUNDS):
+            missed = outside.argmin(0) == len(outside) - 1
+            wide = (blocked - passes).abs() > torch.where(missed, _NARROWER, _NARROW) * reach
             some = slice(int(not bool(wide[0].any())), None)  # most arms start at a clear point
             if not bool(wide.any()):
                 break
             zero = torch.where(outside < 0, safe_divide(inside, inside - outside), 1.0).amin(0)[some]
             share = torch.stack([zero - _NEAR, zero + _NEAR, torch.full_like(zero, 0.5)]).clamp(0, 1).sort(0).values
+            share = torch.where(missed[some], quarters, share)
             radii = passes[some] + share * (blocked - passes)[some]
             between = _clearances(scene, radii.flatten(0, 1), unit, origin).unflatten(1, radii.shape[:2])
             traced += radii.shape[0] * radii.shape[1] * unit.shape[-1]
