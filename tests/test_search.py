@@ -205,8 +205,8 @@ def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
         assert after.residuals == pytest.approx(before.residuals, abs=1e-12)
         variables = {(moved(v.surface), v.quantity) for v in free.variables}
         added = {(s, quantity) for s in (k, k + 1) for quantity in ("curvature", "thickness")}
-        assert {(v.surface, v.quantity) for v in one.free.variables} == variables | added
-        assert {(moved(6), moved(1))} == {(v.surface, v.source) for v in one.free.solves}
+        assert {(v.surface, v.quantity) for v in one.model.variables} == variables | added
+        assert {(moved(6), moved(1))} == {(v.surface, v.source) for v in one.model.solves}
 
 
 def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
@@ -252,7 +252,7 @@ def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k
 def test_along_both_lines_of_a_null_meniscus_the_merit_stays(best_triplet):
     asked, lens = best_triplet
     one = enlarged(lens, asked, 4)
-    places = [[(v.surface, v.quantity) for v in one.free.variables].index((s, "curvature")) for s in (4, 5, 6)]
+    places = [[(v.surface, v.quantity) for v in one.model.variables].index((s, "curvature")) for s in (4, 5, 6)]
     before = one.whole.evaluated(one.model.start).residuals
     for pair in (places[:2], places[1:]):
         x = one.model.start.copy()
