@@ -275,8 +275,8 @@ def test_one_catalog_is_parsed_for_a_glass_it_holds():
     """`raytrace info` on a lens of one maker must not wait for twenty catalogs."""
     script = (
         "from raytrace.materials import catalogs as catalog, agf\n"
-        "found = []; read = catalog.read_agf\n"
-        "catalog.read_agf = lambda path: found.append(path.stem) or read(path)\n"
+        "found = []; read = catalog.read_text\n"
+        "catalog.read_text = lambda path: found.append(path.stem) or read(path)\n"
         "catalog.find_glass('SK16', catalogs=['SCHOTT', 'OHARA']); print(found)"
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
