@@ -170,6 +170,10 @@ def test_derivatives_of_a_base_ray_are_its_gradients(name):
 def test_wrong_quantities_are_refused():
     with pytest.raises(ValueError, match="did you mean directions"):
         rt.jacobian(COOKE, "curvature", of="direction")
+    with pytest.raises(ValueError, match="`fields` belongs to quantities of rays"):
+        rt.jacobian(COOKE, "curvature", of=lambda lens: lens.wavelengths, fields=[0.0])
+    with pytest.raises(ValueError, match="`merit` belongs to `of=merit`"):
+        rt.jacobian(COOKE, "curvature", merit="spot")
     with pytest.raises(TypeError, match="expected a tensor"):
         rt.jacobian(COOKE, "curvature", of=lambda lens: 3)
     with pytest.raises(rt.BadVariables if hasattr(rt, "BadVariables") else ValueError, match="no variables"):

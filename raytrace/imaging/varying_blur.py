@@ -82,8 +82,8 @@ def bilinear(count: int, reach: int, nodes: int, *, like: Tensor) -> Tensor:
 
 def _spans(weights: Tensor) -> list[tuple[int, int, int]]:
     """Number of each node with a weight, and first and last + 1 position at which it has one."""
-    there = enumerate(torch.nonzero(row)[:, 0] for row in weights)
-    return [(node, int(places[0]), int(places[-1]) + 1) for node, places in there if len(places)]
+    lit = enumerate(torch.nonzero(row)[:, 0] for row in weights)
+    return [(node, int(places[0]), int(places[-1]) + 1) for node, places in lit if len(places)]
 
 
 def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress, *, in_place: bool) -> Tensor:

@@ -468,18 +468,15 @@ def _by_torch(function: Callable, arguments: tuple, options: dict):
     """By torch's forward derivatives, one for each variable; of functions without derivatives their values alone."""
     name = getattr(function, "__name__", "")
     if (name.endswith("_") and not name.endswith("__")) or name in ("__setitem__", "__set__"):
-        raise NotImplementedError(f"{name} changes a tensor in place, which then would lose derivatives by variables")
+        raise RuntimeError(f"{name} changes a tensor in place, which then would lose derivatives by variables")
     leaves, form = pytree.tree_flatten((list(arguments), options))
     result = _values(function(*arguments, **options))
     floats = [leaf for leaf in pytree.tree_leaves(result) if isinstance(leaf, Tensor) and _is_continuous(leaf)]
-    if not floats or getattr(function, "__name__", "") in ("__get__", "__set__"):
+    if not floats:
         return result
-    if ((name := getattr(function, "__name__", "")).endswith("_") and not name.endswith("__")) or name == "__setitem__":
-        raise NotImplementedError(f"{name} changes a tensor in place, which has no derivatives by variables there")
     moving = [place for place, leaf in enumerate(leaves) if isinstance(leaf, MovingTensor)]
     if not moving or _stopped.get() or not torch.is_grad_enabled():
         return result
-
     slopes = []
     for k in range(len(leaves[moving[0]].tangents)):
         with forward_ad.dual_level():

@@ -111,13 +111,22 @@ def jacobian(
 ) -> Jacobian:
     """A quantity of a lens and its derivatives by all design variables, in one pass.
 
-    vary: variables, pickups and solves, as of `optimize`; by default those of the file. of: "landing points" (2, F, W,
+    vary: variables, pickups and solves, as of `optimize`; by default the file's. of: "landing points" (2, F, W,
     P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm, less the axial ray's, of the
     rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,) of a merit function as of
     `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor (...), as
-    lambda lens: rt.spot(lens).whole.rms_radius. Derivatives are exact to rounding; those of failed rays are 0. Raises
+    lambda lens: rt.spot(lens).whole.rms_radius. Derivatives are exact to rounding; failed rays have 0. Raises
     BadVariables, TypeError, ValueError.
     """
+    of_rays = [
+        name
+        for name, given in (("fields", fields), ("wavelengths", wavelengths), ("pupil", pupil))
+        if given is not None
+    ]
+    if of_rays and not (isinstance(of, str) and of in OF_RAYS):
+        raise ValueError(f"jacobian: `{of_rays[0]}` belongs to quantities of rays, {', '.join(OF_RAYS)}: leave it out")
+    if merit is not None and of != "merit":
+        raise ValueError("jacobian: `merit` belongs to `of=merit`: name it, or leave the merit function out")
     model = design_variables(lens, vary)
     if of == "merit":
         quantity, derivatives = _of_merit(model, lens, merit)
@@ -144,9 +153,9 @@ def jacobian(
 
 def moving_lens(model: DesignVariables, variables: np.ndarray | None = None) -> Lens:
     """The lens at variables (n,), by default its own, whose numbers carry their derivatives by all of them."""
-    at = model.start if variables is None else np.asarray(variables, dtype=float)
+    values = model.start if variables is None else np.asarray(variables, dtype=float)
     view = model.views[model.lens.current_configuration - 1]
-    return view.state(Dual(at, np.eye(len(at)))).moving_lens(clips=True)
+    return view.state(Dual(values, np.eye(len(values)))).moving_lens(clips=True)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:

@@ -644,21 +644,22 @@ class Bundle:
     def _template(self):
         """Surfaces, structure and table (W, K) as stored, and the columns of what moves (`_columns`)."""
         view = self.view
-        of_media = {at for addresses in view.glasses.values() for at in addresses}
+        of_media = {address for addresses in view.glasses.values() for address in addresses}
         indices = torch.from_numpy(np.abs(view.indices))
         numbers = {
-            at: torch.tensor(float(n), dtype=torch.float64) for at, n in view.stored.items() if at not in of_media
+            address: torch.tensor(float(n), dtype=torch.float64)
+            for address, n in view.stored.items()
+            if address not in of_media
         }
         numbers |= {k: indices[:, k].clone() for k in view.glasses}
-        places, moving, count = {}, {}, sum(number.numel() for number in numbers.values())
-        for at, number in numbers.items():
-            first = len(places) and max(place.stop for place in places.values())
-            places[at] = slice(first, first + number.numel())
-            unit = torch.eye(count, dtype=torch.float64)[:, places[at]].reshape(count, *number.shape)
-            moving[at] = with_tangents(number, unit)
+        places, moving, first, count = {}, {}, 0, sum(number.numel() for number in numbers.values())
+        for address, number in numbers.items():
+            places[address] = slice(first, first := first + number.numel())
+            unit = torch.eye(count, dtype=torch.float64)[:, places[address]].reshape(count, *number.shape)
+            moving[address] = with_tangents(number, unit)
         media = {k: moving[k] for k in view.glasses}
         with torch.enable_grad():
-            lens = view.held({at: number for at, number in moving.items() if at not in media})
+            lens = view.held({address: number for address, number in moving.items() if address not in media})
             _, structure, table = view.table_of(self.last, lens, media)
         columns = _columns(table, numbers, places)
         return view.table_of(self.last, view.lens)[0], structure, table.detach().numpy().copy(), columns
@@ -879,13 +880,13 @@ def _columns(table: Tensor, numbers: dict, places: dict[object, slice]) -> dict 
     """
     columns, values = {}, table.detach().numpy()
     by = tangents_of(table, max((place.stop for place in places.values()), default=0)).detach().numpy()
-    for at, number in numbers.items():
-        number, derivative = number.numpy(), by[places[at]]  # (1 or W, W, K)
+    for address, number in numbers.items():
+        number, derivative = number.numpy(), by[places[address]]  # (1 or W, W, K)
         held = (values == (number if number.ndim == 0 else number[:, None])).all(0)
         unchanged = np.eye(len(values))[:, :, None] if number.ndim else np.ones((1, len(values), 1))
         moving = (derivative != 0).any((0, 1))
         if not (held[moving].all() and (derivative[:, :, moving] == unchanged).all()):
             return None
         if moving.any():
-            columns[at] = np.flatnonzero(moving)
+            columns[address] = np.flatnonzero(moving)
     return columns
