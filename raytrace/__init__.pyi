@@ -73,8 +73,6 @@ from raytrace.maths.sampling import hexapolar as hexapolar
 from raytrace.maths.sampling import sobol as sobol
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
-from raytrace.optimization.jacobian import Jacobian as Jacobian
-from raytrace.optimization.jacobian import jacobian as jacobian
 from raytrace.optimization.merit import BadMerit as BadMerit
 from raytrace.optimization.merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.merit import Merit as Merit
@@ -123,6 +121,8 @@ from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements
 from raytrace.tolerancing.files import read_tolerances as read_tolerances
 from raytrace.tolerancing.grades import tolerances as tolerances
+from raytrace.tolerancing.jacobian import Jacobian as Jacobian
+from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
 from raytrace.tolerancing.toleranced import Toleranced as Toleranced

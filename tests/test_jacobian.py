@@ -6,9 +6,9 @@ import torch
 from torch.testing import assert_close
 
 import raytrace as rt
-from raytrace.optimization.jacobian import OF_RAYS
 from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system.lens import aligned
+from raytrace.tolerancing.jacobian import OF_RAYS
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.trace import trace_lens
 
@@ -59,6 +59,7 @@ KINDS = {
     "conic and asphere": (ASPHERE, "conic:1 a4:1 sensor"),
     "tilt and decentre": (COOKE, "tilt:3 decentre:4"),
     "glass and aperture": (COOKE, "index:1,3 abbe_number:1 aperture"),
+    "temperature": (COOKE.at(temperature=35.0), "temperature pressure curvature:2"),
     "solve and pickup": (COOKE, "curvature:1-3 curvature:6=f_number(6) thickness:3=2*thickness:1"),
     "real aiming": (GAUSS.at(ray_aiming="real"), "curvature:1-3 thickness:4,5"),
     "real aiming of a tilted lens": (GAUSS.at(ray_aiming="real"), "tilt:2 decentre:9 curvature:1"),
@@ -88,6 +89,70 @@ def test_derivatives_of_rays_are_their_differences(kind, name):
     model = model_of(lens, vary)  # with solves as they come out, and model glasses
     assert_close(found.value, rays_behind(model.lens_at(model.start), name), rtol=0, atol=1e-12)
     assert_differences(lambda lens: rays_behind(lens, name), lens, vary, found.derivatives)
+
+
+def errors_of(lens: rt.Lens) -> tuple:
+    """Rows of a grade, with a sag term and a thickness that another surface takes up."""
+    return tuple(rt.tolerances(lens, "index=0.0002", grade="precision"))
+
+
+@pytest.mark.parametrize("aiming", ["off", pytest.param("real", marks=pytest.mark.slow)])
+def test_derivatives_by_errors_are_their_differences(aiming):
+    lens = COOKE.at(ray_aiming=aiming)
+    rows = errors_of(lens)
+    found = rt.jacobian(lens, tolerances=rows, fields=FIELDS, pupil=PUPIL)
+    steps = torch.tensor([1e-3 * row.maximum for row in rows], dtype=torch.float64)
+    landing = rays_behind(
+        rt.perturbed(lens, rows, torch.cat([torch.diag(steps), -torch.diag(steps)])), "landing points"
+    )
+    plus, minus = landing.chunk(2, 1)
+    difference = ((plus - minus) / (2 * steps.reshape(-1, 1, 1, 1))).movedim(1, 0)
+    limits = (1e3 * steps).reshape(-1, 1, 1, 1, 1)  # mm at the limit of each error
+    assert_close(limits * found.derivatives, limits * difference, rtol=1e-4, atol=1e-8)
+    assert found.variables[0] == f"{rows[0].name} of {rows[0].where}"
+    assert not found.numbers.any()
+
+
+def test_errors_follow_the_variables():
+    lens, rows = GAUSS, errors_of(GAUSS)[:3]
+
+    def of(lens: rt.Lens) -> torch.Tensor:
+        return rt.spot(lens, fields=[5.0]).whole.rms_radius
+
+    both = rt.jacobian(lens, "curvature:1 sensor", of=of, tolerances=rows)
+    variables, errors = rt.jacobian(lens, "curvature:1 sensor", of=of), rt.jacobian(lens, of=of, tolerances=rows)
+    assert both.variables == (*variables.variables, *errors.variables)
+    assert_close(both.derivatives, torch.cat([variables.derivatives, errors.derivatives]), rtol=1e-9, atol=1e-12)
+    assert_close(both.numbers, torch.cat([variables.numbers, errors.numbers]))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"of": "merit", "merit": "spot", "grade": "precision"}, "derivatives by design variables alone"),
+        ({"tolerances": (), "grade": "high"}, "leave `grade` and `limits` out"),
+        ({"vary": "temperature:3"}, "expected temperature without surfaces"),
+        ({"vary": "pressure@2"}, "pressure is that of all configurations"),
+    ],
+)
+def test_numbers_that_do_not_go_together_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        rt.jacobian(COOKE, **{"vary": "curvature", **options})
+
+
+def test_a_merit_function_moves_with_the_temperature():
+    lens, step = COOKE.at(temperature=35.0), 1.0
+    found = rt.jacobian(lens, "temperature", of="merit", merit="wavefront")
+    ends = [
+        rt.jacobian(lens.at(temperature=35.0 + sign * step), "temperature", of="merit", merit="wavefront").value
+        for sign in (1, -1)
+    ]
+    assert_close(
+        found.derivatives[0],
+        (ends[0] - ends[1]) / (2 * step),
+        rtol=1e-3,
+        atol=1e-3 * float(found.derivatives.abs().max()),
+    )
 
 
 @pytest.mark.parametrize("kind", ["curvature and thickness", "real aiming", "tilt and decentre"])

@@ -511,12 +511,13 @@ COMMANDS = (
     ),
     _command(
         "jacobian",
-        "derivatives of rays or of a merit function by the variables",
+        "derivatives of rays or of a merit function by variables and errors of manufacture",
         "Derivatives of the points where rays land, of their directions or paths, or of the residuals of a merit "
-        "function, by all design variables in one pass, with the launch and aiming of the rays. The text has the mean "
-        "and the largest derivative by each variable; -o and --json have all of them.",
+        "function, by all design variables and errors of manufacture in one pass, with the launch and aiming of the "
+        "rays. The text has the mean and the largest derivative by each number; -o and --json have all of them.",
         """
-        cooke_triplet --vary curvature thickness
+        cooke_triplet --vary curvature thickness temperature
+        cooke_triplet --grade precision --of paths
         lens.zmx --of paths --field 0 10 -o derivatives.json
         double_gauss --vary curvature --of merit --merit spot""",
         lens,
@@ -530,6 +531,8 @@ COMMANDS = (
         ),
         option("--merit", metavar="KIND", help="of --of merit: spot, wavefront or angular (default: the file's)"),
         table,
+        grade={"help": "errors of manufacture by the tolerances of a published grade, as of `tolerance`"},
+        limits={"metavar": "NAME=LIMIT", "help": "errors by kind and limit, as of `tolerance`"},
     ),
     _command(
         "view",

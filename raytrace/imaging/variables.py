@@ -56,6 +56,7 @@ from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import (
     APERTURE,
     GLASS,
+    OF_LENS,
     Address,
     BadVariables,
     ParameterPath,
@@ -608,7 +609,7 @@ def _named(lens: Lens, vary: str) -> tuple[tuple[Vary, ...], tuple[str, ...]]:
         for one in varied(lens, word):
             is_alone = one.surface or (one.surface, one.quantity) == APERTURE
             if one.quantity == "glass" or one.operand is not None or not is_alone:
-                raise BadVariables(f"{word!r}: {name_of(one)} is a variable of optimize alone")
+                raise BadVariables(f"{word!r}: {name_of(one)} is a variable of optimize and jacobian alone")
             kinds[one] = "sensor" if word == "sensor" else one.quantity
     if not kinds:
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
@@ -623,7 +624,7 @@ def _variable(lens: Lens, number: int, kind: str, quantity: str) -> Variable:
     """
     if (number, quantity) == APERTURE:
         start = float(lens.aperture.value)
-        return Variable(kind, number, start, _APERTURE * start, ParameterPath(("aperture", "value")))
+        return Variable(kind, number, start, _APERTURE * start, OF_LENS[APERTURE])
     surface = lens.surfaces[number]
     path = path_of(surface, quantity)
     start = number_at(surface, path).detach()

@@ -67,7 +67,7 @@ from raytrace.plotting import style
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_label, field_points
 from raytrace.system.optimization_data import Row, Vary
-from raytrace.system.parameter_paths import APERTURE
+from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
@@ -1082,7 +1082,7 @@ def _lens_at(
     variables = tuple(
         dataclasses.replace(one, bounds=bounds.get(name_of(one), one.bounds))
         for one in data.variables
-        if (one.surface, one.quantity) != APERTURE  # which no file holds
+        if (one.surface, one.quantity) not in OF_LENS  # which no file holds
     )
     return dataclasses.replace(lens, optimization_data=dataclasses.replace(data, variables=variables))
 

@@ -5,6 +5,7 @@ curvature:1-4,7 conic:3 a4:3  of some surfaces
 tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose; of the image, too
 sensor                        the last gap
 aperture                      the number of the system aperture: F/#, entrance pupil, NA, or the radius of the stop
+temperature pressure          of lens and air, °C and atm, by which the indices change; radii do not
 index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
 thickness:6@2                 in configuration 2, of a number that differs between configurations
 curvature:4=-curvature:3      pickup: a factor times another number plus an offset, as thickness:8=2*thickness:2+1
@@ -37,12 +38,14 @@ from raytrace.materials.glass import (
 )
 from raytrace.optimization.lens_state import LensState
 from raytrace.system.configurations import Operand, ScaledPath, same
-from raytrace.system.lens import Lens, is_round_about_axis, media
+from raytrace.system.lens import Lens, is_round_about_axis, media, with_environment
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
-    APERTURE,
     GLASS,
     GLASS_NUMBER,
+    OF_LENS,
+    PRESSURE,
+    TEMPERATURE,
     Address,
     BadVariables,
     UnknownNumber,
@@ -77,7 +80,7 @@ SOLVED_BY = {
 }
 
 #: Words that take no surfaces.
-_ALONE = ("sensor", "aperture")
+_ALONE = ("sensor", *(name for _, name in OF_LENS))
 
 #: Numbers that belong to a medium.
 MEDIA = (*GLASS, "glass")
@@ -227,19 +230,21 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     named, _, configurations = word.partition("@")
     kind, colon, numbers = named.partition(":")
     of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
-    known = dict.fromkeys(["thickness", "sensor", "aperture", *MEDIA, *GROUPS, *of_surfaces])
+    known = dict.fromkeys(["thickness", *_ALONE, *MEDIA, *GROUPS, *of_surfaces])
     if (kind in _ALONE and colon) or (kind in _INSTEAD and kind not in known):
         meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
         raise BadVariables(f"{word!r}: expected {kind if kind in _ALONE else 'a number of a lens'}{meant}")
     if kind not in known:
         meant = f"; did you mean {spaces}?" if (spaces := _spaces(lens, kind)) else did_you_mean(kind, known)
         raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{meant}")
-    if kind == "aperture":
+    if (0, kind) in OF_LENS:
+        holder, *_ = OF_LENS[0, kind].path
+        of_lens = "system aperture" if holder == "aperture" else kind
         if configurations:
-            raise BadVariables(f"{word!r}: the system aperture is that of all configurations; leave @ out")
-        if any(place.path[0] == "aperture" for operand in lens.operands for place in operand.paths):
-            raise BadVariables(f"{word!r}: the system aperture differs between the configurations, and is not varied")
-        return (Vary(*APERTURE),)
+            raise BadVariables(f"{word!r}: the {of_lens} is that of all configurations; leave @ out")
+        if any(place.path[0] == holder for operand in lens.operands for place in operand.paths):
+            raise BadVariables(f"{word!r}: the {of_lens} differs between the configurations, and is not varied")
+        return (Vary(0, kind),)
     if kind == "sensor":
         kind, surfaces = "thickness", [sensor(lens)]
     elif numbers or colon:
@@ -264,8 +269,8 @@ def split_words(vary: str | Sequence[str]) -> list[str]:
 
 def name_of(one: Vary) -> str:
     """A variable as bounds and tables call it: thickness_6, in configuration 2 thickness_6@2, aperture."""
-    if (one.surface, one.quantity) == APERTURE:
-        return "aperture"
+    if (one.surface, one.quantity) in OF_LENS:
+        return one.quantity
     return f"{one.quantity}_{one.surface}" + (f"@{one.configuration}" if one.configuration else "")
 
 
@@ -302,10 +307,15 @@ def bounds_of(
 def with_modelled(lens: Lens, moved: Sequence[Vary | Solve]) -> Lens:
     """The lens with every such number modelled, at 0 where it was not, and glasses whose numbers move as model glasses.
 
-    Warns VariedGlass of the latter: between the lines of its definition a model glass is only near that of a catalog.
+    Warns VariedGlass of the latter: between the lines of its definition a model glass is only near that of a catalog. A
+    lens whose temperature or pressure moves is in air of 20 °C and 1 atm if nothing else is given.
     """
+    if {(one.surface, one.quantity) for one in moved} & {TEMPERATURE, PRESSURE}:
+        lens = with_environment(lens, None, None)
     surfaces = list(lens.surfaces)
     for one in moved:
+        if (one.surface, one.quantity) in OF_LENS:
+            continue
         surface = surfaces[one.surface]
         if one.quantity in GLASS:
             surfaces[one.surface] = dataclasses.replace(surface, glass=_model_of(surface.glass, one.surface, lens))
@@ -549,7 +559,7 @@ class View:
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
-        self._held = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at != APERTURE}
+        self._held = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
@@ -606,8 +616,9 @@ class View:
 
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:
-        """What moves of the media, by the surface that tells them."""
-        found: dict[int, list[Address]] = {}
+        """What moves of the media, by the surface that tells them: all of them with the air."""
+        air = [at for at in (TEMPERATURE, PRESSURE) if at in self.moved]
+        found: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
         for surface, quantity in self.moved:
             if quantity in GLASS or quantity.startswith(GLASS_NUMBER):
                 found.setdefault(surface, []).append((surface, quantity))

@@ -26,8 +26,10 @@ from raytrace.system.surface import SHAPE, Surface
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
 
-#: The number of the system aperture, a number of the lens that no surface has.
+#: Numbers of the lens that no surface has: of the system aperture, and of the air (°C, atm).
 APERTURE: Address = (0, "aperture")
+TEMPERATURE: Address = (0, "temperature")
+PRESSURE: Address = (0, "pressure")
 
 #: Numbers of the medium behind a surface, where it is a model glass or a constant index.
 GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
@@ -54,6 +56,14 @@ class ParameterPath(NamedTuple):
     def steps(self) -> tuple:
         """The path as that of `configurations.part`."""
         return self.path if self.entry is None else (*self.path, (self.entry,))
+
+
+#: Where a lens holds the numbers that no surface has.
+OF_LENS = {
+    APERTURE: ParameterPath(("aperture", "value")),
+    TEMPERATURE: ParameterPath(("environment", "temperature")),
+    PRESSURE: ParameterPath(("environment", "pressure")),
+}
 
 
 def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
@@ -137,25 +147,19 @@ def with_numbers_of(
 ) -> Lens:
     """The lens with other numbers, by address; known: their places, where they have been looked up before."""
     surfaces = list(lens.surfaces)
-    if APERTURE in numbers:
-        lens = with_aperture(lens, numbers[APERTURE])
     for (surface, quantity), number in numbers.items():
-        if (surface, quantity) == APERTURE:
+        if (surface, quantity) in OF_LENS:
+            lens = with_number(lens, OF_LENS[surface, quantity], number)
             continue
         place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
         surfaces[surface] = with_number(surfaces[surface], place, number)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
-def with_aperture(lens: Lens, number: Tensor) -> Lens:
-    """The lens with another number of its system aperture."""
-    return dataclasses.replace(lens, aperture=dataclasses.replace(lens.aperture, value=number))
-
-
 def stored_number(lens: Lens, at: Address) -> Tensor | None:
     """The number at an address; None where a surface does not model it. Raises UnknownNumber."""
-    if at == APERTURE:
-        return lens.aperture.value
+    if at in OF_LENS:
+        return number_at(lens, OF_LENS[at])
     surface = lens.surfaces[at[0]]
     return number_at(surface, path_of(surface, at[1], f"surface {at[0]}: "))
 

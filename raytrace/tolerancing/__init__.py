@@ -12,6 +12,7 @@ monte_carlo     the criterion of random lenses, resumable
 toleranced      `tolerance` and its result: sensitivities, expectation, trials, table and figure
 as_built        `AsBuilt`: the expectation as a term of a merit function, with exact derivatives
 grades          `tolerances`: rows of published grades and of limits
+jacobian        `jacobian`: derivatives of any quantity by design variables and errors
 
 A kind of error is a row of `KINDS` in `system/tolerance_data.py`.
 """

@@ -68,10 +68,16 @@ class Perturbation:
         needed = any(KINDS[row.kind].needs_semi_diameter for row in self.rows)
         self.radii = semi_diameters(lens) if needed else None
 
-    def __call__(self, errors: Tensor | Sequence[float]) -> Lens:
-        """The lens with errors (N,), or (L, N) for L lenses. Raises BadTolerance for another number of them."""
-        lens, rows = self.lens, self.rows
-        errors = torch.as_tensor(errors, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    def __call__(self, errors: Tensor | Sequence[float], lens: Lens | None = None) -> Lens:
+        """The lens with errors (N,), or (L, N) for L lenses. Raises BadTolerance for another number of them.
+
+        lens: with other numbers; the semi-diameters, to which fringes refer, stay.
+        """
+        rows = self.rows
+        lens = self.lens if lens is None else with_ray_aiming(lens, self.lens.ray_aiming)
+        if not isinstance(errors, Tensor):
+            errors = torch.as_tensor(errors)
+        errors = errors.to(lens.wavelengths)
         if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
             shape, count = tuple(errors.shape), len(rows)
             raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")

@@ -1,12 +1,14 @@
-"""Derivatives by the design variables of a lens, of rays, merit functions, and any function of a lens, in one pass.
+"""Derivatives of rays, merit functions, and any function of a lens by its design variables and its errors, in one pass.
 
-The lens is made of tensors that carry their derivatives by all variables (`maths.tangents`), those that solves and
-pickups bring about included, and the quantity is computed from it once, as without derivatives: by the compiled trace
-where that carries the rays, else by torch. Nothing is held fixed: rays are launched and aimed anew with every variable.
+The lens is made of tensors that carry their derivatives (`maths.tangents`) by all variables, those that solves and
+pickups bring about included, and by all errors of manufacture, and the quantity is computed from it once, as without
+derivatives: by the compiled trace where that carries the rays, else by torch. Nothing is held fixed: rays are launched
+and aimed anew with every number.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,28 +16,32 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, value
 from raytrace.maths.result import Column, Result, Table
-from raytrace.maths.tangents import MovingTensor, tangents_of, value_of
+from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
 from raytrace.optimization.variables import DesignVariables, design_variables, name_of
 from raytrace.system.lens import Lens, aligned, wavelengths_of
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
+from raytrace.system.tolerance_data import Tolerance
+from raytrace.tolerancing.grades import tolerances as tolerances_of
+from raytrace.tolerancing.perturbation import Perturbation
+from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.launch import rays
 from raytrace.tracing.trace import trace_lens
 from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value
 
 
 class NoDerivatives(RaytraceWarning):
-    """A quantity that carries no derivatives by the design variables."""
+    """A quantity that carries no derivatives by the numbers of the lens."""
 
 
 @value
 class Jacobian(Result):
-    """A quantity of a lens and its derivatives by n design variables.
+    """A quantity of a lens and its derivatives by n design variables and errors of manufacture.
 
-    value: (...) of the quantity; derivatives: (n, ...), in the unit of the quantity per unit of the variable (mm of
-    thicknesses and decentres, 1/mm of curvatures, degrees of tilts); variables: their names, as thickness_6; numbers:
-    (n,) their values. quantity: its name.
+    value: (...) of the quantity; derivatives: (n, ...), in the unit of the quantity per unit of the number (mm of
+    thicknesses and decentres, 1/mm of curvatures, degrees of tilts, °C; of errors the unit of their limits); variables:
+    names, as thickness_6, of errors their kind and place; numbers: (n,) the values, 0 of errors. quantity: its name.
     """
 
     value: Tensor
@@ -66,7 +72,7 @@ class Jacobian(Result):
     def tables(self) -> list[Table]:
         columns = {**self.columns(), "variable": [*self.variables]}
         shape = " × ".join(map(str, self.value.shape)) or "one number"
-        return [Table(columns, [f"derivatives of {self.quantity} ({shape}) by {len(self.variables)} variables"])]
+        return [Table(columns, [f"derivatives of {self.quantity} ({shape}) by {len(self.variables)} numbers"])]
 
     def document(self) -> dict:
         return {
@@ -104,19 +110,23 @@ def jacobian(
     vary: str | Sequence[str | Vary] | None = None,
     *,
     of: str | Callable[[Lens], Tensor] = "landing points",
+    tolerances: Tolerances | Iterable[Tolerance] | None = None,
+    grade: Literal["commercial", "precision", "high"] | None = None,
+    limits: str | Sequence[str] = "",
     fields: Tensor | Sequence | None = None,
     wavelengths: Tensor | Sequence[float] | None = None,
     pupil: Tensor | tuple[Tensor, Tensor] | None = None,
     merit: Merit | DefaultMerit | Sequence[Row] | str | None = None,
 ) -> Jacobian:
-    """A quantity of a lens and its derivatives by all design variables, in one pass.
+    """A quantity of a lens and its derivatives by all design variables and errors of manufacture, in one pass.
 
-    vary: variables, pickups and solves, as of `optimize`; by default the file's. of: "landing points" (2, F, W,
-    P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm, less the axial ray's, of the
-    rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,) of a merit function as of
-    `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor (...), as
-    lambda lens: rt.spot(lens).whole.rms_radius. Derivatives are exact to rounding; failed rays have 0. Raises
-    BadVariables, TypeError, ValueError.
+    vary: variables, pickups and solves, as of `optimize`; by default the file's, or none beside errors. of: "landing
+    points" (2, F, W, P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm, less the
+    axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,) of a
+    merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor (...), as
+    lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0, as of
+    `perturbed`; grade, limits: those of `tolerances` instead. Derivatives are exact to rounding; failed rays have 0.
+    Raises BadVariables, BadTolerance, TypeError, ValueError.
     """
     of_rays = [
         name
@@ -127,8 +137,15 @@ def jacobian(
         raise ValueError(f"jacobian: `{of_rays[0]}` belongs to quantities of rays, {', '.join(OF_RAYS)}: leave it out")
     if merit is not None and of != "merit":
         raise ValueError("jacobian: `merit` belongs to `of=merit`: name it, or leave the merit function out")
-    model = design_variables(lens, vary)
+    perturbation = _perturbation(lens, tolerances, grade, limits)
+    alone = vary is None and perturbation is not None
+    model = DesignVariables(lens) if alone else design_variables(lens, vary)
     if of == "merit":
+        if perturbation is not None:
+            raise ValueError(
+                "jacobian: the residuals of a merit function have derivatives by design variables alone; for errors "
+                "give `of` a function, as lambda lens: rt.spot(lens).whole.rms_radius"
+            )
         quantity, derivatives = _of_merit(model, lens, merit)
     else:
         if callable(of):
@@ -141,21 +158,41 @@ def jacobian(
                 f"jacobian: `of` is {named_value(of)}; expected {', '.join(known)} or a function of a lens"
                 + (did_you_mean(of, known) if isinstance(of, str) else "")
             )
-        quantity, derivatives = derivatives_of(function, moving_lens(model), len(model.variables))
+        errors = 0 if perturbation is None else len(perturbation.rows)
+        moving = moving_lens(model, further=errors)
+        if perturbation is not None:
+            count = len(model.variables) + errors
+            zero = lens.wavelengths.new_zeros(errors)
+            moving = perturbation(with_tangents(zero, torch.eye(count, dtype=zero.dtype)[:, count - errors :]), moving)
+        quantity, derivatives = derivatives_of(function, moving, len(model.variables) + errors)
+    rows = () if perturbation is None else Tolerances(perturbation.rows).labels
     return Jacobian(
         quantity,
         derivatives,
-        tuple(map(name_of, model.variables)),
-        torch.as_tensor(model.start),
+        (*map(name_of, model.variables), *rows),
+        torch.as_tensor(np.concatenate([model.start, np.zeros(len(rows))])),
         of if isinstance(of, str) else getattr(of, "__name__", "a function").replace("<lambda>", "a function"),
     )
 
 
-def moving_lens(model: DesignVariables, variables: np.ndarray | None = None) -> Lens:
-    """The lens at variables (n,), by default its own, whose numbers carry their derivatives by all of them."""
-    values = model.start if variables is None else np.asarray(variables, dtype=float)
-    view = model.views[model.lens.current_configuration - 1]
-    return view.state(Dual(values, np.eye(len(values)))).moving_lens(clips=True)
+def _perturbation(
+    lens: Lens, tolerances: Tolerances | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
+) -> Perturbation | None:
+    """The lens with the errors that are asked for; None: with none."""
+    if tolerances is not None and (grade or limits):
+        raise ValueError("jacobian: `tolerances` are given: leave `grade` and `limits` out")
+    if tolerances is None and not (grade or limits):
+        return None
+    return Perturbation(lens, tolerances_of(lens, limits, grade=grade) if tolerances is None else tolerances)
+
+
+def moving_lens(model: DesignVariables, *, further: int = 0) -> Lens:
+    """The lens at its own variables, whose numbers carry their derivatives by all of them.
+
+    further: derivatives that follow, of which its numbers have none.
+    """
+    view, count = model.views[model.lens.current_configuration - 1], len(model.start)
+    return view.state(Dual(model.start, np.eye(count + further, count))).moving_lens(clips=True)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:
