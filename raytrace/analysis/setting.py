@@ -13,7 +13,7 @@ from raytrace.maths.result import flat
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
-from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.paraxial import axial_beam, largest_field
 from raytrace.tracing.ray_failures import check_reach, ray_failures
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
@@ -141,7 +141,7 @@ def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor, T
 
     And whether they exist (F,): no chief ray may reach a real image height.
     """
-    extent, found = object_field(lens, fields, first_order(lens))
+    extent, found = object_field(lens, fields, axial_beam(lens))
     infinite = is_at_infinity(lens)
     described = torch.rad2deg(torch.atan(extent)) if infinite else extent
     kind = "angle" if infinite else "object_height"

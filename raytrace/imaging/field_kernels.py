@@ -31,7 +31,7 @@ from raytrace.psf_models.models import is_sampled_in_common
 from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import field_of_object
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.scene import Memo, scene, trace_scene
 from raytrace.wave_optics import hybrid
 from raytrace.wave_optics.compute import psf as wave_psf
@@ -369,7 +369,7 @@ def by_angle(lens: Lens) -> Lens:
     if lens.fields.kind != "object_height" or lens.fields.telecentric:
         return lens
     angled = with_field_kind(lens, "angle")
-    x, y = field_of_object(angled, torch.stack([lens.fields.x, lens.fields.y]), first_order(lens))
+    x, y = field_of_object(angled, torch.stack([lens.fields.x, lens.fields.y]), axial_beam(lens))
     return dataclasses.replace(angled, fields=dataclasses.replace(angled.fields, x=x, y=y))
 
 

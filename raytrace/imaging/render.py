@@ -55,7 +55,7 @@ from raytrace.psf_models.dft import TooManyPoints
 from raytrace.system.lens import Lens, check_media, field_points, is_round_about_axis, with_wavelengths
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import object_field
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
@@ -740,7 +740,7 @@ def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     """Paraxial images (2, N) mm of the objects whose chief rays meet the sensor at (2, N) mm; there itself if none."""
     near = 1e-4 * points.abs().max() * torch.eye(2, dtype=points.dtype, device=points.device)
     fields = sensor.fields(lens, torch.cat([points, near], 1))
-    extents = object_field(lens, fields.nan_to_num(0.0), first_order(lens))[0]
+    extents = object_field(lens, fields.nan_to_num(0.0), axial_beam(lens))[0]
     scale = near @ torch.linalg.inv(extents[:, -2:])  # mm of the image per unit of the object
     return torch.where(fields[:, :-2].isnan().any(0), points, scale @ extents[:, :-2])
 

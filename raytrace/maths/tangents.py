@@ -127,10 +127,15 @@ def _sum(value: Tensor, parts: Sequence[tuple[Tensor, object]]) -> MovingTensor:
     """The value with tangents Σ dx ∂y/∂x of parts (x, ∂y/∂x), those that move; ∂y/∂x None: 1."""
     total = None
     for x, slope in parts:
-        if isinstance(x, MovingTensor):
-            tangents = _under(x.tangents, value.dim())
-            tangents = tangents if slope is None else tangents * slope
-            total = tangents if total is None else total + tangents
+        if not isinstance(x, MovingTensor):
+            continue
+        tangents = _under(x.tangents, value.dim())
+        if total is None:
+            total = tangents if slope is None else tangents * slope
+        elif isinstance(slope, Tensor):
+            total = torch.addcmul(total, tangents, slope)
+        else:
+            total = torch.add(total, tangents, alpha=1 if slope is None else slope)
     return with_tangents(value, _full(total, value))
 
 
@@ -164,7 +169,8 @@ def _power(x, exponent):
 
 
 def _add_product(x, a, b, *, value=1):
-    return _sum(torch.addcmul(x, a, b, value=value), ((x, None), (a, value * b), (b, value * a)))
+    by_a, by_b = (b, a) if value == 1 else (value * b, value * a)
+    return _sum(torch.addcmul(x, a, b, value=value), ((x, None), (a, by_a), (b, by_b)))
 
 
 def _angle(y, x):

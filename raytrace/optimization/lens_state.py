@@ -409,7 +409,7 @@ def _gaussian(state: LensState, wavelength: int) -> Gaussian:
     A1, B1, C1, D1 = state.matrix(1, stop - 1, wavelength, to_next=True)
     A2, B2, C2, D2 = state.matrix(stop, last, wavelength)
     whole = A2 * A1 + B2 * C1, A2 * B1 + B2 * D1, C2 * A1 + D2 * C1, C2 * B1 + D2 * D1
-    return Gaussian(*whole, (A1, B1), (B2, D2), n[0], n[last])
+    return Gaussian(*whole, (A1, B1), lambda: (B2, D2), n[0], n[last])
 
 
 def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
@@ -418,11 +418,11 @@ def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
     def matrices(lens: Lens) -> list[Tensor]:
         at = lens.wavelengths[wavelength]
         found = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, at)[:-1]), at)
-        return [*found[:4], *found.front, *found.rear]
+        return [found.A, found.B, found.C, found.D, *found.front, *found.rear]
 
     A, B, C, D, A1, B1, B2, D2 = state.through_torch(matrices)
     n = state.index(wavelength)
-    return Gaussian(A, B, C, D, (A1, B1), (B2, D2), n[0], n[-2])
+    return Gaussian(A, B, C, D, (A1, B1), lambda: (B2, D2), n[0], n[-2])
 
 
 def listed(numbers: Sequence, count: int):

@@ -175,6 +175,8 @@ def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
 
 def _vertex(surface: Surface) -> tuple[Tensor, Tensor, Sag | None]:
     """The curvatures at the vertex along x and y without sag terms, and the sag terms there."""
+    if surface.curvature is not None and surface.coefficients is None and surface.sag_terms is None:
+        return surface.curvature, surface.curvature, None
     centre = torch.zeros_like(surface.thickness)
     added = None if surface.sag_terms is None else relief(surface.sag_terms).sag(centre, centre)
     if is_freeform(surface):

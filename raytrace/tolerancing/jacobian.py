@@ -6,6 +6,7 @@ derivatives: by the compiled trace where that carries the rays, else by torch. N
 and aimed anew with every number.
 """
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
@@ -19,7 +20,7 @@ from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
 from raytrace.optimization.variables import DesignVariables, design_variables, name_of
-from raytrace.system.lens import Lens, aligned, wavelengths_of
+from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
@@ -217,9 +218,10 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
 
 def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> Callable[[Lens], Tensor]:
     def function(lens: Lens) -> Tensor:
-        colours = wavelengths_of(lens, wavelengths)
-        launched = rays(lens, fields=fields, pupil=pupil, wavelengths=colours)
-        return quantity(trace_lens(aligned(lens, 3), launched, colours[:, None]))
+        launched = rays(lens, fields=fields, pupil=pupil, wavelengths=wavelengths)
+        if quantity is not _paths:
+            launched = dataclasses.replace(launched, opl=None)
+        return quantity(trace_lens(aligned(lens, 3), launched, launched.wavelength))
 
     return function
 

@@ -21,7 +21,7 @@ from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.aiming import aim_at_middle
-from raytrace.tracing.paraxial import cone_angle, first_order, object_distance_of
+from raytrace.tracing.paraxial import axial_beam, cone_angle, object_distance_of
 from raytrace.tracing.trace import is_bent, steps
 
 _PARALLEL = 1e-15  # rad per mm, and other quantities that are 0 but for rounding
@@ -225,7 +225,7 @@ def _aim(lens: Lens, wavelength: Tensor) -> Tensor:
         position = torch.stack([*aim, torch.zeros_like(aim[0])])
         return start(position, _start_direction(aim, distance))
 
-    size = 0.5 * first_order(lens).entrance_pupil_diameter.detach()
+    size = 0.5 * axial_beam(lens).entrance_pupil_diameter.detach()
     size = torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
     return aim_at_middle(lens, through, axis, wavelength, size)[0]
 
@@ -303,7 +303,7 @@ def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
     batch = H_inverse[..., 0, 0]
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value + 0 * batch
-    straight = first_order(lens)
+    straight = axial_beam(lens)
     if lens.aperture.kind in ("object_na", "object_cone_angle"):
         radius = torch.tan(cone_angle(lens, media(lens, lens.primary)[0])) * _length(of_turn, -1)
     else:

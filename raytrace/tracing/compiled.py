@@ -431,11 +431,17 @@ def task_of(
         with_batch_axes(x, len(shape)).expand(3, *shape).contiguous() for x in (rays.position, rays.direction)
     )
     opl = None if rays.opl is None else rays.opl.expand(shape).contiguous()
-    if all(n.dim() == 0 for n in numbers):
-        table = torch.stack(numbers)[None]
-    else:  # a row for all rays of the last axis
-        rows = [(n[..., 0] if n.dim() else n).expand(shape[:-1]) for n in numbers]
-        table = torch.stack(rows, -1).reshape(-1, len(numbers))
+    # A row for all rays of the last axis; numbers that are the same in all rows are put into them together.
+    single = [k for k, n in enumerate(numbers) if n.dim() == 0]
+    table = torch.stack([numbers[k] for k in single])[None] if single else None
+    if len(single) < len(numbers):
+        several = [k for k, n in enumerate(numbers) if n.dim()]
+        table_of_rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1).flatten(0, -2)
+        if table is None:
+            table = table_of_rows
+        else:
+            columns = torch.tensor([*single, *several]).argsort()
+            table = torch.cat([table.expand(len(table_of_rows), -1), table_of_rows], -1)[:, columns]
     return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
 
 

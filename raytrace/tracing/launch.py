@@ -57,7 +57,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
-from raytrace.tracing.paraxial import CONES, FirstOrder, cone_angle, field_scale, first_order
+from raytrace.tracing.paraxial import CONES, Beam, axial_beam, cone_angle, field_scale
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
 from raytrace.words import RaytraceWarning, calling_level, named_value
 
@@ -126,20 +126,20 @@ def rays_of_field(
     validity have axes of 1 where they do not depend on the wavelength.
     """
     lens = with_ray_aiming(lens, ray_aiming)
-    paraxial = first_order(lens)
+    beam = axial_beam(lens)
     index = index_behind(lens, 0, wavelength).to(pupil.dtype)
-    field, reached = object_field(lens, field, paraxial)
+    field, reached = object_field(lens, field, beam)
 
     entrance = _entrance(lens)
 
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
-        return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index, entrance)
+        return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, beam, index, entrance)
 
     def turned(pupil: Tensor) -> Tensor:
         return pupil if entrance is None else _turned(entrance.turn, pupil)
 
     if _is_aimed(lens):
-        radius = _aimed_radius(lens, paraxial, entrance)
+        radius = _aimed_radius(lens, beam, entrance)
         pupil, found = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
         reached = reached & found
     rays = through(pupil)
@@ -192,42 +192,39 @@ def is_at_infinity(lens: Lens) -> bool:
     return False
 
 
-def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm.
 
     And whether there are such (...): where no chief ray reaches a real image height, the field is on the axis.
     """
-    estimate = paraxial_field(lens, field, paraxial)
+    estimate = paraxial_field(lens, field, beam)
     if lens.fields.kind != "real_image_height":
         return estimate, torch.ones_like(estimate[0], dtype=torch.bool)
     index, entrance = index_behind(lens, 0, lens.primary).to(field.dtype), _entrance(lens)
 
     def through(field: Tensor, pupil: Tensor) -> Rays:
-        return _through_entrance_pupil(lens, field, pupil, paraxial, index, entrance)
+        return _through_entrance_pupil(lens, field, pupil, beam, index, entrance)
 
-    radius = _aimed_radius(lens, paraxial, entrance) if _is_aimed(lens) else None
+    radius = _aimed_radius(lens, beam, entrance) if _is_aimed(lens) else None
     return aim_at_image(lens, through, field, estimate, radius)
 
 
-def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
+def paraxial_field(lens: Lens, field: Tensor, beam: Beam) -> Tensor:
     """As `object_field`, real image heights as if they were paraxial ones."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind == "object_height":
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    scale = _paraxial_scale(lens, paraxial)
-    if kind != "angle":
-        return _scaled(field, scale)
-    slope = torch.tan(torch.deg2rad(field))
-    return slope if at_infinity else _scaled(slope, scale)
+    extent = torch.tan(torch.deg2rad(field)) if kind == "angle" else field
+    return extent if kind == "angle" and at_infinity else _scaled(extent, _paraxial_scale(lens, beam))
 
 
-def field_of_object(lens: Lens, extent: Tensor, paraxial: FirstOrder) -> Tensor:
+def field_of_object(lens: Lens, extent: Tensor, beam: Beam) -> Tensor:
     """Field points (2, ...) of slopes, or object heights in mm, (2, ...): the inverse of `paraxial_field`."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind != "object_height" and not (kind == "angle" and at_infinity):
-        extent = _scaled(extent, 1 / _paraxial_scale(lens, paraxial))
+        extent = _scaled(extent, 1 / _paraxial_scale(lens, beam))
     return torch.rad2deg(torch.atan(extent)) if kind == "angle" else extent
 
 
@@ -239,15 +236,15 @@ def object_point(lens: Lens, height: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(x, y, z - source.thickness))
 
 
-def _paraxial_scale(lens: Lens, paraxial: FirstOrder) -> Tensor | float:
+def _paraxial_scale(lens: Lens, beam: Beam) -> Tensor | float:
     """`field_scale` of the kind of field of a lens."""
     return field_scale(
         lens.fields.kind,
         at_infinity=is_at_infinity(lens),
         distance=lens.surfaces[0].thickness,
-        entrance_pupil=paraxial.entrance_pupil_position,
-        power=paraxial.power / index_behind(lens, 0, lens.primary),
-        magnification=paraxial.magnification,
+        entrance_pupil=beam.entrance_pupil_position,
+        power=beam.power / index_behind(lens, 0, lens.primary),
+        magnification=beam.magnification,
     )
 
 
@@ -290,52 +287,52 @@ def stop_radius(lens: Lens) -> Tensor:
     The paraxial ray with paraxial ray aiming, or where the real one does not reach the stop; else the real one. At the
     primary wavelength. Where the axis bends it is measured from the base ray.
     """
-    return _stop_radius(lens, first_order(lens), _entrance(lens))[0]
+    return _stop_radius(lens, axial_beam(lens), _entrance(lens))[0]
 
 
 def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
     """The points (2, ...) mm of the stop that rays of pupil points (2, ...) are aimed at; and its radius, mm."""
-    paraxial, entrance = first_order(lens), _entrance(lens)
-    radius = _stop_radius(lens, paraxial, entrance)[0]
+    beam, entrance = axial_beam(lens), _entrance(lens)
+    radius = _stop_radius(lens, beam, entrance)[0]
     target = pupil if entrance is None else _turned(entrance.turn, pupil)
-    return _scaled(target, _signed(radius, paraxial, entrance)), radius
+    return _scaled(target, _signed(radius, beam, entrance)), radius
 
 
-def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
+def _stop_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
     """And whether the real marginal ray reaches the stop; None if that is not traced."""
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value, None
-    estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
+    estimate = beam.stop_height.abs() if entrance is None else entrance.radius
     if lens.ray_aiming == "paraxial":
         return estimate, None
-    edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
+    edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(beam.entrance_pupil_diameter.dtype)
     index = index_behind(lens, 0, lens.primary).to(edge.dtype)
-    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
+    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, beam, index, entrance)
     position, arrives = at_stop(lens, rays, lens.primary)
     height = position[1].abs() if entrance is None else safe_sqrt(dot_2(position, position))
     return torch.where(arrives, height, estimate), arrives
 
 
-def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+def _signed(radius: Tensor, beam: Beam, entrance: Entrance | None) -> Tensor:
     """The radius with the sign of `FirstOrder.stop_height`; an `Entrance` inverts by its `turn`."""
-    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
+    return radius * torch.where(beam.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
 
 
-def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+def _aimed_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> Tensor:
     """As `_signed`; warns MarginalRayLost."""
-    radius, arrives = _stop_radius(lens, paraxial, entrance)
+    radius, arrives = _stop_radius(lens, beam, entrance)
     if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=calling_level())
-    return _signed(radius, paraxial, entrance)
+    return _signed(radius, beam, entrance)
 
 
 def _through_entrance_pupil(
-    lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor, entrance: Entrance | None
+    lens: Lens, field: Tensor, pupil: Tensor, beam: Beam, index: Tensor, entrance: Entrance | None
 ) -> Rays:
     """Rays from a slope or object height (2, ...) to fractions (2, ...) of the entrance pupil, by default paraxial."""
     point = None if is_at_infinity(lens) else object_point(lens, field)
-    radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
+    radius, depth = 0.5 * beam.entrance_pupil_diameter, beam.entrance_pupil_position
     if lens.fields.telecentric:
         # The pupil is at infinity: equal cones about chief rays parallel to the axis.
         if lens.aperture.kind not in CONES:

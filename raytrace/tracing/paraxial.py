@@ -4,8 +4,8 @@ A ray is (y, ω) with ω = n u, u = dy/dz the slope and n the *signed* index, ne
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+import functools
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -111,12 +111,13 @@ def brackets(powers: Sequence, gaps: Sequence) -> tuple:
     return A, B, C, D
 
 
-class Gaussian(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Gaussian:
     """System matrices of a lens at one wavelength, and the first-order data that follow; tensors or dual numbers.
 
     A, B, C, D: y′ = A y + B ω, ω′ = C y + D ω from surface 1 to behind the last surface before the image; front: A and
-    B to the vertex of the stop; rear: B and D from the stop; n_object, n_image: signed indices. vergence: n over the
-    object distance, 0 for an object at infinity. Source: Welford, Aberrations, ch. 3.
+    B to the vertex of the stop; from_stop: computes B and D from the stop; n_object, n_image: signed indices. vergence:
+    n over the object distance, 0 for an object at infinity. Source: Welford, Aberrations, ch. 3.
     """
 
     A: object
@@ -124,9 +125,14 @@ class Gaussian(NamedTuple):
     C: object
     D: object
     front: tuple
-    rear: tuple
+    from_stop: Callable[[], tuple]
     n_object: object
     n_image: object
+
+    @functools.cached_property
+    def rear(self) -> tuple:
+        """B and D from the stop to behind the last surface before the image."""
+        return self.from_stop()
 
     @property
     def effective_focal_length(self):
@@ -259,10 +265,56 @@ def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
     """The system matrices of a lens; n: signed indices (...) from the object's to that before the image."""
     surfaces, stop = lens.surfaces[1:-1], lens.stop - 1
     powers, gaps = _powers_and_gaps(surfaces, n, wavelength)
-    # The stop seen from the front (transfer to its vertex) and from the back.
+
+    def from_stop() -> tuple[Tensor, Tensor]:
+        ((_, B, _, D),) = _matrices(powers[stop:], gaps[stop:-1], n[0], -1)
+        return B, D
+
     whole, front = _matrices(powers, gaps[:-1], n[0], -1, stop)
-    ((_, B, _, D),) = _matrices(powers[stop:], gaps[stop:-1], n[0], -1)
-    return Gaussian(*whole, front[:2], (B, D), n[0], n[-1])
+    return Gaussian(*whole, front[:2], from_stop, n[0], n[-1])
+
+
+@value
+class Beam:
+    """The axial beam of a lens at one wavelength: the first-order data of which rays start; every entry (...), mm.
+
+    Entries are those of `FirstOrder`. vergence: signed index over the object distance, 0 for an object at infinity.
+    """
+
+    data: Gaussian
+    vergence: Tensor
+    entrance_pupil_diameter: Tensor
+
+    @property
+    def entrance_pupil_position(self) -> Tensor:
+        return self.data.entrance_pupil_position
+
+    @property
+    def stop_height(self) -> Tensor:
+        return 0.5 * self.entrance_pupil_diameter * self.data.front[0]
+
+    @property
+    def power(self) -> Tensor:
+        return -self.data.C
+
+    @property
+    def magnification(self) -> Tensor:
+        return self.data.magnification(self.vergence)
+
+
+@shared
+def axial_beam(lens: Lens, wavelength: Tensor | None = None) -> Beam:
+    """The axial beam; wavelength: (...) µm, the primary one by default."""
+    wavelength = lens.primary if wavelength is None else wavelength
+    lens = aligned(lens, wavelength.dim()) if wavelength.dim() else lens
+    data = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1]), wavelength)
+    vergence = data.n_object / object_distance_of(lens)
+    kind, distance = lens.aperture.kind, lens.surfaces[0].thickness
+    tan_cone = _tan_cone(lens, data.n_object)
+    diameter = data.entrance_pupil_diameter(kind, lens.aperture.value, distance, vergence, tan_cone)
+    if kind == "entrance_pupil_diameter":
+        diameter = diameter * torch.ones_like(data.A)
+    return Beam(data, vergence, diameter)
 
 
 @shared
@@ -272,16 +324,14 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
     wavelength = lens.primary if wavelength is None else wavelength
+    beam = axial_beam(lens, wavelength)
     lens = aligned(lens, wavelength.dim()) if wavelength.dim() else lens
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
-    data = gaussian(lens, n, wavelength)
+    data, diameter, vergence = beam.data, beam.entrance_pupil_diameter, beam.vergence
     n_object, n_image = data.n_object, data.n_image
     A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
-    vergence = n_object / object_distance_of(lens)  # 0 for an object at infinity
     kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
-    diameter = data.entrance_pupil_diameter(kind, lens.aperture.value, distance, vergence, tan_cone)
-    diameter = diameter * torch.ones_like(focal_length) if kind == "entrance_pupil_diameter" else diameter
     scale = data.marginal_height(kind, diameter, distance, vergence, tan_cone)
     slope_object, slope_image = scale * vergence / n_object, scale * data.omega_behind(vergence) / n_image
     # |n ū y| at the entrance pupil, |n u h| at the object or |n′ u′ h′| at the image, by the kind of field.
@@ -293,11 +343,11 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         invariant = (n_object * slope_object if at_object else n_image * slope_image) * largest
     # Of an entrance pupil at infinity the exit pupil is as large as the axial beam there.
     finite, exit_distance = torch.isfinite(diameter), data.exit_pupil_distance
-    beam = 2 * (scale * (A + data.B * vergence) + slope_image * exit_distance).abs()
-    exit_diameter = torch.where(finite, torch.where(finite, diameter, 1.0) * data.pupil_magnification, beam)
+    width = 2 * (scale * (A + data.B * vergence) + slope_image * exit_distance).abs()
+    exit_diameter = torch.where(finite, torch.where(finite, diameter, 1.0) * data.pupil_magnification, width)
     petzval = petzval_sum([vertex_curvature(s) for s in surfaces], n) * torch.ones_like(n_object)
     return FirstOrder(
-        power=-C,
+        power=beam.power,
         effective_focal_length=focal_length,
         back_focal_distance=-n_image * A / C,
         front_focal_distance=n_object * D / C,
@@ -305,11 +355,11 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         entrance_pupil_diameter=diameter,
         exit_pupil_position=exit_distance - surfaces[-1].thickness,
         exit_pupil_diameter=exit_diameter,
-        stop_height=0.5 * diameter * data.front[0],
+        stop_height=beam.stop_height,
         f_number=focal_length.abs() / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=data.image_distance(vergence),
-        magnification=data.magnification(vergence),
+        magnification=beam.magnification,
         angular_magnification=data.angular_magnification,
         optical_invariant=invariant.abs(),
         object_na=(n_object * torch.sin(torch.atan(slope_object))).abs(),
@@ -341,13 +391,10 @@ def largest_field(lens: Lens) -> Tensor:
 
 def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
     """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
-    n_object, data = media(lens, lens.primary)[0], first_order(lens)
-    vergence = n_object / object_distance_of(lens)
-    front = Gaussian(None, None, None, None, (1.0, data.entrance_pupil_position / n_object), None, n_object, None)
-    kind, distance = lens.aperture.kind, lens.surfaces[0].thickness
-    tan_cone = _tan_cone(lens, n_object)
-    y = front.marginal_height(kind, data.entrance_pupil_diameter, distance, vergence, tan_cone)
-    return y, y * vergence
+    beam, kind, distance = axial_beam(lens), lens.aperture.kind, lens.surfaces[0].thickness
+    tan_cone = _tan_cone(lens, beam.data.n_object)
+    y = beam.data.marginal_height(kind, beam.entrance_pupil_diameter, distance, beam.vergence, tan_cone)
+    return y, y * beam.vergence
 
 
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:

@@ -12,7 +12,7 @@ from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.trace import Crossing, lens_steps
 from raytrace.words import RaytraceWarning, calling_level
 
@@ -175,7 +175,7 @@ def beam_hint(lens: Lens) -> str:
         return ""
     number = float(lens.aperture.value)
     what = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
-    distance, diameter = float(lens.surfaces[0].thickness), float(first_order(lens).entrance_pupil_diameter)
+    distance, diameter = float(lens.surfaces[0].thickness), float(axial_beam(lens).entrance_pupil_diameter)
     return (
         f"the aperture is an {what}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
         "an F-number, an entrance pupil diameter or another aperture that the lens keeps would hold its beam"
