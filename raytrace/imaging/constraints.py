@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 
 from raytrace.materials.glass import Glass
 from raytrace.optimization.glass_choice import Pool
@@ -211,7 +210,7 @@ def _rays(lens: Lens):
     """A row for each ray of every field whose failure is brought back; their values do not count."""
     image = len(lens.surfaces) - 1
     x, y = lens.fields.x.detach(), lens.fields.y.detach()
-    largest = float(torch.hypot(x, y).max()) or 1.0
+    largest = float(lens.fields.extent) or 1.0
     fields = {(float(a) / largest, float(b) / largest) for a, b in zip(x, y, strict=True)} | {(0.0, 0.0)}
     for field in sorted(fields):
         for pupil in _PUPIL:

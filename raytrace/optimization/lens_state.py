@@ -28,13 +28,10 @@ from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_flat, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
-from raytrace.tracing.geometry import edge_thickness
+from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, semi_diameter_margin
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
-
-#: Through which points of the pupil light reaches furthest from the vertex of a surface.
-ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
 
 
 def _marginal_ray_before(state, surface: int):
@@ -100,16 +97,16 @@ def _edge_thickness(state, solve: Solve):
 
 
 def semi_diameter(lens: Lens, k: int) -> Tensor:
-    """mm: fixed, or the extent of the rays of all fields and wavelengths with the margin of `OptimizationData`."""
-    data, stored = lens.optimization_data, lens.surfaces[k].semi_diameter
-    if stored and (data is None or k in data.semi_diameters):
-        return lens.wavelengths.new_tensor(stored)
+    """mm, as `tracing.geometry.semi_diameters`, with derivatives: fixed, or the extent of the rays with its margin."""
+    fixed = fixed_semi_diameters(lens)
+    if k in fixed:
+        return lens.wavelengths.new_tensor(fixed[k])
     field = torch.stack([lens.fields.x, lens.fields.y])[:, None, :, None]
     points = lens.wavelengths.new_tensor(ENDS).T[:, None, None]
     rays = _behind(lens, k, field, vignette(lens, field, points), lens.wavelengths[:, None, None])
     height = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0).amax().sqrt()
-    percent, length = (0.0, 0.0) if data is None or k == lens.stop else data.semi_diameter_margin
-    return (1 + percent / 100) * height + length
+    factor, length = semi_diameter_margin(lens, k)
+    return factor * height + length
 
 
 def _behind(lens: Lens, k: int, field: Tensor, pupil: Tensor, wavelength: Tensor) -> Rays:
@@ -522,11 +519,6 @@ def rays_by_torch(
     return [Dual(value, slope) for value, slope in zip(parts, slopes, strict=True)], valid
 
 
-def largest_field(lens: Lens) -> float:
-    """Distance of the outermost field from the axis, in the lens's own kind of field."""
-    return float(torch.hypot(lens.fields.x, lens.fields.y).max())
-
-
 class Ray(NamedTuple):
     """A ray by its wavelength (from 0), field (Hx, Hy) as part of the largest, and pupil point before vignetting."""
 
@@ -627,7 +619,7 @@ class Bundle:
     @cached_property
     def field(self) -> np.ndarray:
         """(2, W, R) in the lens's own kind of field."""
-        scale = self._opening * largest_field(self.view.lens)
+        scale = self._opening * float(self.view.lens.fields.extent)
         return scale * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
 
     @cached_property

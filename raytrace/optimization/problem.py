@@ -24,7 +24,6 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from raytrace.analysis.chief import SAMPLES
@@ -148,10 +147,9 @@ def _behind_the_lens(lens: Lens) -> Arguments:
 
 def _chief_ray(lens: Lens) -> Arguments:
     """The ray of the largest field through the centre of its pupil, vignetting applied, on the image."""
-    radius = torch.hypot(lens.fields.x, lens.fields.y)
-    if not bool(radius.any()):
+    if not (extent := lens.fields.extent):
         raise BadHold("`hold`: all fields are on the axis: there is no off-axis chief ray")
-    x, y = (largest_field(lens)[:, 0] / radius.max()).tolist()
+    x, y = (largest_field(lens)[:, 0] / extent).tolist()
     return (len(lens.surfaces) - 1, 0), (x, y, 0.0, 0.0)
 
 

@@ -289,6 +289,11 @@ class Fields:
         """The unit of field points."""
         return FIELD_UNITS[self.kind]
 
+    @property
+    def extent(self) -> Tensor:
+        """() distance of the outermost field from the axis, in that unit."""
+        return torch.hypot(self.x, self.y).amax()
+
 
 #: Methods of modules and tensors of torch that a lens, a value, lacks: the function in their place.
 _IN_TORCH = {
@@ -781,7 +786,7 @@ def check(lens: Lens) -> None:
     _check_object(lens)
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
-    if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
+    if lens.fields.kind == "angle" and bool(lens.fields.extent >= 90):
         raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
 
 

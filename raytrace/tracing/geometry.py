@@ -29,7 +29,7 @@ from raytrace.tracing.trace import lens_steps
 from raytrace.words import RaytraceWarning, calling_level
 
 #: Points of the pupil whose rays are highest on a surface.
-_ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
+ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
 
 _HEIGHTS = 65  # at which two surfaces are compared
 _LEAST = 1e-6  # mm: an overlap that counts
@@ -87,18 +87,34 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
     return found
 
 
+def fixed_semi_diameters(lens: Lens) -> dict[int, float]:
+    """mm, by surface, of the semi-diameters that are given; the others follow the rays."""
+    data = lens.optimization_data
+    given = range(len(lens.surfaces)) if data is None else data.semi_diameters
+    return {k: float(size) for k in given if (size := lens.surfaces[k].semi_diameter)}
+
+
+def semi_diameter_margin(lens: Lens, k: int) -> tuple[float, float]:
+    """Factor a and length c mm of the semi-diameter a h + c of a surface that rays reach up to a height h.
+
+    `OptimizationData` has them; the stop and the image have no margin.
+    """
+    if lens.optimization_data is None or k in (lens.stop, len(lens.surfaces) - 1):
+        return 1.0, 0.0
+    percent, length = lens.optimization_data.semi_diameter_margin
+    return 1 + percent / 100, length
+
+
 def semi_diameters(lens: Lens) -> list[float]:
     """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
-    optimization_data, last = lens.optimization_data, len(lens.surfaces) - 1
-    given = range(last + 1) if optimization_data is None else optimization_data.semi_diameters
-    found = [(s.semi_diameter or math.nan) if k in given else math.nan for k, s in enumerate(lens.surfaces)]
+    fixed, last = fixed_semi_diameters(lens), len(lens.surfaces) - 1
+    found = [fixed.get(k, math.nan) for k in range(last + 1)]
     if all(map(math.isfinite, found[1:last])):
         return found
-    percent, length = (0.0, 0.0) if optimization_data is None else optimization_data.semi_diameter_margin
     for k, reach in enumerate(_reaches(lens), 1):
         if math.isnan(found[k]):
-            bare = k in (lens.stop, last)
-            found[k] = reach if bare else (1 + percent / 100) * reach + length
+            factor, length = semi_diameter_margin(lens, k)
+            found[k] = factor * reach + length
     stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
     return [own if math.isnan(reach) else reach for reach, own in zip(found, stored, strict=True)]
 
@@ -124,7 +140,7 @@ def edge_thickness(thickness, front, back):
 
 def _reaches(lens: Lens) -> list[float]:
     """Largest √(x² + y²) mm of the outermost rays on every surface from 1; nan where none arrives."""
-    points = lens.wavelengths.new_tensor(_ENDS, dtype=torch.float64).T
+    points = lens.wavelengths.new_tensor(ENDS, dtype=torch.float64).T
     try:
         rays, found = launch(lens, points, wavelengths=lens.wavelengths), []
         for crossing in lens_steps(lens, rays, lens.wavelengths[:, None]):

@@ -381,11 +381,10 @@ def largest_field(lens: Lens) -> Tensor:
 
     Where not every surface is round about one axis it is the outermost itself: directions are not alike.
     """
-    size = torch.hypot(lens.fields.x, lens.fields.y)
     if is_round_about_axis(lens):
-        largest = size.amax()
-        return torch.stack([torch.zeros_like(largest), largest])[:, None]
-    outermost = size.argmax()
+        extent = lens.fields.extent
+        return torch.stack([torch.zeros_like(extent), extent])[:, None]
+    outermost = torch.hypot(lens.fields.x, lens.fields.y).argmax()
     return torch.stack([lens.fields.x[outermost], lens.fields.y[outermost]])[:, None]
 
 

@@ -164,7 +164,7 @@ def _help(lens: Lens, fields: Tensor | None) -> str:
     if hint := beam_hint(lens):
         return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
     if fields is not None:
-        largest = float(torch.hypot(lens.fields.x, lens.fields.y).amax())
+        largest = float(lens.fields.extent)
         return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
     return "give other fields by `fields`, a smaller beam by `f_number` or `entrance_pupil_diameter`"
 

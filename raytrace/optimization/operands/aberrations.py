@@ -21,7 +21,7 @@ from raytrace.analysis.chief import (
 )
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
 from raytrace.maths.numerics import dot_2, value_of
-from raytrace.optimization.lens_state import LensState, largest_field, listed
+from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.operand import (
     BadRow,
     Evaluate,
@@ -53,7 +53,7 @@ def unvignetted(lens: Lens, field: tuple[float, float], pupil: tuple[float, floa
     """The pupil point that vignetting factors take to a point of the whole pupil, by default its centre."""
     if lens.fields.vignetting is None:
         return pupil
-    at = largest_field(lens) * torch.tensor(field, dtype=torch.float64)[:, None]
+    at = float(lens.fields.extent) * torch.tensor(field, dtype=torch.float64)[:, None]
     corners = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     shift, *ends = vignette(lens, at, corners).numpy().T
     matrix = np.stack([end - shift for end in ends], -1)
@@ -124,7 +124,7 @@ def _by_analysis(numbers: Callable[[Lens], Sequence[Tensor]]) -> Evaluate:
 
 def _points(planner: Planner, fields: Sequence[tuple[float, float]]) -> Tensor:
     """Fields (2, F) in the lens's own kind of field, of parts of the largest radius."""
-    return largest_field(planner.lens) * torch.tensor(fields, dtype=torch.float64).T
+    return float(planner.lens.fields.extent) * torch.tensor(fields, dtype=torch.float64).T
 
 
 def _side(planner: Planner) -> float:
@@ -204,7 +204,7 @@ def _distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
 def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tuple[float, float]]) -> Evaluate:
     """The distortion of a field of each row, by rays; of bent axes and fields that are images by the analysis."""
     for line, field in zip(lines, fields, strict=True):
-        if not any(field) or not largest_field(planner.lens):
+        if not any(field) or not float(planner.lens.fields.extent):
             raise BadRow(line, f"names field {line.row.integers[0]}, on the axis, where nothing is distorted")
     absolute = np.array([bool(line.row.numbers[0]) for line in lines])
     if is_bent(planner.lens) or planner.lens.fields.kind == "real_image_height":
@@ -237,7 +237,7 @@ def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tup
 
 def _extent(planner: Planner, field: tuple[float, float]) -> float:
     """tan θ of a field, or its height: the ideal image height is proportional to it."""
-    size = largest_field(planner.lens) * float(np.hypot(*field))
+    size = float(planner.lens.fields.extent) * float(np.hypot(*field))
     return float(np.tan(np.deg2rad(size))) if planner.lens.fields.kind == "angle" else size
 
 
@@ -266,7 +266,7 @@ def _fields_of(line: Line, planner: Planner) -> list[tuple[float, float]]:
 
 def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """The largest |y - f θ|, in % of f θ or in lengths, of fields along y; f by least squares over all of them."""
-    largest = largest_field(planner.lens)
+    largest = float(planner.lens.fields.extent)
     if planner.lens.fields.kind != "angle" or not largest:
         kind = planner.lens.fields.kind.replace("_", " ")
         raise BadRow(lines[0], f"is of angles of the field; this lens has a field of {kind}")

@@ -18,7 +18,7 @@ import torch
 
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import Dual, polynomial, slope_of, value_of
-from raytrace.optimization.lens_state import ENDS, Bundle, LensState, largest_field, listed
+from raytrace.optimization.lens_state import Bundle, LensState, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,
     EvaluationContext,
@@ -32,7 +32,7 @@ from raytrace.optimization.operands.operand import (
 from raytrace.system.lens import media
 from raytrace.system.shapes import EVEN, conic_sag
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
-from raytrace.tracing.geometry import edge_thickness, rims
+from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, rims, semi_diameter_margin
 
 
 class SemiDiameters:
@@ -45,14 +45,10 @@ class SemiDiameters:
     """
 
     def __init__(self, planner: Planner):
-        self.view, surfaces, data = planner.view, planner.lens.surfaces, planner.lens.optimization_data
-        fixed = range(len(surfaces)) if data is None else data.semi_diameters
+        self.view, surfaces = planner.view, planner.lens.surfaces
         #: mm, by surface, of those that do not follow the rays; the object's is 0 by default.
-        self.fixed = {0: surfaces[0].semi_diameter or 0.0}
-        self.fixed |= {k: float(surfaces[k].semi_diameter) for k in fixed if surfaces[k].semi_diameter}
-        percent, length = (0.0, 0.0) if data is None else data.semi_diameter_margin
-        has_margin = ~np.isin(np.arange(len(surfaces)), (planner.lens.stop, planner.image))
-        self.factors, self.lengths = np.where(has_margin, 1 + percent / 100, 1.0), np.where(has_margin, length, 0.0)
+        self.fixed = {0: surfaces[0].semi_diameter or 0.0} | fixed_semi_diameters(planner.lens)
+        self.factors, self.lengths = np.array([semi_diameter_margin(planner.lens, k) for k in range(len(surfaces))]).T
         self.asked: set[int] = set()
         self._bundle: Bundle | None = None
 
@@ -93,7 +89,7 @@ class SemiDiameters:
         """The rays through the `ENDS` of all fields and wavelengths up to a surface, the same in every call."""
         if self._bundle is None:
             fields, self._bundle = self.view.lens.fields, Bundle(self.view, last)
-            largest = largest_field(self.view.lens) or 1.0
+            largest = float(fields.extent) or 1.0
             points = [*zip((fields.x / largest).tolist(), (fields.y / largest).tolist(), strict=True)]
             for wavelength in range(len(self.view.wavelengths)):
                 for field in points:

@@ -18,7 +18,6 @@ from raytrace.analysis.mtf import clear_circle, cutoff, mtf_on_grid
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.numerics import Dual, slope_of, value_of
-from raytrace.optimization.lens_state import largest_field
 from raytrace.optimization.operands.operand import (
     BadRow,
     Evaluate,
@@ -58,7 +57,7 @@ def _field_number(line: Line, planner: Planner) -> int:
 
 def _field_part(planner: Planner, number: int) -> tuple[float, float]:
     """(Hx, Hy) of a field, from 0."""
-    fields, largest = planner.lens.fields, largest_field(planner.lens) or 1.0
+    fields, largest = planner.lens.fields, float(planner.lens.fields.extent) or 1.0
     return float(fields.x[number]) / largest, float(fields.y[number]) / largest
 
 

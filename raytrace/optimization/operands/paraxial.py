@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from raytrace.maths.numerics import Dual, quotient, value_of
-from raytrace.optimization.lens_state import LensState, largest_field, listed
+from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,
     EvaluationContext,
@@ -62,7 +62,7 @@ def paraxial_image_distance(state: LensState, wavelength: int):
 
 def _largest_extent(state: LensState):
     """Slope of the largest field at infinity, or mm of the object; real image heights are taken as paraxial."""
-    largest = largest_field(state.lens)
+    largest = float(state.lens.fields.extent)
     return state.field_scale * (np.tan(np.deg2rad(largest)) if state.lens.fields.kind == "angle" else largest)
 
 
@@ -117,7 +117,7 @@ def image_index(context: EvaluationContext, wavelengths: Sequence[int]):
 
 def field_of(planner: Planner, number: int) -> tuple[float, float]:
     """A field of the lens by its number, as a part of the largest radius; 0: the largest, `paraxial.largest_field`."""
-    fields, largest = planner.lens.fields, largest_field(planner.lens)
+    fields, largest = planner.lens.fields, float(planner.lens.fields.extent)
     if largest == 0:
         return 0.0, float(number == 0)
     x, y = outermost_field(planner.lens)[:, 0] if number == 0 else (fields.x[number - 1], fields.y[number - 1])
