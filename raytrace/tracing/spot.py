@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.budget import RAY_BYTES, afford, afford_rays
+from raytrace.budget import RAY_BYTES, afford, afford_rays, piece
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.system.lens import Lens, field_points
@@ -189,10 +189,10 @@ def arrivals(
     ray_aiming: str | None = None,
     progress: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter,
 ) -> Arrivals:
-    """Trace points (2, P) of the pupil and their weights (P,) to the sensor, field by field.
+    """Trace points (2, P) of the pupil and their weights (P,) to the sensor, as many fields at once as a chunk holds.
 
-    fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does. Raises
-    budget.OverBudget for more rays than memory holds.
+    fields, ray_aiming: as for `launch`; progress: goes over the chunks, as a bar does. Raises budget.OverBudget for
+    more rays than memory holds.
     """
     fields = field_points(fields, like=lens)
     F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
@@ -200,9 +200,9 @@ def arrivals(
     count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
     helps = "ask for fewer, or by `rays`, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
-    each = []  # of every field, rays (3, 1, W, P) on the sensor, their status, and whether they reach it
-    for field in progress(fields.unbind(1)):
-        launched = launch(lens, pupil, fields=field[:, None], ray_aiming=ray_aiming)
+    each = []  # of every chunk, rays (3, F, W, P) on the sensor, their status, and whether they reach it
+    for some in progress(fields.split(piece(L * RAY_BYTES * W * P), 1)):
+        launched = launch(lens, pupil, fields=some, ray_aiming=ray_aiming)
         launched = dataclasses.replace(launched, opl=None)
         rays = trace_lens(lens, launched, lens.wavelengths[:, None])
         on_sensor = rays, torch.zeros_like(rays.valid, dtype=torch.int64), rays.valid
@@ -212,14 +212,11 @@ def arrivals(
                 reached = reached & ~crossing.missed & ~crossing.totally_reflected
                 on_sensor = crossing.rays, status, reached
         each.append(on_sensor)
-    joined = Rays(
-        torch.cat([rays.position for rays, *_ in each], -3),
-        torch.cat([rays.direction for rays, *_ in each], -3),
-        torch.cat([rays.valid for rays, *_ in each], -3),
-    )
+    parts = [[rays.position, rays.direction, rays.valid, *rest] for rays, *rest in each]
+    *joined, status, reached = (torch.cat(pieces, -3) for pieces in zip(*parts, strict=True)) if parts[1:] else parts[0]
+    joined = Rays(*joined)
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     weight = shares[:, None] * weights / weights.sum()
-    status, reached = (torch.cat(parts, -3) for parts in zip(*(rest for _, *rest in each), strict=True))
     return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
 
 
