@@ -13,14 +13,15 @@ Source of the design: Plackett & Burman, Biometrika 33, 305 (1946); of the matri
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, safe_divide, value_of
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.tangents import tangents_of, value_of
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
@@ -29,12 +30,11 @@ from raytrace.tolerancing.grades import tolerances as tolerances_of
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
-from raytrace.tracing.compiled import Task, forward, prepare, push
+from raytrace.tracing.compiled import prepare
 from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.geometry import semi_diameters
-from raytrace.tracing.launch import launch
 from raytrace.tracing.spot import image_rays
-from raytrace.tracing.trace import lens_task, without_apertures
+from raytrace.tracing.trace import without_apertures
 
 #: Angle of the astigmatism of an irregularity, degrees, and its change: the squares and the product of cos 2θ and
 #: sin 2θ have the means of a uniform distribution.
@@ -164,61 +164,13 @@ class AsBuiltTerm:
         unit: mm in the unit of length of the merit function. Derivatives of a state that has them, else None.
         """
         factor = (self.settings.weight / len(self.errors)) ** 0.5 / unit
-        moving = {at: number for at, number in state.numbers.items() if isinstance(number, Dual)}
-        numbers = {at: self.errors.new_tensor(float(value_of(number))) for at, number in state.numbers.items()}
-
-        def lenses(moved: Sequence[Tensor]) -> Lens:
-            return self.lenses(state.view.held(numbers | dict(zip(moving, moved, strict=True))), self.errors)
-
-        with torch.no_grad():
-            start = [numbers[at] for at in moving]
-            slopes = [self.errors.new_tensor(number.slope) for number in moving.values()]
-            position, direction, valid, *changes = self._traced(lenses, start, slopes)
-
-            def offsets(position: Tensor, direction: Tensor) -> Tensor:
-                return factor * self._offsets(position, direction, valid).reshape(-1)
-
-            values, lost = offsets(position, direction).numpy(), int((~valid).sum())
-            if not changes:
-                return values, None, lost
-            jacobian = _along(offsets, (position, direction), changes)
-        return values, jacobian.numpy().T, lost
-
-    def _traced(self, lenses: Callable[[Sequence[Tensor]], Lens], start: Sequence[Tensor], slopes: Sequence[Tensor]):
-        """Position, direction and validity of the rays on the sensor, and with slopes (n,) of the numbers how position
-        and direction change with the variables, (n, 3, L, F, W, P) each."""
-        task = self._task(lenses(start)) if prepare() == "compiled" else None
-        if task is None:
-            return self._traced_by_torch(lenses, start, slopes)
-        if not slopes:
-            rays = forward(task)
-            return rays.position, rays.direction, rays.valid
-        numbers = lambda *moved: [part for part in self._task(lenses(moved)).inputs if part is not None]  # noqa: E731
-        position, direction, table = _along(numbers, start, slopes)
-        pushed = push(task, table, (position.swapaxes(0, 1), direction.swapaxes(0, 1), None))
-        changes = (part.swapaxes(0, 1) for part in (pushed.by_position, pushed.by_direction))
-        return pushed.position, pushed.direction, pushed.valid, *changes
-
-    def _traced_by_torch(self, lenses, start, slopes):
-        """The same without the compiled trace."""
-
-        def ends(*moved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            rays = image_rays(lenses(moved), self.sampling.points, fields=self.sampling.fields)
-            return rays.position, rays.direction, rays.valid
-
-        changes = _along(lambda *moved: ends(*moved)[:2], start, slopes) if slopes else ()
-        return *ends(*start), *changes
-
-    def _task(self, lens: Lens) -> Task | None:
-        """The rays of the sample as the compiled trace takes them; None if it does not have a surface."""
-        rays = launch(lens, self.sampling.points, fields=self.sampling.fields)
-        return lens_task(lens, dataclasses.replace(rays, opl=None), lens.wavelengths[:, None])
-
-
-def _along(function: Callable, at: Sequence[Tensor], changes: Sequence[Tensor]):
-    """How the results of a function change with n variables, (n, …), from the changes (n, …) of its arguments."""
-    at = tuple(at)
-    return torch.func.vmap(lambda *along: torch.func.jvp(function, at, along)[1])(*changes)
+        with torch.set_grad_enabled(state.count > 0):
+            rays = image_rays(
+                self.lenses(state.moving_lens(), self.errors), self.sampling.points, fields=self.sampling.fields
+            )
+            offsets = factor * self._offsets(rays.position, rays.direction, rays.valid).reshape(-1)
+        slopes = tangents_of(offsets, state.count).numpy().T if state.count else None
+        return value_of(offsets).numpy(), slopes, int((~rays.valid).sum())
 
 
 def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:

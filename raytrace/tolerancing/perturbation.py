@@ -75,9 +75,8 @@ class Perturbation:
         """
         rows = self.rows
         lens = self.lens if lens is None else with_ray_aiming(lens, self.lens.ray_aiming)
-        if not isinstance(errors, Tensor):
-            errors = torch.as_tensor(errors)
-        errors = errors.to(lens.wavelengths)
+        like = lens.wavelengths
+        errors = errors.to(like) if isinstance(errors, Tensor) else like.new_tensor(errors)
         if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
             shape, count = tuple(errors.shape), len(rows)
             raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")
