@@ -242,7 +242,6 @@ def _floating(values: tuple) -> Tensor:
 _UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
 _BLUR_RAYS = 4, 8  # of units of blur
-_NEAR = 5.0  # mm within its limit from which on a thickness is part of a step towards the limits
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
 
 
@@ -570,18 +569,13 @@ class Variables(Owned):
         """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""
         numbers = torch.tensor(x)
         with torch.set_grad_enabled(derivatives):
-            numbers.requires_grad_(derivatives)
+            numbers = with_tangents(numbers, torch.eye(len(x), dtype=numbers.dtype)) if derivatives else numbers
             lens = to(self._modelled, dtype=torch.float64, device="cpu")
-            lens = _with_values(lens, self._all, numbers.unbind())
-            each = [*_shortfalls(lens, self.limits)]
+            each = [*_shortfalls(_with_values(lens, self._all, numbers.unbind()), self.limits)]
         excess = np.array([float(one.detach()) for one in each])
         if not derivatives:
             return excess, None
-        slope = np.zeros((len(excess), len(x)))
-        for k, one in enumerate(each):
-            if excess[k] > -_NEAR and one.requires_grad:
-                slope[k] = torch.autograd.grad(one, numbers, retain_graph=True)[0].numpy()
-        return excess, slope
+        return excess, np.array([tangents_of(one, len(x)).numpy() for one in each]).reshape(-1, len(x))
 
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
@@ -640,10 +634,9 @@ def _variable(lens: Lens, number: int, kind: str, quantity: str) -> Variable:
     else:
         angle = torch.linspace(0, 2 * math.pi, 33, dtype=start.dtype, device=start.device)
         x, y = edge * torch.cos(angle), edge * torch.sin(angle)
-        changed = torch.func.jvp(
-            lambda v: sag_at(with_number(surface, path, v), x, y), (start,), (torch.ones_like(start),)
-        )
-        moved = float(changed[1].abs().max())
+        with torch.enable_grad():
+            moving = with_number(surface, path, with_tangents(start, torch.ones_like(start)[None]))
+            moved = float(tangents_of(sag_at(moving, x, y), 1).abs().max())
     if moved == 0:
         why = "is flat, and a conic constant" if quantity == "conic" else "has a number that"
         raise BadVariables(f"'{kind}:{number}': the surface {why} changes nothing there")

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from raytrace.materials.glass import FORMULAS, WITH_ERRORS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.words import RaytraceWarning
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
@@ -136,12 +137,11 @@ def dn_dt(glass: Glass, wavelength: Tensor, air: Environment) -> tuple[Tensor, T
     temperature, pressure = _like(air, exact)
     in_vacuum = exact * air_index(exact, temperature, pressure)
 
-    def indices(temperature: Tensor) -> tuple[Tensor, Tensor]:
+    with torch.enable_grad():
+        temperature = with_tangents(temperature, torch.ones_like(temperature)[None])
         around = air_index(exact, temperature, pressure)
         n = index_in(glass, in_vacuum / around, Environment(temperature, pressure))
-        return n, n * around
-
-    return torch.func.jacfwd(indices)(temperature)
+    return tangents_of(n, 1)[0], tangents_of(n * around, 1)[0]
 
 
 def objection(place: Environment) -> str:

@@ -27,12 +27,11 @@ from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
 from raytrace.tolerancing.grades import tolerances as tolerances_of
-from raytrace.tolerancing.perturbation import perturbed
+from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.focus import focus_moments, shift_to_focus
-from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
 
@@ -96,7 +95,7 @@ class AsBuiltTerm:
         if not len(self.tolerances):
             raise BadTolerance("no tolerances; give a `grade`, `limits` or `tolerances`")
         self.limits = _focus_limits(lens, self.tolerances)
-        self.radii = semi_diameters(lens)
+        self.perturbation = Perturbation(without_apertures(lens), self.tolerances)
         self.errors = design(self.tolerances).to(lens.wavelengths)
         self.sampling = sampling_of(without_apertures(lens), settings.fields, settings.rings, settings.arms)
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
@@ -113,7 +112,13 @@ class AsBuiltTerm:
         rows = [dataclasses.astuple(row) for row in (*self.tolerances, *self.tolerances.compensators)]
         numbers = [self.sampling.fields, self.sampling.field_weights, self.sampling.points, self.weights]
         return repr(
-            [rows, self.tolerances.test_wavelength, self.settings.weight, self.radii, [n.tolist() for n in numbers]]
+            [
+                rows,
+                self.tolerances.test_wavelength,
+                self.settings.weight,
+                self.perturbation.radii,
+                [n.tolist() for n in numbers],
+            ]
         )
 
     def expected(self, lens: Lens) -> Tensor:
@@ -132,16 +137,7 @@ class AsBuiltTerm:
 
     def lenses(self, lens: Lens, errors: Tensor) -> Lens:
         """Lenses with errors (L, N), without apertures."""
-        surfaces = tuple(
-            dataclasses.replace(surface, apertures=(), semi_diameter=None if np.isnan(radius) else radius)
-            for surface, radius in zip(lens.surfaces, self.radii, strict=True)
-        )
-        data = lens.optimization_data
-        if data is not None:
-            data = dataclasses.replace(data, semi_diameters=tuple(range(len(surfaces))))
-        return aligned(
-            perturbed(dataclasses.replace(lens, surfaces=surfaces, optimization_data=data), self.tolerances, errors), 3
-        )
+        return aligned(self.perturbation(errors, without_apertures(lens)), 3)
 
     def _offsets(self, position: Tensor, direction: Tensor, valid: Tensor) -> Tensor:
         """Offsets (2, L, F, W P) mm of rays (3, L, F, W, P) from the centroid of each spot at the best focus of each
