@@ -17,15 +17,16 @@ from problems import MICROMETRE, PICOMETRE, own_fields
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
+from raytrace.imaging.built_lens import lens_as_built
 from raytrace.optimization.problem import conditions_of
 from raytrace.system.lens import Lens, media
 from raytrace.tolerancing.criteria import CRITERIA
-from raytrace.tolerancing.study import sampling_of
+from raytrace.tolerancing.study import Study, View, sampling_of
 from raytrace.tracing.paraxial import largest_field
 from raytrace.tracing.scene import beam_share
 from raytrace.tracing.spot import chief_reference, image_rays
 from raytrace.tracing.trace import is_bent, without_apertures
-from raytrace.tracing.wavefront import wavefront_of
+from raytrace.tracing.wavefront import clear_wavefront, wavefront_of, without
 from raytrace.viewer.compute import spots_of
 
 CASES = Path(__file__).parent / "cases"
@@ -96,6 +97,8 @@ ZOO = {
 }
 
 
+#: Lenses whose beams apertures clip.
+CLIPPED = "obscured", "obscured asphere", "annulus", "rectangular stop", "vane", "clipped"
 #: Lenses whose last space above is only near the focus.
 UNFOCUSED = "finite object", "sensor in glass", "annulus", "rectangular stop", "vane", "inches"
 
@@ -157,6 +160,20 @@ def test_spot_radii(lens):
 
 
 @quiet
+def test_fields_are_independent():
+    """A field has the same spot, radii and all, whether or not another one is clipped."""
+    lens = rt.read_lens("cooke_triplet").replace(6, apertures=(rt.Aperture("circular", (0.0, 13.0)),))
+    alone, together = rt.spot(lens, fields=[0]), rt.spot(lens, fields=[0, 20])
+    assert bool(alone.arrivals.rays.valid.all())
+    assert not bool(together.arrivals.rays.valid.all())
+    for name in ("rms_radius", "geometric_radius", "centroid"):
+        for spots in ("each", "whole"):
+            numbers = [getattr(getattr(found, spots), name) for found in (alone, together)]
+            axis = 1 if name == "centroid" else 0
+            assert torch.equal(numbers[0].select(axis, 0), numbers[1].select(axis, 0)), (name, spots)
+
+
+@quiet
 @pytest.mark.parametrize("model", [rt.Gaussian(order=16), rt.DRT(order=5)], ids=["gaussian", "drt"])
 def test_moments_of_kernels(lens, model):
     """Centroid and second moments of PSFs are those of spots."""
@@ -211,6 +228,62 @@ def test_wavefront_of_tolerances(lens):
     weights = lens.fields.weight / lens.fields.weight.sum()
     expected = (weights * less_mean_and_tilt(rt.wavefront(lens, size=401)).square()).sum().sqrt()
     assert close(nominal, expected, rel=5e-3, abs=1e-6)
+
+
+def clipped_and_moved(name: str) -> tuple[Lens, rt.Tolerances]:
+    """A lens of one wavelength, and the decentre of the surface that clips its beams."""
+    lens = member(name)
+    lens = lens.at(wavelengths=lens.primary[None], fields=own_fields(lens)[:, -1:])
+    surface = next(k for k, surface in enumerate(lens.surfaces) if surface.apertures)
+    size = 0.02 * max(lens.surfaces[surface].apertures[0].extent)
+    row = rt.Tolerance("surface_decenter_y", (surface,), -size, size)
+    return lens, rt.Tolerances((row,))
+
+
+@quiet
+@pytest.mark.parametrize("name", [*CLIPPED[:-1], pytest.param(CLIPPED[-1], marks=pytest.mark.slow)])
+def test_perturbed_lenses_of_tolerances(name):
+    """A lens with errors has the RMS wavefront and the spot radius of its own clear pupil, whose edge has moved."""
+    lens, rows = clipped_and_moved(name)
+    sampling = sampling_of(lens)
+    errors = torch.tensor([[-1.0], [0.0], [0.6]], dtype=torch.float64) * rows[0].maximum
+    lenses, singles = rt.perturbed(lens, rows, errors), [rt.perturbed(lens, rows, row) for row in errors]
+    waves = CRITERIA["wavefront"].quantity(lenses, sampling).sqrt()
+    radii = CRITERIA["rms"].quantity(lenses, sampling).sqrt()
+    expected = [variance_less_tilt(single, sampling).sqrt() for single in singles]
+    assert close(waves, expected, rel=1e-4)
+    spots = [rt.spot(single, fields=sampling.fields, rings=24).whole.mean_square_radius for single in singles]
+    assert close(radii, [1e3 * (sampling.field_weights * square).sum().sqrt() for square in spots], rel=1e-4)
+
+
+def variance_less_tilt(lens: Lens, sampling) -> torch.Tensor:
+    """Mean square () of the OPD of fields in waves², by the points of the clear pupil that `wavefront` has."""
+    front = clear_wavefront(scene_of(lens, sampling.fields), 14, 96)
+    flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])
+    share = front.energy / front.energy.sum(-1, keepdim=True)
+    return (sampling.field_weights * (share * flat * flat).sum(-1)[0, :, 0]).sum()
+
+
+@quiet
+@pytest.mark.parametrize("name", CLIPPED[1:4])
+def test_derivatives_of_perturbed_lenses(name):
+    """First and second derivatives of tolerances by a decentre include the motion of the edge."""
+    lens, rows = clipped_and_moved(name)
+    sampling = sampling_of(lens)
+    study = Study([View(lens, CRITERIA["wavefront"], sampling)], dataclasses.replace(rows, compensators=()), loss=1.0)
+    size, none = float(study.half), torch.zeros(1, 0, dtype=torch.float64)
+    at = torch.tensor([[0.3 * size]], dtype=torch.float64)
+
+    def variance(shift: float) -> float:
+        return float(variance_less_tilt(rt.perturbed(lens, rows, at[0] + shift), sampling))
+
+    step = 0.05 * size
+    less, here, more = variance(-step), variance(0.0), variance(step)
+    first, second = (more - less) / (2 * step), (more - 2 * here + less) / step**2
+    _, slope, _ = study.slope(at, none)
+    behind, ahead = (study.slope(at + side * step, none)[1] for side in (-1, 1))
+    assert float(slope) == pytest.approx(first, rel=1e-3)
+    assert float((ahead - behind) / (2 * step)) == pytest.approx(second, rel=1e-2)
 
 
 @quiet
@@ -399,6 +472,34 @@ def test_focus(lens):
     vertex = 0.5 * step * (squares[0] - squares[2]) / (squares[0] - 2 * squares[1] + squares[2])
     assert squares[1] <= min(squares[0], squares[2])
     assert abs(vertex) < 1e-3 * step
+
+
+@quiet
+@pytest.mark.parametrize("name", ["triplet", "rectangular stop"])
+def test_focus_as_built(name):
+    """A camera as built moves its sensor as the compensator of tolerances, and at one field and wavelength as focus."""
+    lens = member(name).at(fields=[0, 2])
+    sensor = len(lens.surfaces) - 2
+    rows = [rt.Tolerance(kind, (k,), -0.3, 0.3) for kind, k in (("surface_tilt_x", 2), ("thickness", sensor))]
+    rows = rt.Tolerances(tuple(rows), (rt.Compensator(sensor),))
+    errors = torch.tensor([[0.2, 0.03], [-0.3, -0.05]], dtype=torch.float64)
+
+    def shift(lens: Lens) -> torch.Tensor:
+        lenses = lens_as_built(lens, rows, errors, own_fields(lens)), rt.perturbed(lens, rows, errors)
+        built, before = (each.surfaces[-2].thickness.flatten() for each in lenses)
+        return built - before
+
+    sampling = sampling_of(lens, own_fields(lens))
+    _, moved = Study([View(lens, CRITERIA["rms"], sampling)], rows, loss=1.0).refocused(
+        torch.cat([errors, torch.zeros_like(errors[:1])])
+    )
+    assert close(shift(lens), moved[:2, 0] - moved[2], rel=1e-4)
+    lens = lens.at(fields=[0], wavelengths=lens.primary[None])
+    distances = [
+        float(rt.focus(each).sensor_distance) - float(each.surfaces[-2].thickness)
+        for each in (lens, *(rt.perturbed(lens, rows, row) for row in errors))
+    ]
+    assert close(shift(lens), [distance - distances[0] for distance in distances[1:]], rel=1e-4)
 
 
 @quiet

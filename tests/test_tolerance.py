@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,9 @@ from scipy.optimize import minimize_scalar
 
 import raytrace as rt
 from raytrace.system.configurations import Operand
+from raytrace.tolerancing import monte_carlo
+from raytrace.tolerancing.criteria import criterion_of
+from raytrace.tolerancing.study import Study, views_of
 from raytrace.tracing.spot import image_rays
 
 LIMITS = "radius=0.1% thickness=0.03 element_decenter=0.03 element_tilt=0.05"
@@ -100,6 +104,20 @@ def test_a_trial_is_the_same_in_any_study(triplet, built):
     torch.testing.assert_close(fewer.trials, built.trials[:260], rtol=1e-10, atol=0)
     other = rt.tolerance(triplet, limits=LIMITS, trials=20, seed=1)
     assert not torch.allclose(other.trials, built.trials[:20])
+
+
+def test_many_trials_are_worth_compiling(triplet, monkeypatch):
+    """The trace is compiled, once for a machine, for the rays of 3,000 lenses, not for those of 2."""
+    prepared = []
+    monkeypatch.setattr(monte_carlo, "prepare", lambda: prepared.append("compiled"))
+    study = Study(views_of(triplet, partial(criterion_of, "rms"), None, 4, 6), rt.tolerances(triplet, LIMITS), loss=1.0)
+    zero = torch.zeros(1, dtype=torch.float64)
+    monkeypatch.setattr(
+        study, "compensated", lambda e: (zero.expand(len(e)), zero.expand(len(e), 1), zero.expand(len(e)))
+    )
+    for trials, expected in ((2, []), (3000, ["compiled"])):
+        monte_carlo.monte_carlo(study, trials, 0, checkpoint=None, share=None, progress=None)
+        assert prepared == expected
 
 
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):

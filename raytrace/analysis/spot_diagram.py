@@ -260,13 +260,15 @@ def _of_clear_pupils(
     lens: Lens, fields: Tensor, launched: Tensor, rings: int, about: Tensor | None, each: Spot, whole: Spot
 ) -> tuple[Spot, Spot]:
     """The spots (F, W) and (F,) of launched rays, (L, F, W) and (L, F) of a batch, with the statistics of the clear
-    pupils of lenses that clip them.
+    pupils of the fields that apertures clip.
 
     about: (2, F) mm, (2, L, F) of a batch, or None. The points, and which of them are valid, stay those launched.
     """
     size = max(1, _KERNELS // len(lens.wavelengths))
     parts = torch.arange(fields.shape[1]).split(size)
-    lenses = torch.stack([clipped(scene_of(lens, fields[:, part]), launched) for part in parts]).any(0).nonzero()[:, 0]
+    clips = torch.cat([clipped(scene_of(lens, fields[:, part]), launched) for part in parts], 1).any(-1)  # (L, F)
+    lenses = clips.any(-1).nonzero()[:, 0]
+    clips = clips[0] if lens.count is None else clips
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     found = each, whole
     for some in lenses.split(max(1, size // fields.shape[1])):
@@ -286,7 +288,12 @@ def _of_clear_pupils(
             })
             for old, new in zip(found, zip(*spots, strict=True), strict=True)
         )  # fmt: skip
-    return found
+
+    def chosen(new: Spot, old: Spot, clips: Tensor) -> Spot:
+        numbers = {name: torch.where(clips, getattr(new, name), getattr(old, name)) for name in _STATISTICS}
+        return dataclasses.replace(new, **numbers)
+
+    return chosen(found[0], each, clips[..., None]), chosen(found[1], whole, clips)
 
 
 def _put(numbers: Tensor, new: Tensor, axis: int, lenses: Tensor) -> Tensor:

@@ -22,9 +22,10 @@ from raytrace.psf_models.models import DRT, Gaussian, psf
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
+from raytrace.tracing.clear_pupil import Arms, rule_near
 from raytrace.tracing.focus import shift_to_focus, spot_parabola
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import trace_scene
+from raytrace.tracing.scene import Scene, trace_scene
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import wavefront_of, without
@@ -36,12 +37,19 @@ _ACROSS = 10  # points across the pupil, by which lost light is measured
 @value
 class Sampling:
     """Fields (2, F) with weights (F,), and pupil points with weights: (2, P) and (P,), or (2, 1, F, W, P) and
-    (1, F, W, P) where apertures clip the beams."""
+    (1, F, W, P) where apertures clip the beams of the nominal lens, `rings` of them on each of its arms."""
 
     fields: Tensor
     field_weights: Tensor
     points: Tensor
     weights: Tensor
+    rings: int = 4
+    arms: Arms | None = None
+
+    def of(self, lens: Lens) -> tuple[Scene, Tensor, Tensor]:
+        """The scene of a lens near the nominal one, and points and weights over its clear pupils."""
+        scene = scene_of(lens, self.fields)
+        return scene, *rule_near(scene, self.points, self.weights, self.arms, self.rings)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,16 +84,16 @@ def _mean_square_radius(lens: Lens, sampling: Sampling) -> Tensor:
 
 def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """The mean square spot radius as a parabola of the position of the sensor, µm², µm²/mm, µm²/mm²."""
-    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
-    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    scene, points, weights = sampling.of(lens)
+    rays, weights = trace_scene(scene, points), (wavelength_shares(lens)[:, None] * weights).flatten(-2)
     together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
     return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
 
 
 def _mean_square_angle(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square angle (L,) mrad² of the rays at the sensor, of all wavelengths, about the mean of each field."""
-    rays = trace_scene(scene_of(lens, sampling.fields), sampling.points)
-    weights = (wavelength_shares(lens)[:, None] * sampling.weights).flatten(-2)
+    scene, points, weights = sampling.of(lens)
+    rays, weights = trace_scene(scene, points), (wavelength_shares(lens)[:, None] * weights).flatten(-2)
     weights = torch.where(rays.valid.flatten(-2), weights, 0.0)
     total, directions = weights.sum(-1, keepdim=True), rays.direction.flatten(-2)
     share = safe_divide(weights, total)
@@ -104,7 +112,7 @@ def light(lens: Lens, sampling: Sampling) -> Tensor:
 
 def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
     """Mean square (L,) of the OPD about its mean and tilt, waves²."""
-    front = wavefront_of(scene_of(lens, sampling.fields), sampling.points, sampling.weights)
+    front = wavefront_of(*sampling.of(lens))
     lit = (front.energy > 0).sum(-1, keepdim=True) >= 3  # fewer rays have no mean and tilt
     front = dataclasses.replace(front, energy=torch.where(lit, front.energy, 1.0))
     flat = without(front, 3) / (1e-3 * lens.wavelengths[:, None])

@@ -13,6 +13,7 @@ from raytrace.system.identity import digest, identity
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.study import CHUNK, Study
 from raytrace.tolerancing.tolerances import BadTolerance
+from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 
 _JOURNAL = Kind(
     damaged=BadTolerance,
@@ -43,7 +44,10 @@ class _Trials:
 
 def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
     """The criterion (T,) of the trials, the changes (T, C) of their compensators, and their share (T,) of the light."""
-    count, others = len(study.tolerances), len(study.compensators)
+    lens, sampling, count, others = study.lens, study.sampling, len(study.tolerances), len(study.compensators)
+    rays = sampling.fields.shape[1] * len(lens.wavelengths) * sampling.points.shape[-1]
+    if trials * rays * len(lens.surfaces) >= WORTH_COMPILING:
+        prepare()  # the rays of a batch of lenses are launched as those of one lens
     found = study.half.new_zeros(trials, 2 + others)
     chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
     mine = (share or Share()).of(range(len(chunks)))

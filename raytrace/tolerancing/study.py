@@ -21,7 +21,7 @@ from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axi
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
-from raytrace.tolerancing.criteria import Criterion, Sampling, at_best_focus, light, size_of_image
+from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus, light, size_of_image
 from raytrace.tolerancing.perturbation import Perturbation, path_of, with_operands
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
@@ -34,6 +34,7 @@ _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
 _ALIKE = 1e-10  # of the curvatures, each by itself 1: the least one of compensators that differ
 _RINGS, _SAME = (4, 6, 8), 1e-4  # rings of the pupil that are tried, and the accepted relative error of q
+_CLIPPED = (4, 16), (6, 24), (8, 32), (8, 64), (12, 96)  # rings and arms where apertures clip beams; the last are exact
 #: Lenses traced at once.
 CHUNK = 1024
 
@@ -319,9 +320,9 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
     """Fields and pupil points of a lens and of lenses near it.
 
     fields: by default those of the lens with their weights; as errors are not symmetric, a lens that is round about its
-    axis has each also mirrored along y, and the two share its weight. rings: of `gauss_rings`, or of the clear pupil
-    (`tracing.clear_pupil`) of a nominal lens that clips rays, whose points lenses with errors have, too; by default the
-    fewest that give the mean square spot radius of `spot`, to _SAME.
+    axis has each also mirrored along y, and the two share its weight. rings, arms: of `gauss_rings`, or of the clear
+    pupil (`tracing.clear_pupil`) of each lens near a nominal one that clips rays; by default the fewest that give the
+    mean square spot radius of `spot` to _SAME, and where rays are clipped the wavefront's variance, too.
     """
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
@@ -334,21 +335,26 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
         points, weights = torch.cat([points, mirrored[:, new]], 1), torch.cat([share, share[new]])
     weights = weights / weights.sum()
 
+    finest = SAMPLINGS["gauss"][2]
+    view = scene_of(lens, points)
+    clips = is_clipped(view, gauss_rings(finest if rings is None else rings, arms, **like)[0])
+
     def rule(rings: int, arms: int | None) -> Sampling:
-        at, shares = gauss_rings(rings, arms, **like)
-        view = scene_of(lens, points)
-        if is_clipped(view, at):
-            at, shares = arms_of(view, 4 * rings if arms is None else arms).rule(rings)
-        return Sampling(points, weights, at, shares)
+        clear = arms_of(view, arms or 4 * rings) if clips else None
+        at, shares = clear.rule(rings) if clips else gauss_rings(rings, arms, **like)
+        return Sampling(points, weights, at, shares, rings, clear)
 
     with torch.no_grad():
         if rings is not None:
             return rule(rings, arms)
-        finest = rule(SAMPLINGS["gauss"][2], None)
-        quantity = size_of_image(lens).quantity
-        square = quantity(lens, finest)
-        for rings in _RINGS:
-            fewer = rule(rings, arms)
-            if bool((quantity(lens, fewer) - square).abs() <= _SAME * square):
+        judges = [size_of_image(lens)]
+        judges += [CRITERIA["wavefront"]] if clips and not lens.afocal else []
+        *tried, last = _CLIPPED if clips else [(rings, None) for rings in (*_RINGS, finest)]
+        best = rule(*last)
+        squares = [judge.quantity(lens, best) for judge in judges]
+        for rings, usual in tried:
+            fewer = rule(rings, arms or usual)
+            pairs = zip(judges, squares, strict=True)
+            if all(bool((judge.quantity(lens, fewer) - q).abs() <= _SAME * q) for judge, q in pairs):
                 return fewer
-    return finest
+    return best

@@ -21,11 +21,12 @@ import math
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.apertures import clearances_of, stands_inside
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import Lens, field_points, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
@@ -39,7 +40,39 @@ _COARSE = 64  # arms round the pupil between which kinks are looked for
 _NEWTON = 4  # steps to a kink
 _RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
 _INNER = 6, 24  # rings and arms of the rays whose mean is a point inside the clear pupil
+_NEARBY = 0.5  # radians that a kink moves by, at most, between lenses near each other
+_DIFFERENCE = 1e-4  # of the radius of the pupil: step of the differences that are slopes of clearances
+_SETTLED, _ROUNDED = 1e-2, 1e-9  # of the radius: the last step that was not yet taken; of clearances
+_TOGETHER = 32  # lenses whose clear pupils are searched at once
 _NODES, _DENSER = 8, 1.25  # of a span between kinks; more of them than arms of equal steps
+
+
+@value
+class Edges:
+    """Both ends of the clear parts of arms, each on an edge.
+
+    radius: (2, D, F, W, B) inner and outer; number: (2, D, F, W, B) of the clearance that is 0 there, as of
+    `_clearances_at`: 0 for the edge of the pupil, -1 for the origin; slope: (2, D, F, W, B) of that clearance along the
+    arm, 0 where there is none; exists: (D, F, W, B), whether the arm has this part.
+    """
+
+    radius: Tensor
+    number: Tensor
+    slope: Tensor
+    exists: Tensor
+
+
+@value
+class Kinks:
+    """Where another edge begins to bound the clear pupil, (D, F, W, K); the angle is inf where a kernel has fewer.
+
+    radius: near that point; pair: (2, D, F, W, K) numbers of the clearances that are 0 there; count: of arms.
+    """
+
+    angle: Tensor
+    radius: Tensor
+    pair: Tensor
+    count: int
 
 
 @value
@@ -48,7 +81,7 @@ class Arms:
 
     origin: (2, D, F, W) pupil point from which they start, unit: (2, D, F, W, B) their directions, share: (D, F, W, B)
     of the full angle that each represents, 1 in all. inner, outer: (D, F, W, B) radii between which light passes, with
-    derivatives. rays: how many were traced for each kernel.
+    derivatives. rays: how many were traced for each kernel. edges, kinks: what `rule_near` starts from.
     """
 
     origin: Tensor
@@ -57,6 +90,8 @@ class Arms:
     inner: Tensor
     outer: Tensor
     rays: int
+    edges: Edges | None = None
+    kinks: Kinks | None = None
 
     def rule(self, rings: int) -> tuple[Tensor, Tensor]:
         """Pupil points (2, D, F, W, P) and weights (D, F, W, P): `rings` nodes on each part, those of a ring together.
@@ -137,14 +172,14 @@ def is_clipped(scene: Scene, points: Tensor | None = None) -> bool:
 
 @torch.no_grad()
 def clipped(scene: Scene, points: Tensor | None = None) -> Tensor:
-    """Whether rays of each object distance (D,), or lens of a batch, fail; arguments as for `is_clipped`."""
+    """Whether rays (D, F, W) of an object distance, or lens of a batch, fail; arguments as for `is_clipped`."""
     points = scene.wavelengths.new_zeros(2, 0) if points is None else points
     if any(surface.apertures for surface in scene.lens.surfaces):
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
     if points.shape[1] == 0:
-        return torch.zeros(scene.shape[0], dtype=torch.bool, device=points.device)
-    return ~trace_scene(scene, points).valid.flatten(1).all(-1)
+        return torch.zeros(scene.shape, dtype=torch.bool, device=points.device)
+    return ~trace_scene(scene, points).valid.all(-1)
 
 
 def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
@@ -160,8 +195,8 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     if fold == "round":
         unit, origin = like.new_tensor([[0.0], [1.0]]).reshape(2, 1, 1, 1, 1), like.new_zeros(2, *scene.shape)
-        inner, outer, traced = _clear_parts(scene, unit.expand(2, *scene.shape, 1), origin)
-        return Arms(origin, unit.expand(2, *scene.shape, outer.shape[-1]), torch.ones_like(outer), inner, outer, traced)
+        unit = unit.expand(2, *scene.shape, 1)
+        return _clear_parts(scene, origin, unit, torch.ones_like(unit[0]), *_enclosed(scene, unit, origin))
     is_hollow = any(map(stands_inside, apertures))
     with torch.no_grad():
         origin, traced = like.new_zeros(2, *scene.shape), 0
@@ -171,13 +206,71 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
             origin = torch.stack([safe_divide((passes * at).sum(-1), passes.sum(-1)) for at in points])
             origin = torch.stack([torch.zeros_like(origin[0]), origin[1]]) if fold == "mirror" else origin
             traced = points.shape[1]
-    kinks, searched = _kinks(scene, origin, fold, around, is_hollow)
-    angle, share = _angles(kinks, count, around)
+    kinks, searched = _kinks(scene, origin, count, fold, is_hollow)
+    angle, share = _angles(kinks.angle, count, around)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
-    inner, outer, found = _clear_parts(scene, unit, origin)
-    parts = outer.shape[-1] // unit.shape[-1]
-    return Arms(origin, unit.repeat(1, 1, 1, 1, parts), share.repeat(1, 1, 1, parts), inner, outer,
-                traced + searched + found)  # fmt: skip
+    edges, found = _enclosed(scene, unit, origin)
+    return _clear_parts(scene, origin, unit, share, edges, traced + searched + found, kinks)
+
+
+def rule_near(
+    scene: Scene, points: Tensor, weights: Tensor, arms: Arms | None = None, rings: int = 12
+) -> tuple[Tensor, Tensor]:
+    """Pupil points (2, D, F, W, P) and weights (D, F, W, P) over the clear pupils of lenses near a known one.
+
+    points, weights: the rule of the known lens, of `rings`; arms: its arms (1, F, W, B) by `arms_of`, None if it clips
+    no ray. Newton steps move its kinks and edges to those of each lens, by five rays an edge. The clear pupil of a lens
+    whose edges are those of other apertures is searched as by `arms_of`.
+    """
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        return points, weights
+    if arms is None:
+        is_near, count = ~clipped(scene, points).flatten(1).any(-1), 4 * rings
+        points, weights = points[:, None, None, None].expand(2, *scene.shape, -1), weights.expand(*scene.shape, -1)
+    else:
+        moved, is_near = _moved(scene, arms)
+        (points, weights), count = moved.rule(rings), arms.kinks.count
+    others = (~is_near).nonzero()[:, 0]
+    for some in others.split(_TOGETHER) if len(others) else ():
+        chosen = scene if len(is_near) == 1 else dataclasses.replace(scene, lens=one_lens(scene.lens, some), memo=None)
+        at, shares = arms_of(chosen, count).rule(rings)
+        more = at.shape[-1] - points.shape[-1]
+        points, weights = (torch.nn.functional.pad(t, (0, max(0, more))) for t in (points, weights))
+        at, shares = (torch.nn.functional.pad(t, (0, max(0, -more))) for t in (at, shares))
+        points, weights = points.index_copy(1, some, at), weights.index_copy(0, some, shares)
+    return points, weights
+
+
+def _moved(scene: Scene, arms: Arms) -> tuple[Arms, Tensor]:
+    """The arms of lenses near one whose are known, and whether (D,) their edges are those of the same apertures."""
+    edges, kinks = pytree.tree_map(
+        lambda t: t.expand(*t.shape[:-4], *scene.shape, -1) if isinstance(t, Tensor) else t, (arms.edges, arms.kinks)
+    )
+    origin = arms.origin.expand(2, *scene.shape)
+    if kinks.angle.shape[-1]:
+        start = kinks.radius, kinks.angle.nan_to_num(posinf=0.0)
+        angle, _ = _crossing(scene, origin, start, kinks.pair, _NEARBY)
+        kinks = dataclasses.replace(kinks, angle=torch.where(kinks.angle.isfinite(), angle, torch.inf))
+    angle, share = _angles(kinks.angle, kinks.count, 2 * math.pi)
+    unit = torch.stack([torch.sin(angle), torch.cos(angle)])
+    with torch.no_grad():
+        each = unit.repeat(1, 1, 1, 1, edges.radius.shape[-1] // unit.shape[-1])
+        reach = _reach(each, origin)
+        clips = edges.number > 0
+        edges = dataclasses.replace(edges, radius=torch.where(edges.number == 0, reach, edges.radius))
+        edges = dataclasses.replace(edges, radius=_step(scene, edges, each, origin))
+        inward = _DIFFERENCE * edges.number.new_tensor([1, -1]).reshape(2, 1, 1, 1, 1)
+        here, inside = (_clearances(scene, edges.radius + step, each, origin) for step in (0.0, inward))
+        own = (edges.number - 1).clamp_min(0)[None]
+        rest, slopes = (t.gather(0, own)[0] for t in (here, (inside - here) / inward))
+        others = torch.where(clips, here.scatter(0, own, torch.inf), here).amin(0)
+        rest, slope = torch.where(clips, rest, 0.0), torch.where(clips, slopes, 0.0)
+        is_same = (others >= -2 * rest.abs() - _ROUNDED) & (rest.abs() <= _SETTLED * slope.abs())
+        is_same &= (clips <= (edges.slope != 0)) & (edges.radius >= 0) & (edges.radius <= reach)
+        is_same &= edges.radius[1] > edges.radius[0]
+        edges = dataclasses.replace(edges, radius=edges.radius - safe_divide(rest, slope), slope=slope)
+    is_near = (is_same | ~edges.exists).all(0).flatten(1).all(-1)
+    return _clear_parts(scene, origin, unit, share, edges, 0, kinks), is_near
 
 
 def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
@@ -210,21 +303,23 @@ def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
     return angles, shares
 
 
-def _kinks(scene: Scene, origin: Tensor, fold: str, around: float, is_hollow: bool) -> tuple[Tensor, int]:
-    """Angles (D, F, W, K) at which another edge begins to bound the clear pupil, or blocked arms begin, inf where there
-    are fewer than K.
+def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool) -> tuple[Kinks, int]:
+    """Where another edge begins to bound the clear pupil, or blocked arms begin, for `count` arms.
 
-    K is 0 if an arm has several clear parts. And the number of rays traced for each kernel.
+    There are none if an arm has several clear parts. And the number of rays traced for each kernel.
     """
     is_whole = fold == "none"
-    count = _COARSE if is_whole else _COARSE // 2
-    step = around / count
-    angle = (torch.arange(count, dtype=origin.dtype, device=origin.device) + 0.5) * step
+    coarse = _COARSE if is_whole else _COARSE // 2
+    step = 2 * math.pi / _COARSE
+    angle = (torch.arange(coarse, dtype=origin.dtype, device=origin.device) + 0.5) * step
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])[:, None, None, None].expand(2, *scene.shape, -1)
-    (inner, outer), (number_in, number_out), _, exists, traced = _enclosed(scene, unit, origin)
-    if outer.shape[-1] > count:
-        return origin.new_zeros(*scene.shape, 0), traced
-    found, exists_after = [origin.new_zeros(*scene.shape, 0)], exists.roll(-1, -1)
+    edges, traced = _enclosed(scene, unit, origin)
+    none = origin.new_zeros(*scene.shape, 0)
+    found = [Kinks(none, none, edges.number.new_zeros(2, *none.shape), count)]
+    if edges.exists.shape[-1] > coarse:
+        return found[0], traced
+    (inner, outer), (number_in, number_out), exists = edges.radius, edges.number, edges.exists
+    exists_after = exists.roll(-1, -1)
     changes = []
     for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
         after = number.roll(-1, -1)
@@ -243,8 +338,8 @@ def _kinks(scene: Scene, origin: Tensor, fold: str, around: float, is_hollow: bo
         start = radius.gather(-1, order), angle[order] + 0.5 * step
         kink, rays = _crossing(scene, origin, start, pair, step)
         traced += rays
-        found.append(torch.where(change.gather(-1, order), kink, torch.inf))
-    return torch.cat(found, -1), traced
+        found.append(Kinks(torch.where(change.gather(-1, order), kink, torch.inf), start[0], pair, count))
+    return Kinks(*(torch.cat(part, -1) for part in zip(*map(pytree.tree_leaves, found), strict=True)), count), traced
 
 
 def _crossing(scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float):
@@ -274,34 +369,39 @@ def _newton(u: Tensor, v: Tensor, differences: Tensor, small: float) -> Tensor:
     return small * torch.stack([safe_divide(q * u - b * v, determinant), safe_divide(a * v - p * u, determinant)])
 
 
-def _clear_parts(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Radii (D, F, W, B) between which light passes on arms in the directions (2, D, F, W, A); and the number of rays.
+def _clear_parts(
+    scene: Scene, origin: Tensor, unit: Tensor, share: Tensor, edges: Edges, traced: int, kinks: Kinks | None = None
+) -> Arms:
+    """Arms in the directions (2, D, F, W, A) whose parts end at edges that are known closely.
 
     B is A, or a multiple of it if an obstruction lies in an arm: then the second clear parts of all arms follow the
     first ones. A part that an arm does not have lies between 0 and 0. First derivatives are exact to 1e-6, second ones
     to 1e-3, where an aperture of any shape sets the edge; where rays miss a surface or are totally reflected the edge
-    has none. Parts and gaps shorter than 1/32 of an arm may be missed, or 1/8 where no aperture stops light within the
-    beam; gaps behind the third part are filled.
+    has none. traced: rays traced so far for each kernel.
     """
-    radius, number, slope, exists, traced = _enclosed(scene, unit, origin)
-    unit = unit.repeat(1, 1, 1, 1, radius.shape[-1] // unit.shape[-1])
+    parts = edges.radius.shape[-1] // unit.shape[-1]
+    unit, share = unit.repeat(1, 1, 1, 1, parts), share.repeat(1, 1, 1, parts)
     # A step with a constant slope has the error (1 - c'/s)(ρ - ρ₀) to first order, in value and derivatives.
-    for _ in range(2 if bool((slope != 0).any()) else 0):
-        clearances = _clearances(scene, radius, unit, origin)
-        here = clearances.gather(0, (number - 1).clamp(0, len(clearances) - 1)[None])[0]
-        radius = radius - safe_divide(here, slope)
+    for _ in range(2 if bool((edges.slope != 0).any()) else 0):
+        edges = dataclasses.replace(edges, radius=_step(scene, edges, unit, origin))
         traced += 2 * unit.shape[-1]
-    radius = torch.where(number == 0, _reach(unit, origin), radius)
-    inner, outer = torch.where(exists, radius, 0.0)
-    return inner, outer, traced
+    radius = torch.where(edges.number == 0, _reach(unit, origin), edges.radius)
+    inner, outer = torch.where(edges.exists, radius, 0.0)
+    return Arms(origin, unit, share, inner, outer, traced, dataclasses.replace(edges, radius=radius.detach()), kinks)
 
 
-def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
-    """Edges (2, D, F, W, B), inner and outer, just inside the clear side, and which aperture sets them; no derivatives.
+def _step(scene: Scene, edges: Edges, unit: Tensor, origin: Tensor) -> Tensor:
+    """Radii (2, D, F, W, B) of edges, after a Newton step with their slopes."""
+    clearances = _clearances(scene, edges.radius, unit, origin)
+    here = clearances.gather(0, (edges.number - 1).clamp_min(0)[None])[0]
+    return edges.radius - safe_divide(here, edges.slope)
 
-    Their numbers are those of `_clearances_at`: 0 for the edge of the pupil, -1 for the origin. Then the slope of the
-    clearance, 0 where there is none; whether the part exists (D, F, W, B); and the number of rays traced for each
-    kernel.
+
+def _enclosed(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Edges, int]:
+    """Edges on arms in the directions (2, D, F, W, A), just inside the clear side, without derivatives.
+
+    Also the number of rays traced for each kernel. Parts and gaps shorter than 1/32 of an arm may be missed, or 1/8
+    where no aperture stops light within the beam; gaps behind the third part are filled.
     """
     arms = unit.shape[-1]
     with torch.no_grad():
@@ -348,7 +448,7 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor):
         slope = safe_divide((outside - inside).gather(0, number[None])[0], blocked - passes)
         slope = torch.where((lowest < 0) & (number < len(scanned) - 1) & ~ends, slope, 0.0)
         number = torch.where(ends, number.new_tensor([-1, 0]).reshape(2, 1, 1, 1, 1), number + 1)
-    return passes, number, slope, here.any(0), traced
+    return Edges(passes, number, slope, here.any(0)), traced
 
 
 def _reach(unit: Tensor, origin: Tensor) -> Tensor:
