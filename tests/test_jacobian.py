@@ -41,8 +41,8 @@ def assert_gradients(of, lens: rt.Lens, vary: str, close: float = 1e-11) -> None
     """The gradient of a weighted sum of a function by torch's graph, and the same sum of the Jacobian."""
     found = rt.jacobian(lens, vary, of=of)
     view = model_of(lens, vary).views[lens.current_configuration - 1].clipping
-    leaves, moved = view.leaves()
-    value = of(moved)
+    leaves = {at: torch.tensor(n, dtype=torch.float64, requires_grad=True) for at, n in view.stored.items()}
+    value = of(view.held(leaves))
     weights = torch.rand(value.shape, generator=torch.Generator().manual_seed(4), dtype=value.dtype)
     by = torch.autograd.grad((weights * value).sum(), list(leaves.values()), allow_unused=True)
     expected = torch.stack([torch.zeros((), dtype=value.dtype) if g is None else g for g in by])

@@ -354,8 +354,8 @@ class LensState:
         """
         view = self.view.clipping if clips else self.view
         with torch.set_grad_enabled(self.count > 0):
-            leaves, lens = view.leaves({at: value_of(self.numbers[at]) for at in only or self.numbers})
-            numbers = function(lens)
+            leaves = {at: _tensor(self.numbers[at]).requires_grad_() for at in only or self.numbers}
+            numbers = function(view.held(leaves))
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
     def _chained(self, number: Tensor, leaves: dict) -> Dual:
@@ -370,33 +370,32 @@ class LensState:
         return Dual(value, slope)
 
     def moving_lens(self, *, clips: bool = False) -> Lens:
-        """The lens whose numbers carry their derivatives by all variables: of many numbers in one forward pass.
+        """The lens, whose numbers carry their derivatives by all variables: of many numbers in one forward pass.
 
         clips: whether the lens has its apertures.
         """
-        numbers = {
-            at: with_tangents(
-                torch.tensor(float(value_of(self.numbers[at])), dtype=torch.float64),
-                torch.from_numpy(np.array(slope_of(self.numbers[at], self.count))),
-            )
-            for at in self.numbers
-        }
+        numbers = {at: _tensor(number) for at, number in self.numbers.items()}
+        if self.count:
+            slopes = {at: torch.tensor(slope_of(number, self.count)) for at, number in self.numbers.items()}
+            numbers = {at: with_tangents(number, slopes[at]) for at, number in numbers.items()}
         return (self.view.clipping if clips else self.view).held(numbers)
 
     def each_through_torch(self, function: Callable, arrays: Sequence):
         """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
         entries = [torch.tensor(value_of(array)) for array in arrays]
-        if not self.count:
-            with torch.no_grad():
-                values = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in self.numbers.items()}
-                return function(self.view.held(values), *entries).numpy()
-        moved = [
-            with_tangents(entry, torch.from_numpy(array.full().copy())) if isinstance(array, Dual) else entry
+        entries = [
+            with_tangents(entry, torch.tensor(array.full())) if isinstance(array, Dual) else entry
             for entry, array in zip(entries, arrays, strict=True)
         ]
-        with torch.enable_grad():
-            numbers = function(self.moving_lens(), *moved)
-        return Dual(numbers.detach().numpy(), tangents_of(numbers, self.count).detach().numpy())
+        with torch.set_grad_enabled(self.count > 0):
+            numbers = function(self.moving_lens(), *entries)
+        values = numbers.detach().numpy()
+        return Dual(values, tangents_of(numbers, self.count).detach().numpy()) if self.count else values
+
+
+def _tensor(number) -> Tensor:
+    """The value () of a number."""
+    return torch.tensor(float(value_of(number)), dtype=torch.float64)
 
 
 def _gaussian(state: LensState, wavelength: int) -> Gaussian:
@@ -504,19 +503,15 @@ def rays_by_torch(
 ) -> tuple[list, np.ndarray]:
     """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity."""
 
-    def parts_of(lens: Lens) -> list[Tensor]:
-        rays = function(lens)
-        return [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl, rays.valid)]
-
-    values = {at: torch.tensor(float(value_of(n)), dtype=torch.float64) for at, n in state.numbers.items()}
-    with torch.no_grad():
-        *parts, valid = (part.numpy().copy() for part in parts_of(state.view.held(values)))
+    with torch.set_grad_enabled(state.count > 0):
+        rays = function(state.moving_lens())
+        parts = [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl)]
+    valid = rays.valid.expand(shape).numpy().copy()
+    values = [part.detach().numpy().copy() for part in parts]
     if not state.count:
-        return parts, valid
-    with torch.enable_grad():
-        *moved, _ = parts_of(state.moving_lens())
-    slopes = [np.where(valid, tangents_of(part, state.count).numpy(), 0.0) for part in moved]
-    return [Dual(value, slope) for value, slope in zip(parts, slopes, strict=True)], valid
+        return values, valid
+    slopes = [np.where(valid, tangents_of(part, state.count).detach().numpy(), 0.0) for part in parts]
+    return [Dual(value, slope) for value, slope in zip(values, slopes, strict=True)], valid
 
 
 class Ray(NamedTuple):

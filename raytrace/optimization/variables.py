@@ -36,6 +36,7 @@ from raytrace.materials.glass import (
     normal_line_deviation,
     refractive_index,
 )
+from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.optimization.lens_state import LensState
 from raytrace.system.configurations import Operand, ScaledPath, same
 from raytrace.system.lens import Lens, is_round_about_axis, media, with_environment
@@ -665,24 +666,15 @@ class View:
     @cached_property
     def is_plain(self) -> bool:
         """Whether all first-order data follow from thicknesses and curvatures alone."""
+        plain = "curvature", "thickness", *GLASS
+        others = [at for at in self.stored if at[1] not in plain and not at[1].startswith(GLASS_NUMBER)]
+        units = torch.eye(len(others), dtype=torch.float64)
+        numbers = {at: torch.tensor(float(self.stored[at]), dtype=torch.float64) for at in others}
         with torch.enable_grad():
-            numbers, lens = self.leaves()
-            powers = [vertex_curvature(s).reshape(()) for s in lens.surfaces if s.curvature is not None or s.is_plane]
-            phases = [power_of(s.phase, lens.wavelengths)[1].sum() for s in lens.surfaces if s.phase is not None]
-            plain = "curvature", "thickness", *GLASS
-            named = [(quantity, n) for (_, quantity), n in numbers.items() if not quantity.startswith(GLASS_NUMBER)]
-            others = [n for quantity, n in named if quantity not in plain]
-            total = sum([p for p in (*powers, *phases) if p.requires_grad], torch.zeros((), dtype=torch.float64))
-            if not others or not total.requires_grad:
-                return True
-            found = torch.autograd.grad(total, others, allow_unused=True)
-        return all(g is None or not bool(g.any()) for g in found)
-
-    def leaves(self, values: dict[Address, float] | None = None) -> tuple[dict[Address, Tensor], Lens]:
-        """What moves, as tensors that require a gradient, and the lens that holds them."""
-        values = self.stored if values is None else values
-        numbers = {at: torch.tensor(float(n), dtype=torch.float64, requires_grad=True) for at, n in values.items()}
-        return numbers, self.held(numbers)
+            lens = self.held({at: with_tangents(numbers[at], units[k]) for k, at in enumerate(others)})
+            powers = [vertex_curvature(s) for s in lens.surfaces if s.curvature is not None or s.is_plane]
+            powers += [power_of(s.phase, lens.wavelengths)[1] for s in lens.surfaces if s.phase is not None]
+        return not any(bool(tangents_of(power, len(others)).any()) for power in powers)
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
         """The lens with other numbers."""
