@@ -104,6 +104,39 @@ def test_hits_of_many_random_surfaces_satisfy_their_equation(compiler, kind):
     check(kind, 285, 1800, 1)
 
 
+#: Kind, curvature, coefficients, semi-diameter, position and direction of a ray whose slope on the surface is near its
+#: largest: where the conic closes, or far from the vertex.
+STEEP = {
+    "where the conic closes": (
+        "even asphere",
+        (-0.036381678447950296, (-0.00017232064084787098, -1.7130613348537356e-07), None),
+        (-44.826439194857194, 4.905550646491374, 0.3824602191824389),
+        (-0.5283823370739633, 0.06404418141146435, 0.8465875316206777),
+    ),
+    "where odd terms meet the edge of the conic": (
+        "odd asphere",
+        (
+            0.02931703115298198,
+            (0.004291296476589754, -1.88405979588851e-05, -5.299759522774956e-07),
+            51.724944770182105,
+        ),
+        (38.856900773782414, 37.122651506098336, -0.9370841004788599),
+        (-0.24934869410680888, -0.45383480317376373, 0.8554876972671555),
+    ),
+}
+
+
+@both_engines
+@pytest.mark.parametrize("name", STEEP)
+def test_a_hit_on_a_steep_slope_is_on_the_surface(engine, name):
+    kind, (curvature, coefficients, rim), position, direction = STEEP[name]
+    surface = Surface(scalar(5.0), scalar(curvature), kind=kind, coefficients=vector(*coefficients), semi_diameter=rim)
+    ray = start(vector(*position)[:, None], vector(*direction)[:, None], scalar(0.0)[None])
+    end = hits(surface, ray, engine)
+    assert bool(end.valid)
+    assert not bool(is_off(surface, end))
+
+
 #: Curvatures along y and x, semi-diameter, foot and direction of a ray, and height of its crossing or None.
 TOROIDS = {
     "a change of sign at the edge of the sheet is no crossing": (

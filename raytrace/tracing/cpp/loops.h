@@ -118,7 +118,7 @@ int cross_conic(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const 
 // Newton's method from the base conic, every ray frozen once its step is small: quadratic convergence then puts the
 // error below rounding. Rays that take more than a few steps are left to `careful`.
 template <typename T>
-constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(5e-9);
+constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(1e-9);
 constexpr int kSteps = 8;
 
 // |F| of a hit over the size of its terms, above which it is left to `careful`: where a section closes its slope has no
