@@ -256,6 +256,19 @@ def test_perturbed_lenses_of_tolerances(name):
     assert close(radii, [1e3 * (sampling.field_weights * square).sum().sqrt() for square in spots], rel=1e-4)
 
 
+@quiet
+def test_errors_that_clip_a_beam():
+    """A rim that clips nothing of the nominal lens clips the beam of a lens in which it is decentred."""
+    lens = rt.focus(_with_aperture(rt.Aperture("circular", (0.0, 4.05)))).lens
+    rows, errors = rt.Tolerances((rt.Tolerance("surface_decenter_y", (1,), -0.3, 0.3),)), torch.tensor([[0.0], [0.3]])
+    sampling = sampling_of(lens)
+    radii = CRITERIA["rms"].quantity(rt.perturbed(lens, rows, errors.double()), sampling).sqrt()
+    spots = [rt.spot(rt.perturbed(lens, rows, row), fields=sampling.fields).whole for row in errors.double()]
+    expected = [1e3 * (sampling.field_weights * spot.mean_square_radius).sum().sqrt() for spot in spots]
+    assert close(radii, expected, rel=1e-4)
+    assert abs(float(radii[1] / radii[0]) - 1) > 0.01
+
+
 def variance_less_tilt(lens: Lens, sampling) -> torch.Tensor:
     """Mean square () of the OPD of fields in waves², by the points of the clear pupil that `wavefront` has."""
     front = clear_wavefront(scene_of(lens, sampling.fields), 14, 96)

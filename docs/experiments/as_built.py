@@ -9,6 +9,7 @@ radius in µm, of the refocused lens at precision grade.
 import argparse
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,14 @@ GRADE, SEED, TRIALS = "precision", 2026, 2000
 CASES = {
     "Cooke triplet": ("cooke_triplet", 5.6, 4.0, 3, 0.45, 100),
     "double Gauss": ("double_gauss", 5.6, 14.0, 2, 1.0, 60),
+}
+#: Other conditions, of "What bounds the gain".
+CONDITIONS = {
+    "Cooke triplet, F/3.5, 11.9°": ("cooke_triplet", 3.5, 11.9, 3, 2.0, 100),
+    "Cooke triplet, F/5.6, 4°": ("cooke_triplet", 5.6, 4.0, 3, 1.0, 100),
+    "Cooke triplet, F/5, 6°": ("cooke_triplet", 5.0, 6.0, 3, 1.0, 100),
+    "double Gauss, F/3, 14°": ("double_gauss", 3.0, 14.0, 2, 2.0, 60),
+    "double Gauss, F/8, 14°": ("double_gauss", 8.0, 14.0, 2, 1.0, 60),
 }
 
 
@@ -69,6 +78,14 @@ def judged(lens) -> dict[str, np.ndarray]:
     """Monte Carlo of a seed that no optimisation has seen."""
     built = rt.tolerance(lens, grade=GRADE, trials=TRIALS, seed=SEED)
     return {"nominal": built.nominal.numpy(), "trials": built.trials.numpy()}
+
+
+def sensitivity(lens) -> dict[str, np.ndarray]:
+    """RMS wavefront of 300 lenses, and the changes (N,) of the spot at the worse limit of every tolerance, µm."""
+    waves = rt.tolerance(lens, grade=GRADE, criterion="wavefront", trials=300, seed=SEED)
+    spots = rt.tolerance(lens, grade=GRADE, trials=0)
+    changes = torch.maximum(spots.minimum, spots.maximum)
+    return {"nominal": waves.nominal.numpy(), "waves": waves.trials.numpy(), "changes": changes.numpy()}
 
 
 def samples(term: AsBuiltTerm) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
@@ -134,10 +151,24 @@ def table_of_samples(store: Store, name: str, reference: int = 6000) -> list[str
     return lines
 
 
+def table_of_conditions(store: Store) -> Iterator[str]:
+    """A row for each condition: expected and nominal spot of the usual lens, their changes by the term, in percent."""
+    for title, case in CONDITIONS.items():
+        key = "".join(c if c.isalnum() else "_" for c in title)
+        ends = store.arrays(key, lambda case=case: desensitised(*case))
+        spots = []
+        for end, numbers in ends.items():
+            lens = lens_of(start_of(*case[:3])[0], numbers)
+            found = store.arrays(f"{key}_{end}_trials", lambda lens=lens: judged(lens))
+            spots.append((np.sqrt((found["trials"] ** 2).mean()), float(found["nominal"])))
+        changes = [f"{100 * (new / old - 1):+.1f} %" for old, new in zip(*spots, strict=True)]
+        yield " | ".join([f"| {title}", f"{case[4]:g}", *(f"{spot:.2f}" for spot in spots[0]), *changes]) + " |"
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="figures computed so far")
     parser.add_argument("--plot", type=Path, help="figure to write")
-    parser.add_argument("--only", choices=[*CASES, "samples"], help="one part")
+    parser.add_argument("--only", choices=[*CASES, "samples", "conditions"], help="one part")
 
 
 def main() -> None:
@@ -149,6 +180,9 @@ def main() -> None:
     if arguments.only in (None, "samples"):
         for name in ("cooke_triplet", "double_gauss"):
             print("\n".join(table_of_samples(store, name)))
+    if arguments.only in (None, "conditions"):
+        for line in table_of_conditions(store):
+            print(line, flush=True)
     figure = new_figure(9.0, 3.4 * len(CASES))
     panels = figure.subplots(len(CASES), 3, width_ratios=(1, 1, 1.1))
     for row, (title, case) in zip(panels, CASES.items(), strict=True):
@@ -175,6 +209,12 @@ def draw(row, title: str, lenses: dict, store: Store) -> None:
         print(f"{title} {key}: nominal {nominal:.3f}, mean {trials.mean():.3f} ± {bound:.3f}, 90 % below {high:.3f}")
         rms = np.sqrt((trials**2).mean())
         print(f"   root mean square {rms:.3f}; EFL {float(rt.first_order(lens).effective_focal_length):.4f}")
+        stored = store.arrays(f"{title}_{key}_sensitivity".replace(" ", "_"), lambda lens=lens: sensitivity(lens))
+        waves, changes = stored["waves"], stored["changes"]
+        print(
+            f"   RMS wavefront {float(stored['nominal']):.4f}, root mean square {np.sqrt((waves**2).mean()):.4f} waves"
+        )
+        print(f"   largest change {changes.max():+.3f} µm: {rt.tolerances(lens, grade=GRADE)[int(changes.argmax())]}")
         angles = np.abs(rt.incidence(lens).angle.numpy()).max((0, 1, 2))
         for k, (curvature, thickness) in enumerate(numbers_of(lens), 1):
             print(f"   {k:2d} {1 / curvature if curvature else np.inf:10.3f} {thickness:8.3f} {angles[k - 1]:6.1f}°")
