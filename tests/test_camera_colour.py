@@ -367,7 +367,7 @@ def test_the_closed_form_is_over_fields_colours_and_distances(triplet, pictures)
     one = camera(triplet, SETTINGS)
     spectrum = patch_spectrum(pictures[0], 26, crops=1)
     assert spectrum.shape == (3, 26, 26)
-    distances = even_distances(one, 3, spread="reciprocal")
+    distances = even_distances(one, 2, spread="reciprocal")
     error = camera_error(one, spectrum, distances)
     slope = torch.autograd.grad(error, one.variables.sensor)[0]
     values = []
