@@ -3,6 +3,7 @@
 Other values of the wrong kind are refused. Calls inside the package do not pass through here.
 """
 
+import contextlib
 import functools
 import inspect
 import math
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from raytrace.io import as_lens
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, computed_once
 from raytrace.words import known_option, named_value, nameless, with_article
 
 #: Options of several numbers, and which of them may be infinite; those of `fields` may be pairs.
@@ -57,6 +58,7 @@ def public(function: Callable, name: str) -> Callable:
     """
     parameters = inspect.signature(function).parameters
     names = tuple(parameters)
+    sharing = computed_once if "lens" in parameters else contextlib.nullcontext
     every = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
     readers = {key: reader for key, one in parameters.items() if (reader := _reader(one))}
 
@@ -68,7 +70,8 @@ def public(function: Callable, name: str) -> Callable:
         taken += given[len(names) :]
         options = {word: _read(name, readers, word, value) for word, value in options.items()}
         try:
-            return function(*taken, **options)
+            with sharing():
+                return function(*taken, **options)
         except RuntimeError as error:
             if (clear := _under_vmap(name, error)) is error:
                 raise

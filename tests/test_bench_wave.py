@@ -111,6 +111,7 @@ def test_page_and_table_hold_the_figures(tmp_path):
     assert len(found.plot().axes) == 2
 
 
+@pytest.mark.slow
 def test_script_writes_the_page(monkeypatch, tmp_path):
     """A few samplings of small kernels; their errors are of no interest here."""
     few = bench.entrants

@@ -279,6 +279,7 @@ def test_a_run_started_from_the_closed_form_resumes_to_the_same_end(tmp_path):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
     """The order is planned for the lens as it begins, not for the one of the checkpoint."""
     planned, plan = [], Camera.plan
@@ -391,6 +392,7 @@ def test_kernels_of_several_wavelengths_are_their_weighted_sum():
         camera(read_lens(LENS), dataclasses.replace(SMALL, wavelengths=(0.48, 0.62)))
 
 
+@pytest.mark.slow
 def test_a_run_writes_the_lens_that_it_learned(tmp_path):
     """Read back it is the lens of the outcome to the last bit, and traces to the same spot."""
     settings = dataclasses.replace(

@@ -66,6 +66,7 @@ def test_that_aperture_is_a_sharp_one_for_gaussian_drt(lens, textures, f_number,
     assert found.focus_paraxial_m == pytest.approx(metres, abs=0.1)
 
 
+@pytest.mark.slow
 def test_drt_has_several_optima_there(lens, textures):
     """Downhill from 25 m lies one of 0.01222; near 57.59 mm the error is 7 % less, behind a hill."""
     own = camera(lens, dataclasses.replace(FAST, model="drt"))

@@ -72,14 +72,16 @@ def interrupt(monkeypatch, name: str, step: int):
 
 @pytest.fixture(scope="module")
 def finished(pictures, tmp_path_factory):
-    """A finished run of PARAXIAL on these pictures with its figure: folder, standard output, standard error."""
+    """A finished run of PARAXIAL on these pictures with its figure: folder, standard output and error, progress."""
     folder = tmp_path_factory.mktemp("finished")
-    out, err = io.StringIO(), io.StringIO()
+    out, err, shown = io.StringIO(), io.StringIO(), []
     words = ("--data", str(pictures), *PARAXIAL, "-o", "one", "--json", "--plot", "loss.png")
-    with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.chdir(folder)
+        patch.setattr(Lines, "set_postfix_str", lambda self, text="", refresh=True: shown.append(text))
         code = cli.main(["codesign", "double_gauss", *words])
     assert code == 0, err.getvalue()
-    return folder, out.getvalue(), err.getvalue()
+    return folder, out.getvalue(), err.getvalue(), shown
 
 
 @pytest.fixture
@@ -104,7 +106,7 @@ def compare(capsys, tmp_path, monkeypatch):
 
 
 def test_a_run_reports_its_results(run, pictures, finished, one):
-    _, out, err = finished
+    _, out, err, _ = finished
     document, kept = json.loads(out), read("one/outcome.json")
     assert {key: document[key] for key in kept} == kept
     assert (document["model"], document["settings"]["width"], document["settings"]["patch"]) == ("paraxial", 4, 16)
@@ -291,6 +293,7 @@ def test_a_run_begins_where_the_closed_form_ends(run, pictures):
     assert read("one/spectral.json")["sensor_mm"] < 57.84
 
 
+@pytest.mark.slow
 def test_spectral_at_infinity_is_valid_json(run, pictures):
     """A sensor kept 0.4 mm nearer than the focal plane: null in the file and in --json, "infinity" in words."""
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
@@ -304,30 +307,22 @@ def test_spectral_at_infinity_is_valid_json(run, pictures):
     assert "in focus: infinity (paraxial), infinity (least RMS spot)" in run(*bounded)[1]
 
 
-def test_progress_counts_the_batches_of_a_test(run, pictures, monkeypatch):
-    words = []
-    monkeypatch.setattr(Lines, "set_postfix_str", lambda self, text="", refresh=True: words.append(text))
-    assert run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")[0] == 0
-    assert words.count("testing, batch 2 of 2") == 3 + 9
-    assert any(text.startswith("refine, loss 0.") for text in words)
+def test_progress_counts_the_batches_of_a_test(finished):
+    *_, shown = finished
+    assert shown.count("testing, batch 2 of 2") == 3 + 9
+    assert any(text.startswith("refine, loss 0.") for text in shown)
 
 
-def test_the_figure_has_the_curves_of_training_and_of_the_closed_form(run, pictures, finished):
-    command = ("double_gauss", "--data", pictures, *PARAXIAL, "--loss", "spectral", "-o", "one", "--plot", "loss.png")
-    code, _, err = run(*command)
-    assert code == 0, err
-    for folder in (finished[0], Path()):
-        assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_spectral_prints_its_course(run, pictures):
+def test_the_closed_form_prints_its_course_and_draws_it_as_training_does(run, pictures, finished):
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
-    code, out, err = run(*command, "-o", "closed", "--batch", "4")
+    code, out, err = run(*command, "-o", "closed", "--batch", "4", "--plot", "loss.png")
     assert code == 0, err
     found = read("closed/spectral.json")
     assert len(re.findall(r"^ +\d+ +0\.\d{8} +0$", out, re.M)) == len(found["course"])
     assert f"sensor at {found['sensor_mm']:.4f} mm" in out
     assert f"{found['focus_rms_m']:.2f} m (least RMS spot)" in out
+    for folder in (finished[0], Path()):
+        assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
 
 
 WRONG = {
@@ -455,6 +450,7 @@ def test_compare_writes_the_table_and_the_page(compare, pictures):
         compare("double_gauss", *options, *SMALL, "--noise", "0.2", "--models", "paraxial", "--seeds", "3")
 
 
+@pytest.mark.slow
 def test_precision_that_was_found_is_kept(run, pictures, monkeypatch):
     """A machine that would choose otherwise the second time goes on with the first choice."""
     monkeypatch.setattr(codesign_run, "faster_precision", lambda shape: "float32")

@@ -5,7 +5,9 @@ import torch
 
 import raytrace as rt
 from raytrace.analysis import cross_section
+from raytrace.analysis.chief import distortion
 from raytrace.maths.sampling import fan
+from raytrace.system import lens as system_lens
 from raytrace.system.lens import computed_once, media, shared
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps, points_on_surfaces
@@ -91,3 +93,24 @@ def test_paths_with_a_lost_ray_are_traced_step_by_step():
         z_start=-5.0,
     )
     assert {path.status for path in paths[0]} != {"ok"}
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "folded_relay"])
+def test_a_public_function_shares_results_within_its_call(name, monkeypatch):
+    """It evaluates indices less often than its parts do alone, for the same numbers; a variable lens shares nothing."""
+    lens, evaluate, evaluations = rt.read_lens(name), system_lens._refractive_indices, []
+    monkeypatch.setattr(system_lens, "_refractive_indices", lambda *its: evaluations.append(its) or evaluate(*its))
+
+    def counted(compute, lens):
+        evaluations.clear()
+        return compute(lens).height, len(evaluations)
+
+    (height, few), (expected, many) = counted(rt.distortion, lens), counted(distortion, lens)
+    assert torch.equal(height, expected)
+    assert few <= many / 2
+    thickness = lens.surfaces[2].thickness.clone().requires_grad_()
+    varied = lens.replace(2, thickness=thickness)
+    (height, count), (expected, alone) = counted(rt.distortion, varied), counted(distortion, varied)
+    assert count == alone
+    slopes = [torch.autograd.grad(heights.sum(), thickness)[0] for heights in (height, expected)]
+    assert slopes[0] == slopes[1] != 0

@@ -67,6 +67,7 @@ def oracle() -> dict:
     return json.loads((CORPUS / "oracle.json").read_text(encoding="utf-8"))
 
 
+@functools.cache
 def compare(name: str) -> Comparison:
     """Read one file of the corpus and hold everything its oracle marks as certain against it."""
     entry = oracle()[name]

@@ -6,6 +6,7 @@ import functools
 import importlib
 import re
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -32,10 +33,19 @@ def classes() -> list[tuple[str, str]]:
     ]
 
 
+def definitions(node: ast.AST) -> Iterator[ast.AST]:
+    """A module, class or function, and all that are defined within, also in its branches."""
+    if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+        yield node
+    for part in ("body", "orelse", "handlers", "finalbody"):
+        for statement in getattr(node, part, ()):
+            yield from definitions(statement)
+
+
+@functools.cache
 def texts(name: str) -> list[str]:
     """The docstrings of a module, its classes and functions."""
-    nodes = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    return [ast.get_docstring(node) or "" for node in ast.walk(parsed(MODULES[name])) if isinstance(node, nodes)]
+    return [ast.get_docstring(node) or "" for node in definitions(parsed(MODULES[name]))]
 
 
 def named(name: str) -> set[str]:

@@ -242,6 +242,7 @@ def test_derivatives_by_tilts():
     assert gradcheck(merits, at, eps=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_strehl_ratio_is_differentiated_by_a_tilt():
     def ratio(tilt):
         mirror = {"radius": -400.0, "conic": -1.0, "glass": "MIRROR", "thickness": -200.0}

@@ -155,9 +155,9 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
 def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
     drawn = []
     monkeypatch.setattr(style, "save", lambda figure, path, **how: drawn.append(figure))
-    words = ["psf", "phone", "--model", "gaussian", "--plot", str(tmp_path / "a.png")]
+    words = ["psf", "phone", "--model", "gaussian", "--field", "0", "10", "--plot", str(tmp_path / "a.png")]
     for more in ([], ["--pixel", "0.001"], ["--size", "31"], ["--per-wavelength"]):
         assert main([*words, *more]) == 0
     shapes = [[panel.images[0].get_array().shape for panel in figure.axes if panel.images] for figure in drawn]
-    assert shapes == [[(129, 129)] * 4, [(21, 21)] * 4, [(31, 31)] * 4, [(129, 129)] * 12]
+    assert shapes == [[(129, 129)] * 2, [(21, 21)] * 2, [(31, 31)] * 2, [(129, 129)] * 6]
     assert all(outside(figure) == [] for figure in drawn)

@@ -22,8 +22,9 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
-from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, is_any, value
+from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, in_transform, is_any, value
 from raytrace.maths.result import point_text
+from raytrace.maths.tangents import varies
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, ScaledPath
@@ -57,20 +58,26 @@ APERTURE_KINDS = {
 # -- results that several analyses of a lens share ---------------------------------------------------------------------
 
 P, T = ParamSpec("P"), TypeVar("T")
-_found: ContextVar[dict | None] = ContextVar("found", default=None)
+_results: ContextVar[dict | None] = ContextVar("results", default=None)
+_MOST = 256  # results, the oldest being dropped first
+_FEW = 64  # numbers of an argument that are compared
 
 
 @contextlib.contextmanager
 def computed_once() -> Iterator[None]:
-    """Within: indices, first-order data and stop radius of every lens are computed once, where no gradient is recorded.
+    """Within: indices, first-order data, base rays and stop radius of every lens are computed once.
 
-    No number of a lens may be changed in place meanwhile.
+    Not those that may be differentiated. No number of a lens may be changed in place meanwhile. Every public function
+    of a lens runs within, one that another calls within the same.
     """
-    token = _found.set({})
+    if _results.get() is not None:
+        yield
+        return
+    token = _results.set({})
     try:
         yield
     finally:
-        _found.reset(token)
+        _results.reset(token)
 
 
 def shared(compute: Callable[P, T]) -> Callable[P, T]:
@@ -78,21 +85,39 @@ def shared(compute: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(compute)
     def result(*arguments: P.args, **options: P.kwargs) -> T:
-        # torch.compile does not trace context variables.
-        if torch.compiler.is_compiling() or torch.is_grad_enabled() or options or (found := _found.get()) is None:
+        # torch.compile does not trace context variables; results within a transform belong to it.
+        if torch.compiler.is_compiling() or options or (results := _results.get()) is None or in_transform():
             return compute(*arguments, **options)
+        if any(_is_its_own(argument, results) for argument in arguments):
+            return compute(*arguments)
         key = compute, *map(_key, arguments)
-        if key not in found:  # the arguments are stored, too: as long as they live their identity is their own
-            found[key] = compute(*arguments), arguments
-        return found[key][0]
+        if key not in results:
+            _store(results, key, compute(*arguments), arguments)
+        return results[key][0]
 
     return result
 
 
-def _key(argument: object) -> object:
-    """A lens by its identity, wavelengths by their values."""
+def _store(results: dict, key: object, result: object, arguments: object) -> None:
+    """Stores a result with its arguments: as long as they live their identity is their own."""
+    if len(results) >= _MOST:
+        del results[next(iter(results))]
+    results[key] = result, arguments
+
+
+def _is_its_own(argument: object, results: dict) -> bool:
+    """Whether a result of an argument is not shared: many wavelengths, or a number that may be differentiated."""
     if isinstance(argument, Tensor):
-        return argument.dtype, argument.device, *argument.shape, *argument.flatten().tolist()
+        return argument.numel() > _FEW or varies(argument)
+    if id(argument) not in results:
+        _store(results, id(argument), any(map(varies, pytree.tree_leaves(argument))), argument)
+    return results[id(argument)][0]
+
+
+def _key(argument: object) -> object:
+    """A lens by its identity, wavelengths by their values, which are not read off another device."""
+    if isinstance(argument, Tensor) and argument.device.type == "cpu":
+        return argument.dtype, *argument.shape, *argument.flatten().tolist()
     return id(argument)
 
 
@@ -139,6 +164,7 @@ def batch_shape(lens: "Lens") -> torch.Size:
     return broadcast_shape(*{number.shape[own:] for number, own, *_ in _numbers(lens)})
 
 
+@shared
 def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
     """The lens with numbers (…, L) of a batch as (…, L, 1, …), at least, or exactly, so many axes of 1 behind.
 

@@ -16,7 +16,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, dot, in_forward_mode, in_transform, is_any, safe_sqrt, unit, value
 from raytrace.maths.tangents import varies
-from raytrace.system.lens import Lens, batch_shape, media
+from raytrace.system.lens import Lens, batch_shape, media, shared
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
@@ -169,6 +169,7 @@ class _Near(NamedTuple):
         return tuple(m[..., :2] @ move + m[..., 2:] @ turn for m in (self.X, self.D))
 
 
+@shared
 def _near(lens: Lens, wavelength: Tensor) -> _Near:
     distance = object_distance_of(lens)
     aim = _aim(lens, wavelength)
@@ -259,7 +260,8 @@ def _linearised(function: Callable, at: Tensor, given: object) -> tuple[Tensor, 
     with torch.enable_grad():
         copies = at[:, None].repeat(1, _FIGURES, *(1,) * (at.dim() - 1)).requires_grad_()
         figures, others = function(copies)
-        (slopes,) = torch.autograd.grad(figures, copies, units(_FIGURES), create_graph=recorded)
+        # Of a scalar: with weights `grad` imports sympy, 1.4 s.
+        (slopes,) = torch.autograd.grad((figures * units(_FIGURES)).sum(), copies, create_graph=recorded)
     if not recorded:
         figures, *others = (part.detach() for part in (figures, *others))
     return figures[:, 0], slopes.transpose(0, 1), others

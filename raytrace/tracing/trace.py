@@ -20,7 +20,7 @@ from raytrace.maths.numerics import detached, dot, is_wrapped, value
 from raytrace.maths.tangents import tangents_of, value_of, with_tangents
 from raytrace.system.apertures import inside
 from raytrace.system.intersection import meet
-from raytrace.system.lens import Lens, media
+from raytrace.system.lens import Lens, media, shared
 from raytrace.system.phases import IdealLens, kind_of
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
@@ -295,6 +295,7 @@ def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]
     return stop, arrives
 
 
+@shared
 def without_apertures(lens: Lens) -> Lens:
     """The lens without apertures: no ray is vignetted."""
     surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
