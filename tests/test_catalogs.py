@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from problems import for_examples
 
 import raytrace as rt
-from raytrace.materials import catalogs
-from raytrace.materials.agf import format_agf, listed, parse_agf
+from raytrace.materials import agf, catalogs
+from raytrace.materials.agf import format_agf, parse_agf
 from raytrace.materials.catalogs import (
     SHIPPED,
     AmbiguousGlass,
@@ -405,7 +405,7 @@ def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
 
 def test_a_text_without_a_glass_is_no_catalog():
     with pytest.raises(CatalogError, match=r"bad\.agf:1: found no glass"):
-        listed("CC a comment alone\n", "bad.agf")
+        agf.listed("CC a comment alone\n", "bad.agf")
 
 
 def test_binary_and_damaged_files(tmp_path):

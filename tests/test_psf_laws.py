@@ -90,8 +90,8 @@ def test_a_memo_changes_no_kernel_and_traces_less(model, stop):
     if stop is not None:
         lens = lens.replace(5, apertures=(Aperture("circular", (0.0, stop)),))
     sensor, memo = number(57.9).requires_grad_(), Memo()
-    # One unit in the last place of a path of 100 mm, 1.4e-14 mm, turns the phase by 1.6e-10: torch crosses the last plane
-    # of stored rays, the compiled trace that of others.
+    # One unit in the last place of a path of 100 mm, 1.4e-14 mm, turns the phase by 1.6e-10: torch crosses the last
+    # plane of stored rays, the compiled trace that of others.
     close = 1e-12 if model == "wave" else 1e-13
     options = {
         "fields": number([[0.0], [2.0]]),
