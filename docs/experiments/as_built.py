@@ -81,11 +81,13 @@ def judged(lens) -> dict[str, np.ndarray]:
 
 
 def sensitivity(lens) -> dict[str, np.ndarray]:
-    """RMS wavefront of 300 lenses, and the changes (N,) of the spot at the worse limit of every tolerance, µm."""
+    """RMS wavefront of 300 lenses, changes (N,) of the spot at the worse limit of every tolerance, and √E[q], µm."""
     waves = rt.tolerance(lens, grade=GRADE, criterion="wavefront", trials=300, seed=SEED)
     spots = rt.tolerance(lens, grade=GRADE, trials=0)
     changes = torch.maximum(spots.minimum, spots.maximum)
-    return {"nominal": waves.nominal.numpy(), "waves": waves.trials.numpy(), "changes": changes.numpy()}
+    expected = 1e3 * rt.AsBuilt(GRADE).of(lens).expected(lens).sqrt()
+    of_waves = {"nominal": waves.nominal.numpy(), "waves": waves.trials.numpy()}
+    return {**of_waves, "changes": changes.numpy(), "expected": expected.detach().numpy()}
 
 
 def samples(term: AsBuiltTerm) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
@@ -211,6 +213,7 @@ def draw(row, title: str, lenses: dict, store: Store) -> None:
         print(f"   root mean square {rms:.3f}; EFL {float(rt.first_order(lens).effective_focal_length):.4f}")
         stored = store.arrays(f"{title}_{key}_sensitivity".replace(" ", "_"), lambda lens=lens: sensitivity(lens))
         waves, changes = stored["waves"], stored["changes"]
+        print(f"   root of E[q] in the merit {stored['expected']:.3f} µm")
         print(
             f"   RMS wavefront {float(stored['nominal']):.4f}, root mean square {np.sqrt((waves**2).mean()):.4f} waves"
         )
