@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from problems import for_examples
 
 import raytrace as rt
-from raytrace.materials import catalogs
+from raytrace.materials import agf, catalogs
 from raytrace.materials.agf import format_agf, parse_agf
 from raytrace.materials.catalogs import (
     SHIPPED,
@@ -642,3 +642,10 @@ def test_internal_transmittance_between_listed_wavelengths_is_differentiable():
     at = [torch.tensor(numbers, dtype=torch.float64, requires_grad=True) for numbers in ([0.352, 0.61], [3.0, 7.0])]
     assert torch.autograd.gradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)
     assert torch.autograd.gradgradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)
+
+
+def test_a_text_without_a_glass_is_refused():
+    """A damaged catalog of an archive, too, whose glasses are read when they are asked for."""
+    for read in (agf.listed, parse_agf):
+        with pytest.raises(CatalogError, match=r"no glass.*NM record"):
+            read("CC figures of a vendor\nNI BK7 2 517642\n", "vendor.agf")

@@ -518,7 +518,7 @@ def rays_by_torch(
         return parts, valid
     with torch.enable_grad():
         *moved, _ = parts_of(state.moving_lens())
-    slopes = [np.where(valid, tangents_of(part, state.count).numpy(), 0.0) for part in moved]
+    slopes = [np.where(valid, tangents_of(part, state.count).detach().numpy(), 0.0) for part in moved]
     return [Dual(value, slope) for value, slope in zip(parts, slopes, strict=True)], valid
 
 
