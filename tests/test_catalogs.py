@@ -403,11 +403,6 @@ def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
         read_agf(path)
 
 
-def test_a_text_without_a_glass_is_no_catalog():
-    with pytest.raises(CatalogError, match=r"bad\.agf:1: found no glass"):
-        agf.listed("CC a comment alone\n", "bad.agf")
-
-
 def test_binary_and_damaged_files(tmp_path):
     path = tmp_path / "bad.agf"
     path.write_bytes(b"NM A\nPK\x03\x04" + bytes(range(256)) * 9)
@@ -647,3 +642,10 @@ def test_internal_transmittance_between_listed_wavelengths_is_differentiable():
     at = [torch.tensor(numbers, dtype=torch.float64, requires_grad=True) for numbers in ([0.352, 0.61], [3.0, 7.0])]
     assert torch.autograd.gradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)
     assert torch.autograd.gradgradcheck(lambda w, t: internal_transmittance(bk7, w, t), at)
+
+
+def test_a_text_without_a_glass_is_refused():
+    """A damaged catalog of an archive, too, whose glasses are read when they are asked for."""
+    for read in (agf.listed, parse_agf):
+        with pytest.raises(CatalogError, match=r"no glass.*NM record"):
+            read("CC figures of a vendor\nNI BK7 2 517642\n", "vendor.agf")

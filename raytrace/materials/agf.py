@@ -103,7 +103,7 @@ class _Listing(Mapping):
         self._text, self._catalog, self._path = text, catalog, path
         starts = _names(text)
         _refuse_many(len(starts), path)
-        ends = [*(start for _, start in starts[1:]), len(text)][: len(starts)]
+        ends = [*(start for _, start in starts), len(text)][1:]
         self.header = text[: starts[0][1]] if starts else ""
         line, self._places = 1 + self.header.count("\n"), {}
         for (name, start), end in zip(starts, ends, strict=True):
