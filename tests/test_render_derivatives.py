@@ -110,7 +110,7 @@ def check(light, move, *, eps, rel, floor=3e-6):
 
 
 #: Order, step and tolerance of a model: pixels of DRT have kinks, where the edges of its light cross theirs.
-MODELS = {"gaussian": (4, 1e-4, 1e-5), "drt": (2, 1e-5, 5e-3)}
+MODELS = {"gaussian": (4, 1e-4, 1e-5), "drt": (2, 1e-6, 5e-3)}
 QUICK = {("gaussian", "curvature"), ("drt", "semi_diameter")}
 
 
