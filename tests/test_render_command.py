@@ -1,5 +1,6 @@
 """`raytrace render`: the written pictures are those of the library, every option once, and what is refused."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -24,12 +25,17 @@ QUICK = ("--sensor", "6x4", "--tol", "0.3", "--model", "gaussian")
 
 @pytest.fixture(scope="module", autouse=True)
 def _optics_once():
-    """A lens and a sensor are prepared once for the command and the library: that takes longer than a picture."""
+    """A lens and the geometry of a sensor are prepared once for all tests, which takes longer than a picture."""
     prepare, known = render.optics, {}
 
     def prepared(lens, sensor, **how):
-        key = digest(lens, sensor, sorted(how.items()))
-        return known[key] if key in known else known.setdefault(key, prepare(lens, sensor, **how))
+        noiseless = dataclasses.replace(
+            sensor, mosaic="none", full_well=None, read_noise=0.0, bits=None, black_level=None
+        )
+        key = digest(lens, noiseless, sorted(how.items()))
+        if key not in known:
+            known[key] = prepare(lens, noiseless, **how)
+        return dataclasses.replace(known[key], sensor=sensor)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "optics", prepared)
