@@ -436,12 +436,9 @@ def task_of(
     table = torch.stack([numbers[k] for k in single])[None] if single else None
     if len(single) < len(numbers):
         several = [k for k, n in enumerate(numbers) if n.dim()]
-        table_of_rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1).flatten(0, -2)
-        if table is None:
-            table = table_of_rows
-        else:
-            columns = torch.tensor([*single, *several]).argsort()
-            table = torch.cat([table.expand(len(table_of_rows), -1), table_of_rows], -1)[:, columns]
+        rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1).reshape(-1, len(several))
+        columns = torch.tensor([*single, *several]).argsort()
+        table = rows if table is None else torch.cat([table.expand(len(rows), -1), rows], -1)[:, columns]
     return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
 
 
