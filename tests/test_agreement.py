@@ -161,7 +161,8 @@ def test_spot_radii(lens):
 
 @quiet
 def test_fields_are_independent():
-    """A field has the same spot, radii and all, whether or not another one is clipped."""
+    """A field has the same spot, radii and all, whether or not another one is clipped: to 5e-14 mm, few units in the last
+    place of the paths of 100 mm, since torch rounds the slopes of one field otherwise than those of several."""
     lens = rt.read_lens("cooke_triplet").replace(6, apertures=(rt.Aperture("circular", (0.0, 13.0)),))
     alone, together = rt.spot(lens, fields=[0]), rt.spot(lens, fields=[0, 20])
     assert bool(alone.arrivals.rays.valid.all())
@@ -170,7 +171,7 @@ def test_fields_are_independent():
         for spots in ("each", "whole"):
             numbers = [getattr(getattr(found, spots), name) for found in (alone, together)]
             axis = 1 if name == "centroid" else 0
-            torch.testing.assert_close(*(number.select(axis, 0) for number in numbers), rtol=1e-11, atol=1e-12)
+            torch.testing.assert_close(*(number.select(axis, 0) for number in numbers), rtol=0, atol=5e-14)
 
 
 @quiet

@@ -34,10 +34,9 @@ from raytrace.analysis.setting import (
     wavelength_shares,
 )
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.result import Table, axis
 from raytrace.maths.sampling import gauss_rings
-from raytrace.maths.tangents import varies
 from raytrace.plotting.style import GREY, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance

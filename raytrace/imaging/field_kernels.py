@@ -21,10 +21,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.imaging.sensor import Sensor
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
-from raytrace.maths.tangents import varies
 from raytrace.psf_models import MODELS, NotConverged, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.psf_models.models import is_sampled_in_common

@@ -47,8 +47,8 @@ from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.imaging.warp import resampled
 from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
+from raytrace.maths.numerics import varies
 from raytrace.maths.result import Result, plain
-from raytrace.maths.tangents import varies
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
 from raytrace.psf_models.dft import TooManyPoints

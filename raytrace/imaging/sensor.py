@@ -20,8 +20,7 @@ from raytrace.imaging.image import add_noise, add_shot_noise, as_picture, count_
 from raytrace.imaging.pictures import draws
 from raytrace.imaging.spectral_response import SpectralResponse, channel_names, channel_weights, read_response
 from raytrace.io import as_lens
-from raytrace.maths.numerics import differentiating
-from raytrace.maths.tangents import varies
+from raytrace.maths.numerics import differentiating, varies
 from raytrace.system.lens import Lens, aligned, wavelengths_of, with_field_kind
 from raytrace.tracing.launch import field_of_object, object_field, rays_of_field
 from raytrace.tracing.paraxial import first_order

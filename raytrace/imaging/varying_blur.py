@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import as_picture, extend
-from raytrace.maths.tangents import varies
+from raytrace.maths.numerics import varies
 
 _RANKS, _SAMPLE = 40, 256  # at most: modes of low rank, and kernels that they are found from
 

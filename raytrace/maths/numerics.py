@@ -49,6 +49,19 @@ def has_forward_derivative(number: Tensor) -> bool:
     return in_forward_mode() and forward_ad.unpack_dual(number).tangent is not None
 
 
+def varies(number: Tensor | float | None) -> bool:
+    """Whether a derivative by this number may be requested: backward, forward, by tangents
+    (`maths.tangents`), or by a transform of torch.func.
+
+    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
+    """
+    if not isinstance(number, Tensor):
+        return False
+    if number.requires_grad or hasattr(number, "tangents") or is_wrapped(number):
+        return True
+    return has_forward_derivative(number)
+
+
 def differentiating() -> bool:
     """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
 

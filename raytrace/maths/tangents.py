@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import has_forward_derivative, is_wrapped, plain_functions
+from raytrace.maths.numerics import plain_functions
 
 _stopped: contextvars.ContextVar[bool] = contextvars.ContextVar("stopped", default=False)
 
@@ -75,18 +75,6 @@ def value_of(number: Tensor) -> Tensor:
         return number
     with plain_functions():
         return number.as_subclass(Tensor)
-
-
-def varies(number: Tensor | float | None) -> bool:
-    """Whether a derivative by this number may be requested: backward, forward, or by a transform of torch.func.
-
-    Inside nested transforms a tensor shows only the innermost one: any wrapped tensor may vary for an outer one.
-    """
-    if not isinstance(number, Tensor):
-        return False
-    if isinstance(number, MovingTensor) or number.requires_grad or is_wrapped(number):
-        return True
-    return has_forward_derivative(number)
 
 
 @contextlib.contextmanager

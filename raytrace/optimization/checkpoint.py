@@ -80,7 +80,8 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | PathLike | None, of: Mapping, names: Sequence[str]):
-        self.store, self.names, self.last, self.more = Document(path, of, _CHECKPOINT), names, -np.inf, {}
+        self.store = None if path is None else Document(path, of, _CHECKPOINT)
+        self.names, self.last, self.more = names, -np.inf, {}
 
     def write_glasses(self, stored: Stored, merit: float) -> None:
         """Write a state of the choice of glasses; later states repeat these glasses."""
@@ -102,7 +103,7 @@ class Checkpoint:
 
         Warns NotWritten where the file cannot be written; the optimisation continues.
         """
-        if self.store.path is None or (not now and time.monotonic() < self.last + EVERY):
+        if self.store is None or (not now and time.monotonic() < self.last + EVERY):
             return
         variables = dict(zip(self.names, x.tolist(), strict=True))
         document = {"merit": merit, "cycles": cycles, "variables": variables, **self.more}
@@ -193,14 +194,15 @@ class Log:
     """A file of comma-separated values, a line for every cycle; rewritten with the cycles so far."""
 
     def __init__(self, path: str | PathLike | None, cycles: Sequence[Cycle] = ()):
-        self.store = Store(path, {}, _LOG)
+        self.store = None
         if path is not None:
-            self.table = Table(path)
+            self.store, self.table = Store(path, {}, _LOG), Table(path)
             self.table.begin(_COLUMNS, *map(_cells, cycles))
 
     def add(self, cycle: Cycle) -> None:
         """Add a cycle. Warns NotWritten where the file cannot be written; the optimisation continues."""
-        self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
+        if self.store is not None:
+            self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
 
 
 def _cells(cycle: Cycle) -> list:

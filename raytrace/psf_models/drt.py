@@ -26,9 +26,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford
-from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.numerics import safe_divide, value, varies
 from raytrace.maths.sampling import Grid, sobol
-from raytrace.maths.tangents import varies
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf_models.result import Kernels, moments_of_rays
 from raytrace.system.apertures import Aperture, clearance

@@ -20,10 +20,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import OverBudget, afford, within
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.maths.sampling import grid as make_grid
-from raytrace.maths.tangents import varies
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark

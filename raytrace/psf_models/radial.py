@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford, forewarn
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import safe_divide, varies
 from raytrace.maths.sampling import Grid
-from raytrace.maths.tangents import varies
 from raytrace.tracing.scene import Scene
 
 _STEPS = 64  # of the table of g in a pixel

@@ -22,9 +22,8 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
-from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, in_transform, is_any, value
+from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, in_transform, is_any, value, varies
 from raytrace.maths.result import point_text
-from raytrace.maths.tangents import varies
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, ScaledPath

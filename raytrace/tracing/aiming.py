@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import broadcast_shape, in_transform, is_any, safe_divide, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, in_transform, is_any, safe_divide, varies, with_batch_axes
 from raytrace.maths.sampling import gauss_rings
-from raytrace.maths.tangents import values_alone, varies
+from raytrace.maths.tangents import values_alone
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.trace import at_stop, points_at

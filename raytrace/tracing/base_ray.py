@@ -14,8 +14,17 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import broadcast_shape, dot, in_forward_mode, in_transform, is_any, safe_sqrt, unit, value
-from raytrace.maths.tangents import varies
+from raytrace.maths.numerics import (
+    broadcast_shape,
+    dot,
+    in_forward_mode,
+    in_transform,
+    is_any,
+    safe_sqrt,
+    unit,
+    value,
+    varies,
+)
 from raytrace.system.lens import Lens, batch_shape, media, shared
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start

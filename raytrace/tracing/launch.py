@@ -36,10 +36,10 @@ from raytrace.maths.numerics import (
     select,
     unit,
     value,
+    varies,
     with_batch_axes,
 )
 from raytrace.maths.sampling import gauss_rings
-from raytrace.maths.tangents import varies
 from raytrace.system.lens import (
     FIELD_UNITS,
     RAY_AIMING,

@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import afford_rays
-from raytrace.maths.numerics import broadcast_shape, in_transform, value
-from raytrace.maths.tangents import varies
+from raytrace.maths.numerics import broadcast_shape, in_transform, value, varies
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
 from raytrace.system.rays import Rays
