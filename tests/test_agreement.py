@@ -161,8 +161,10 @@ def test_spot_radii(lens):
 
 @quiet
 def test_fields_are_independent():
-    """A field has the same spot, radii and all, whether or not another one is clipped: to 5e-14 mm, few units in the last
-    place of the paths of 100 mm, since torch rounds the slopes of one field otherwise than those of several."""
+    """A field has the same spot, radii and all, whether or not another one is clipped.
+
+    To 5e-14 mm, a few units in the last place of a path of 100 mm: torch rounds the slopes of several fields otherwise.
+    """
     lens = rt.read_lens("cooke_triplet").replace(6, apertures=(rt.Aperture("circular", (0.0, 13.0)),))
     alone, together = rt.spot(lens, fields=[0]), rt.spot(lens, fields=[0, 20])
     assert bool(alone.arrivals.rays.valid.all())

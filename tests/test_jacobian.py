@@ -132,7 +132,7 @@ def test_errors_follow_the_variables():
         ({"of": "merit", "merit": "spot", "grade": "precision"}, "derivatives by design variables alone"),
         ({"tolerances": (), "grade": "high"}, "leave `grade` and `limits` out"),
         ({"vary": "temperature:3"}, "expected temperature without surfaces"),
-        ({"vary": "pressure@2"}, "pressure is that of all configurations"),
+        ({"vary": "pressure@2"}, "all configurations have the same pressure"),
     ],
 )
 def test_numbers_that_do_not_go_together_are_refused(options, words):

@@ -4,13 +4,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from raytrace.maths.numerics import varies
 from raytrace.maths.tangents import (
     MovingTensor,
     applied,
     tangents_of,
     value_of,
     values_alone,
-    varies,
     with_tangents,
 )
 

@@ -242,7 +242,7 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
         holder, *_ = OF_LENS[0, kind].path
         of_lens = "system aperture" if holder == "aperture" else kind
         if configurations:
-            raise BadVariables(f"{word!r}: the {of_lens} is that of all configurations; leave @ out")
+            raise BadVariables(f"{word!r}: all configurations have the same {of_lens}; leave @ out")
         if any(place.path[0] == holder for operand in lens.operands for place in operand.paths):
             raise BadVariables(f"{word!r}: the {of_lens} differs between the configurations, and is not varied")
         return (Vary(0, kind),)
@@ -617,7 +617,7 @@ class View:
 
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:
-        """What moves of the media, by the surface that tells them: all of them with the air."""
+        """What moves of the media, by the surface in front of them: all of them with the air."""
         air = [at for at in (TEMPERATURE, PRESSURE) if at in self.moved]
         found: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
         for surface, quantity in self.moved:

@@ -47,7 +47,7 @@ def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Shar
     lens, sampling, count, others = study.lens, study.sampling, len(study.tolerances), len(study.compensators)
     rays = sampling.fields.shape[1] * len(lens.wavelengths) * sampling.points.shape[-1]
     if trials * rays * len(lens.surfaces) >= WORTH_COMPILING:
-        prepare()  # the rays of a batch of lenses are launched as those of one lens
+        prepare()  # a batch of lenses is launched as one lens
     found = study.half.new_zeros(trials, 2 + others)
     chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
     mine = (share or Share()).of(range(len(chunks)))

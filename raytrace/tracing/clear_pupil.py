@@ -209,8 +209,8 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
     kinks, searched = _kinks(scene, origin, count, fold, is_hollow)
     angle, share = _angles(kinks.angle, count, around)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
-    edges, found = _enclosed(scene, unit, origin)
-    return _clear_parts(scene, origin, unit, share, edges, traced + searched + found, kinks)
+    edges, enclosing = _enclosed(scene, unit, origin)
+    return _clear_parts(scene, origin, unit, share, edges, traced + searched + enclosing, kinks)
 
 
 def rule_near(
@@ -220,7 +220,7 @@ def rule_near(
 
     points, weights: the rule of the known lens, of `rings`; arms: its arms (1, F, W, B) by `arms_of`, None if it clips
     no ray. Newton steps move its kinks and edges to those of each lens, by five rays an edge. The clear pupil of a lens
-    whose edges are those of other apertures is searched as by `arms_of`.
+    that other apertures bound is searched as by `arms_of`.
     """
     if not any(surface.apertures for surface in scene.lens.surfaces):
         return points, weights
@@ -242,7 +242,7 @@ def rule_near(
 
 
 def _moved(scene: Scene, arms: Arms) -> tuple[Arms, Tensor]:
-    """The arms of lenses near one whose are known, and whether (D,) their edges are those of the same apertures."""
+    """The arms of lenses near a known one, and whether (D,) the same apertures set their edges."""
     edges, kinks = pytree.tree_map(
         lambda t: t.expand(*t.shape[:-4], *scene.shape, -1) if isinstance(t, Tensor) else t, (arms.edges, arms.kinks)
     )
@@ -261,9 +261,9 @@ def _moved(scene: Scene, arms: Arms) -> tuple[Arms, Tensor]:
         edges = dataclasses.replace(edges, radius=_step(scene, edges, each, origin))
         inward = _DIFFERENCE * edges.number.new_tensor([1, -1]).reshape(2, 1, 1, 1, 1)
         here, inside = (_clearances(scene, edges.radius + step, each, origin) for step in (0.0, inward))
-        own = (edges.number - 1).clamp_min(0)[None]
-        rest, slopes = (t.gather(0, own)[0] for t in (here, (inside - here) / inward))
-        others = torch.where(clips, here.scatter(0, own, torch.inf), here).amin(0)
+        setting = (edges.number - 1).clamp_min(0)[None]
+        rest, slopes = (t.gather(0, setting)[0] for t in (here, (inside - here) / inward))
+        others = torch.where(clips, here.scatter(0, setting, torch.inf), here).amin(0)
         rest, slope = torch.where(clips, rest, 0.0), torch.where(clips, slopes, 0.0)
         is_same = (others >= -2 * rest.abs() - _ROUNDED) & (rest.abs() <= _SETTLED * slope.abs())
         is_same &= (clips <= (edges.slope != 0)) & (edges.radius >= 0) & (edges.radius <= reach)

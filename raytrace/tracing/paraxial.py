@@ -278,7 +278,7 @@ def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
 class Beam:
     """The axial beam of a lens at one wavelength: the first-order data of which rays start; every entry (...), mm.
 
-    Entries are those of `FirstOrder`. vergence: signed index over the object distance, 0 for an object at infinity.
+    Entries as in `FirstOrder`. vergence: signed index over the object distance, 0 for an object at infinity.
     """
 
     data: Gaussian
