@@ -123,10 +123,10 @@ def jacobian(
 
     vary: variables, pickups and solves, as of `optimize`; by default the file's, or none where errors are named.
     of: "landing points" (2, F, W, P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm,
-    less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,) of a
-    merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor (...), as
-    lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0, as of
-    `perturbed`; grade, limits: as of `tolerances` instead. Derivatives are exact to rounding; failed rays have 0.
+    less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,)
+    of a merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor
+    (...), as lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0,
+    as of `perturbed`; grade, limits: as of `tolerances` instead. Derivatives are exact to rounding; failed rays have 0.
     Raises BadVariables, BadTolerance, TypeError, ValueError.
     """
     of_rays = [
