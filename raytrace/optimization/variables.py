@@ -38,8 +38,8 @@ from raytrace.materials.glass import (
 )
 from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.optimization.lens_state import LensState
-from raytrace.system.configurations import Operand, ScaledPath, same
-from raytrace.system.lens import Lens, is_round_about_axis, media, with_environment
+from raytrace.system.configurations import Operand, ScaledPath, same, with_entry
+from raytrace.system.lens import Lens, is_round_about_axis, media, per_lens, with_environment
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     GLASS,
@@ -142,21 +142,23 @@ class DesignVariables:
             numbers.append(0.0 if stored is None else float(stored))
         return np.array(numbers)
 
-    def lens_at(self, variables: np.ndarray) -> Lens:
-        """The lens with its variables there, and with all that follows from them."""
+    def lens_at(self, variables: Tensor | np.ndarray) -> Lens:
+        """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+
+        Differentiable to first and second order by tensors: by their graph, by transforms of torch.func, and by
+        tensors that carry derivatives (`maths.tangents`). Numbers of L lenses are (L, 1, 1, 1), as of `perturbed`.
+        """
         lens = self.lens
-        like = lens.wavelengths
-        operands = list(lens.operands)
-        for configuration in range(1, len(self.lens.configurations) + 1) if operands else ():
+        if not isinstance(variables, Tensor):
+            variables = lens.wavelengths.new_tensor(variables, dtype=torch.float64)
+        each, operands = tuple(map(per_lens, variables.unbind(-1))), list(lens.operands)
+        for configuration in range(1, len(lens.configurations) + 1) if operands else ():
             for k, (variable, scale, offset) in followed(self, configuration).items():
-                numbers = operands[k].numbers.clone()
-                numbers[configuration - 1] = scale * float(variables[variable]) + offset
+                numbers = with_entry(operands[k].numbers, (configuration - 1,), scale * each[variable] + offset)
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
-        lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
-        current = self.views[lens.current_configuration - 1]
-        numbers = current.state(np.asarray(variables, dtype=float)).numbers
-        there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
-        return with_numbers_of(lens, there)
+        view = self.views[lens.current_configuration - 1]
+        lens = dataclasses.replace(lens, operands=tuple(operands))
+        return with_numbers_of(lens, view.state(each).tensors, view.places)
 
 
 def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> DesignVariables:
@@ -560,7 +562,8 @@ class View:
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
-        self._held = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
+        #: Where the lens holds the numbers that move.
+        self.places = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
@@ -583,6 +586,11 @@ class View:
                 return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
             if one.kind in ("power", "position"):
                 return one.source > one.surface
+            last = sensor(self.lens), "thickness"  # which changes no power
+            if one.kind == "focal_length":
+                return any((later.surface, later.quantity) != last for later in self.solves[position + 1 :])
+            if (one.surface, one.quantity) == last:
+                return False
             if one.kind == "edge_thickness":
                 shape = [
                     at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
@@ -608,7 +616,7 @@ class View:
     def indices(self) -> np.ndarray:
         """Signed index (W, S) behind every surface, the object first."""
         n = signed(self.lens.surfaces[1:], media(self.lens, self.lens.wavelengths))
-        return np.stack([x.detach().numpy() for x in n], -1)
+        return np.stack([x.detach().cpu().numpy() for x in n], -1)
 
     @cached_property
     def media(self) -> list[int]:
@@ -655,7 +663,7 @@ class View:
                 continue
             bend[k] = float(vertex_curvature(surface).detach()) - self.curvature[k]
             if surface.phase is not None:
-                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
+                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().cpu().numpy()
         return bend, phase
 
     @cached_property
@@ -678,7 +686,7 @@ class View:
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
         """The lens with other numbers."""
-        return with_numbers_of(self.lens, numbers, self._held)
+        return with_numbers_of(self.lens, numbers, self.places)
 
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
