@@ -291,12 +291,13 @@ def models() -> dict[str, DesignVariables]:
     beam = (Vary(0, "aperture"), Vary(0, "thickness"), Vary(1, "curvature"))
     follows = Solve(3, "thickness", "pickup", (0.0,), 1, 2.0, 0.1, configuration=2, operand=0)
     term = lens.replace(3, coefficients=[1e-4, 0.0])
+    lit = dataclasses.replace(lens, optimization_data=OptimizationData(semi_diameter_margin=(5.0, 0.1)))
+    edge = Solve(3, "thickness", "edge_thickness", (2.0, 0.0))
     return {
         **{kind: DesignVariables(lens, VARY, (solve,)) for kind, solve in RULES.items()},
         "real ray": DesignVariables(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.25, 0.7)),)),
-        "edge at the semi-diameter": DesignVariables(
-            lens, VARY[:2], (Solve(3, "thickness", "edge_thickness", (2.0, 0.0)),)
-        ),
+        "edge where the light ends": DesignVariables(lit, VARY[:2], (edge,)),
+        "pupil": DesignVariables(lens.at(f_number=3), VARY[:1], CHAIN[:1]),
         "chain": DesignVariables(lens.at(f_number=3), VARY[:1], CHAIN),
         "term of r²": DesignVariables(term, (Vary(3, "a2"), VARY[0]), (RULES["f_number"], RULES["marginal_height"])),
         "object NA": DesignVariables(near, beam, (RULES["f_number"], RULES["marginal_height"])),
@@ -313,7 +314,7 @@ def numbers_of(model: DesignVariables, x: torch.Tensor) -> torch.Tensor:
     return torch.stack([n.reshape(-1).expand(x.shape[:-1]) if x.dim() > 1 else n for n in numbers], -1)
 
 
-SLOW = ("object NA", "real ray", "temperature")
+SLOW = ("chain", "edge where the light ends", "object NA", "real ray", "temperature")
 
 
 @pytest.mark.parametrize(
@@ -341,7 +342,13 @@ def test_the_lens_of_tensors_is_that_of_numbers_and_has_its_derivatives(name):
     torch.testing.assert_close(numbers_of(model, several), torch.stack([numbers_of(model, one) for one in several]))
 
 
-@pytest.mark.parametrize("name", ["f_number", pytest.param("chain", marks=pytest.mark.slow), "configurations"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
+        for name in ("f_number", "pupil", "chain", "edge where the light ends", "configurations")
+    ],
+)
 def test_transforms_of_torch_take_the_lens_of_tensors(name):
     model = models()[name]
     x = torch.tensor(model.start) * 1.01

@@ -27,13 +27,23 @@ from raytrace.maths.numerics import Dual, Vector, dot, is_any, slope_of, value_o
 from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.system.lens import Lens, index_behind, media, per_lens
 from raytrace.system.optimization_data import Solve
+from raytrace.system.parameter_paths import with_numbers_of
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_flat, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
 from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, semi_diameter_margin
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
-from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
+from raytrace.tracing.trace import (
+    aiming_of,
+    ends,
+    is_bent,
+    pushed,
+    pushed_everywhere,
+    sequence_of,
+    trace_surfaces,
+    without_apertures,
+)
 
 
 def _marginal_ray_before(state, surface: int):
@@ -165,10 +175,13 @@ _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 
 
 class LensState:
-    """view: `variables.View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1)."""
+    """view: `variables.View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
 
-    def __init__(self, view, variables):
-        self.view, self.lens, self.variables = view, view.lens, variables
+    lens: of tensors, that of the view in their dtype and on their device.
+    """
+
+    def __init__(self, view, variables, lens: Lens | None = None):
+        self.view, self.lens, self.variables = view, lens or view.lens, variables
         self.numbers: dict = {
             at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
             for at, (number, scale, offset) in view.variables.items()
@@ -382,24 +395,27 @@ class LensState:
         Passes without derivatives come to s. From there a step of Newton's method has the first derivatives of s by x,
         ds/dx = (1 - ∂P/∂s)⁻¹ ∂P/∂x, and a second step the second ones.
         """
-        still, count = copy.copy(self), len(stored)
+        ats = [(one.surface, one.quantity) for one in self.view.solves]
+
+        def passed(state: LensState, solved: Tensor) -> Tensor:
+            state._passed(solved.unbind())
+            return torch.stack([state.tensors[at].expand(solved.shape[1:]) for at in ats])
+
+        still = copy.copy(self)
         still._kept, still.numbers = {}, {at: number.detach() for at, number in self.numbers.items()}
         with torch.no_grad():
             still._settled(stored)
-        ats = [(one.surface, one.quantity) for one in self.view.solves]
-        solved = torch.broadcast_tensors(*(still.tensors[at] for at in ats))
-        unit = torch.eye(count, dtype=solved[0].dtype, device=solved[0].device)
-        units = unit.reshape(count, count, *[1] * solved[0].dim()).expand(-1, -1, *solved[0].shape)
+        solved = torch.stack(torch.broadcast_tensors(*(still.tensors[at] for at in ats)))
+        unit = torch.eye(len(ats), dtype=solved.dtype, device=solved.device)
+        units = unit.reshape(*unit.shape, *[1] * (solved.dim() - 1)).expand(-1, *solved.shape)
         with torch.enable_grad():
-            still._passed([*map(with_tangents, solved, units)])
-        slopes = [tangents_of(still.tensors[at].expand_as(solved[0]), count) for at in ats]
-        matrix = unit - torch.stack(slopes).movedim((0, 1), (-2, -1))
+            slopes = tangents_of(passed(still, with_tangents(solved, units)), len(ats))
+        matrix = unit - slopes.movedim((0, 1), (-1, -2))
         is_free = torch.linalg.det(matrix).abs()[..., None, None] < _FREE
         inverse = torch.linalg.inv(torch.where(is_free, unit, matrix)).movedim((-2, -1), (0, 1))
         for _ in range(2):
-            missed = [number - known for number, known in zip(self._passed(solved), solved, strict=True)]
-            solved = [known + sum(map(torch.mul, row, missed)) for known, row in zip(solved, inverse, strict=True)]
-        self._take(solved)
+            solved = solved + (inverse * (passed(self, solved) - solved)).sum(1)
+        self._take(solved.unbind())
 
     def _take(self, solved: Sequence) -> None:
         """Other numbers of the solves."""
@@ -419,11 +435,12 @@ class LensState:
     ) -> list:
         """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
-        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on.
+        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on. Of
+        tensors it has none, and all numbers.
         """
         view = self.view.clipping if clips else self.view
         if self.is_of_tensors:
-            return [*function(view.held(self.tensors))]
+            return [*function(with_numbers_of(without_apertures(self.lens), self.tensors, view.places))]
         with torch.set_grad_enabled(self.count > 0):
             leaves = {at: _tensor(self.numbers[at]).requires_grad_() for at in only or self.numbers}
             numbers = [number.reshape(()) for number in function(view.held(leaves))]
@@ -477,8 +494,7 @@ def _tensor(number) -> Tensor:
 def _is_settled(number, before) -> bool:
     """Whether a number of a solve, with its derivatives, is that before a pass, but for rounding."""
     a, b = value_of(number), value_of(before)
-    if isinstance(a, Tensor) or isinstance(b, Tensor):
-        a = torch.as_tensor(a)
+    if isinstance(a, Tensor):
         return not is_any((a != b) & ~((a - b).abs() <= _CONVERGED * torch.finfo(a.dtype).eps * a.abs()))
     if a != b and not abs(a - b) <= _CONVERGED * np.finfo(float).eps * abs(a):
         return False

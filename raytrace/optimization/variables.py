@@ -133,22 +133,24 @@ class DesignVariables:
     @cached_property
     def start(self) -> np.ndarray:
         """The current variables (n,)."""
-        numbers = []
-        for one in self.variables:
-            if one.operand is not None:
-                numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
-                continue
-            stored = stored_number(self.lens, (one.surface, one.quantity))
-            numbers.append(0.0 if stored is None else float(stored))
-        return np.array(numbers)
+        return np.array(
+            [
+                _plain(self.lens, (one.surface, one.quantity))
+                if one.operand is None
+                else float(self.lens.operands[one.operand].numbers[one.configuration - 1])
+                for one in self.variables
+            ]
+        )
 
-    def lens_at(self, variables: Tensor | np.ndarray) -> Lens:
+    def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
         """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+
+        lens: this one in another dtype or on another device, those of the variables.
 
         Differentiable to first and second order by tensors: by their graph, by transforms of torch.func, and by
         tensors that carry derivatives (`maths.tangents`). Numbers of L lenses are (L, 1, 1, 1), as of `perturbed`.
         """
-        lens = self.lens
+        lens = lens or self.lens
         if not isinstance(variables, Tensor):
             variables = lens.wavelengths.new_tensor(variables, dtype=torch.float64)
         each, operands = tuple(map(per_lens, variables.unbind(-1))), list(lens.operands)
@@ -158,7 +160,7 @@ class DesignVariables:
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
         view = self.views[lens.current_configuration - 1]
         lens = dataclasses.replace(lens, operands=tuple(operands))
-        return with_numbers_of(lens, view.state(each).tensors, view.places)
+        return with_numbers_of(lens, LensState(view, each, lens).tensors, view.places)
 
 
 def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> DesignVariables:
@@ -528,9 +530,6 @@ def split_constraint(word: str) -> tuple[str, int, str, str]:
 
 # -- the lens as a function of its variables ---------------------------------------------------------------------------
 
-#: Numbers that a surface keeps at 0 as None.
-_AT_ZERO = ("curvature", "conic")
-
 #: Power of length of what a pickup between configurations adds.
 _POWERS = {"thickness": 1, "curvature": -1}
 
@@ -559,7 +558,10 @@ class View:
         self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
         moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
-        self.lens = _modelled(lens, self.moved)
+        surfaces = list(lens.surfaces)
+        for surface, quantity in self.moved:
+            surfaces[surface] = modelled(surfaces[surface], quantity)
+        self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
         #: Where the lens holds the numbers that move.
@@ -605,8 +607,7 @@ class View:
 
     def number(self, at: Address) -> float:
         """A number of the lens as it is stored."""
-        held = stored_number(self.lens, at)
-        return 0.0 if held is None else float(held)
+        return _plain(self.lens, at)
 
     @cached_property
     def wavelengths(self) -> list[float]:
@@ -616,7 +617,7 @@ class View:
     def indices(self) -> np.ndarray:
         """Signed index (W, S) behind every surface, the object first."""
         n = signed(self.lens.surfaces[1:], media(self.lens, self.lens.wavelengths))
-        return np.stack([x.detach().cpu().numpy() for x in n], -1)
+        return np.stack([x.detach().numpy() for x in n], -1)
 
     @cached_property
     def media(self) -> list[int]:
@@ -663,7 +664,7 @@ class View:
                 continue
             bend[k] = float(vertex_curvature(surface).detach()) - self.curvature[k]
             if surface.phase is not None:
-                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().cpu().numpy()
+                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
         return bend, phase
 
     @cached_property
@@ -706,6 +707,12 @@ class View:
 
     def state(self, variables) -> LensState:
         return LensState(self, variables)
+
+
+def _plain(lens: Lens, at: Address) -> float:
+    """A number of a lens as it is stored, 0 where it is not modelled."""
+    number = stored_number(lens, at)
+    return 0.0 if number is None else float(number)
 
 
 def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
@@ -766,13 +773,3 @@ def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
         moved |= {(one.surface, name) for name in names}
         found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
     return found
-
-
-def _modelled(lens: Lens, moved: Sequence[Address]) -> Lens:
-    """The lens with what moves modelled, also where it is 0 now."""
-    surfaces = list(lens.surfaces)
-    for surface, quantity in moved:
-        if quantity in _AT_ZERO and getattr(surfaces[surface], quantity) is None:
-            zero = torch.zeros_like(surfaces[surface].thickness)
-            surfaces[surface] = dataclasses.replace(surfaces[surface], **{quantity: zero})
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
