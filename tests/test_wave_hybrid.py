@@ -209,6 +209,7 @@ def test_a_height_map_of_pixels_is_traced_as_the_powers_it_samples():
     assert float(landed[2].centre[1]) == pytest.approx(prism, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_height_map_is_filtered_once_however_often_it_is_traced(monkeypatch):
     """Gradients to the heights are those of differences of 10 nm."""
     filtered = []
@@ -388,6 +389,7 @@ def test_light_in_a_wide_window_is_all_the_light():
     assert 0.98 < float(result.energy) < 1.0
 
 
+@pytest.mark.slow
 def test_derivatives_by_heights_and_by_the_lens():
     coefficients = singlet()
 
