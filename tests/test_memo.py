@@ -12,7 +12,9 @@ from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models import Execution, Gaussian, psf
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
-from raytrace.tracing.scene import Memo, cross_bundle, trace_bundle
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.scene import Memo, points_of_bundle, trace_bundle
+from raytrace.tracing.trace import lens_steps, without_apertures
 
 LENSES = Path(__file__).parents[1] / "lenses"
 PUPIL = gauss_rings(3, 8)[0]
@@ -105,20 +107,21 @@ def test_a_number_that_becomes_a_variable_has_its_derivative():
     assert float(gradient) == pytest.approx(float(expected), rel=1e-13)
 
 
-def test_crossings_behind_mirrors_are_those_of_a_full_trace():
+def test_points_behind_mirrors_are_those_of_a_full_trace():
     lens, memo = read_lens(LENSES / "hubble.zmx"), Memo()
     sensor = lens.surfaces[-2].thickness.clone().requires_grad_()
     lens = with_sensor_distance(lens, sensor)
+    numbers = tuple(range(1, len(lens.surfaces)))
+    fields = lens, number([[0.0], [0.02]]), lens.wavelengths[:1], PUPIL
+    lens, field, pupil, wavelength = without_apertures(lens), *fields[1::2], fields[2]
+    every = list(lens_steps(lens, rays_of_field(lens, field, pupil, wavelength=wavelength), wavelength))
     for _ in range(2):
-        found, plain = (
-            cross_bundle((lens, number([[0.0], [0.02]]), lens.wavelengths[:1], PUPIL), m) for m in (memo, None)
-        )
-        assert len(found) == len(plain) == len(lens.surfaces) - 1
-        for one, other in zip(found, plain, strict=True):
-            torch.testing.assert_close(one.rays.position, other.rays.position, atol=0, rtol=0)
-            torch.testing.assert_close(one.rays.opl, other.rays.opl, atol=0, rtol=0)
-            assert torch.equal(one.rays.valid, other.rays.valid)
-            assert torch.equal(one.clipped, other.clipped)
+        (found, met), (plain, arrive) = (points_of_bundle(fields, numbers, m) for m in (memo, None))
+        assert len(found) == len(plain) == len(every)
+        assert torch.equal(met, arrive)
+        for one, other, crossing in zip(found, plain, every, strict=True):
+            torch.testing.assert_close(one, other, atol=0, rtol=0)
+            torch.testing.assert_close(one, crossing.rays.position[:2], atol=1e-11, rtol=0)
 
 
 def test_a_beam_that_follows_the_focal_length_is_launched_anew():
@@ -159,22 +162,27 @@ def axial_bundle(lens: Lens, distances: torch.Tensor):
     return lens, field, lens.wavelengths[:1, None], PUPIL
 
 
-@pytest.mark.parametrize("call", [trace_bundle, lambda b, m: cross_bundle(b, m)[-1].rays])
-def test_drawn_object_distances_are_interpolated_to_a_nanometre(call):
+def test_drawn_object_distances_are_interpolated_to_a_nanometre():
     lens, sensor = double_gauss(), number(57.9).requires_grad_()
-    memo = Memo(object_distances=(1e4, 5e4))
+    memo, numbers = Memo(object_distances=(1e4, 5e4)), (3, lens.stop, len(lens.surfaces) - 1)
     generator = torch.Generator().manual_seed(4)
     for _ in range(3):
         distances = 1e4 + 4e4 * torch.rand(7, generator=generator, dtype=torch.float64)
         moved = axial_bundle(with_sensor_distance(lens, sensor), distances)
-        found, plain = call(moved, memo), call(moved, None)
+        found, plain = (trace_bundle(moved, m) for m in (memo, None))
         torch.testing.assert_close(found.position, plain.position, atol=1e-9, rtol=0)
         torch.testing.assert_close(found.direction, plain.direction, atol=1e-10, rtol=0)
         torch.testing.assert_close(found.opl, plain.opl, atol=1e-9, rtol=0)
         assert torch.equal(found.valid, plain.valid.expand_as(found.valid))
+        points, expected = (points_of_bundle(moved, numbers, m)[0] for m in (memo, None))
+        for one, other in zip(points, expected, strict=True):
+            torch.testing.assert_close(one, other, atol=1e-9, rtol=0)
         gradients = [torch.autograd.grad(spread(rays), sensor)[0] for rays in (found, plain)]
         assert float(gradients[0]) == pytest.approx(float(gradients[1]), rel=1e-9)
-    assert crossed_by(memo, lambda: call(moved, memo)) == 1
+        (gradient,), (other,) = (torch.autograd.grad(at[-1].square().sum(), sensor) for at in (points, expected))
+        assert float(gradient) == pytest.approx(float(other), rel=1e-9)
+    assert crossed_by(memo, lambda: trace_bundle(moved, memo)) == 1
+    assert crossed_by(memo, lambda: points_of_bundle(moved, numbers, memo)) == 1
 
 
 def test_derivative_in_an_interpolated_object_distance():

@@ -220,6 +220,7 @@ def test_boundaries_are_known_on_both_sides_and_add_up_to_their_rows(triplet):
     assert slopes == pytest.approx(state.sides.slope, rel=1e-5, abs=1e-5 * np.abs(slopes).max())
 
 
+@pytest.mark.slow
 def test_boundaries_end_a_descent_without_chattering(triplet):
     """Thicknesses come to rest where the rest of the merit presses them, each within a few steps of its boundary."""
     found = rt.optimize(
@@ -350,6 +351,7 @@ def test_a_merit_without_weight_and_one_without_light_are_refused(triplet):
         rt.optimize(triplet, merit=[row], vary="sensor")
 
 
+@pytest.mark.slow
 def test_the_figure_shows_before_and_after(triplet, tmp_path):
     found = rt.optimize(triplet, merit="spot", vary="curvature sensor", cycles=5)
     figure = found.plot(tmp_path / "report.png")

@@ -206,6 +206,7 @@ def test_which_glasses_vary(triplet):
         without_glass(design_variables(triplet, "glass"), "glass")
 
 
+@pytest.mark.slow
 def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
     optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))

@@ -152,6 +152,7 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
     assert outside(figure) == []
 
 
+@pytest.mark.slow
 def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
     drawn = []
     monkeypatch.setattr(style, "save", lambda figure, path, **how: drawn.append(figure))

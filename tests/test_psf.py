@@ -289,6 +289,7 @@ def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
     assert true <= float(loose.error)
 
 
+@pytest.mark.slow
 def test_an_unreachable_tolerance_is_reported():
     with pytest.warns(NotConverged, match="gaussian: the estimated error .* stays above the tolerance 1e-11"):
         result = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)

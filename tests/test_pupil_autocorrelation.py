@@ -40,6 +40,7 @@ def test_a_wave_by_polynomials_is_that_of_the_traced_grid(name, field, monkeypat
     assert (fitted - both(rt.mtf(lens, frequencies, fields=[field]))).abs().max() < 2e-5
 
 
+@pytest.mark.slow
 def test_a_blurred_field_takes_a_few_thousand_rays(monkeypatch):
     """On a grid of 768 points across the pupil, 450,000 rays a wavelength if all were traced."""
     traced = []
@@ -56,6 +57,7 @@ def test_a_blurred_field_takes_a_few_thousand_rays(monkeypatch):
     assert sum(traced) < 8_000
 
 
+@pytest.mark.slow
 def test_the_quadrature_of_a_sheared_pupil_is_the_limit_of_the_grid():
     """700 points across leave 1e-3, at the edge of the first zero; twice as many a quarter of that."""
     lens = defocused(3.0)

@@ -415,6 +415,7 @@ def test_rendering_maps_over_pictures(triplet):
     torch.testing.assert_close(mapped, varying_blur(pictures, system.kernels[:, :, 0]), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_flat_depth_map_is_that_distance(triplet):
     picture = random(3, ROWS, COLUMNS)
     flat = torch.full((ROWS, COLUMNS), 3e3, dtype=torch.float64)
@@ -470,6 +471,7 @@ def test_bad_input_is_one_clear_error(triplet, picture, options, message):
             rt.render(triplet, picture, sensor=FIELD, **{"model": "gaussian", "tol": 0.3, **options})
 
 
+@pytest.mark.slow
 def test_the_grid_is_refined_to_the_tolerance(triplet):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -554,6 +556,7 @@ def test_no_error_is_estimated_of_requested_nodes(triplet):
     assert np.isnan(system.error)
 
 
+@pytest.mark.slow
 def test_the_model_is_the_first_that_the_next_confirms(triplet):
     """Coarse pixels: a Gaussian; the blur of a defocused lens: rays, a disc; with what is left out."""
     coarse = rt.Sensor(size=(18.0, 12.0), pixels=(6, 4))
@@ -652,6 +655,7 @@ def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
 # -- a camera
 
 
+@pytest.mark.slow
 def test_a_camera_renders_with_its_current_lens(triplet):
     """Its sensor, PSF model and variables: the image follows the sensor distance, with its derivative."""
     variables = rt.Variables(triplet, "sensor")

@@ -87,6 +87,7 @@ def test_the_written_picture_is_the_rendering_to_8_bits(command, photo):
     assert_written(rendered(photo[1]))
 
 
+@pytest.mark.slow
 def test_without_a_size_the_largest_field_lies_in_the_corners(command, photo):
     code, out, err = command("render", LENS, photo[0], *QUICK[2:], "-o", "out.png", "--json")
     assert code == 0, err
@@ -112,6 +113,7 @@ def test_effects_are_left_out(command, photo, words, options):
     assert_written(rendered(photo[1], **options))
 
 
+@pytest.mark.slow
 def test_conditions_are_those_of_other_commands(command, photo):
     words = ("--f-number", 8, "--wavelength", 0.53, 0.46, 0.61, "--object-distance", 2000)
     code, _, err = command("render", LENS, photo[0], *QUICK, *words, "-o", "out.png")
@@ -120,6 +122,7 @@ def test_conditions_are_those_of_other_commands(command, photo):
     assert_written(rendered(photo[1], lens, wavelengths=lens.wavelengths))
 
 
+@pytest.mark.slow
 def test_several_object_distances_are_a_picture_each(command, photo):
     code, out, err = command(
         "render", LENS, photo[0], *QUICK, "--object-distance", 900, "inf", "-o", "out.png", "--json"
@@ -183,6 +186,7 @@ def test_a_depth_map_is_an_array_or_a_grey_picture(command, photo):
 # -- several pictures, figures
 
 
+@pytest.mark.slow
 def test_several_pictures_go_to_a_folder_and_share_the_kernels(command, photo, monkeypatch):
     small = levels(20, 30, 3, seed=1).astype(np.uint8)
     Image.fromarray(small).save("small.png")
@@ -209,6 +213,7 @@ def test_several_pictures_go_to_a_folder_and_share_the_kernels(command, photo, m
     assert sorted(path.name for path in Path().glob("fig*")) == ["fig_other.png", "fig_photo.png", "fig_small.png"]
 
 
+@pytest.mark.slow
 def test_the_figure_is_saved_as_a_comparison_too(command, photo):
     assert command("render", LENS, photo[0], *QUICK, "--compare", "fig.pdf")[0] == 0
     assert Path("fig.pdf").read_bytes().startswith(b"%PDF")

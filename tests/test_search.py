@@ -447,6 +447,7 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
     assert float(rt.first_order(found.lenses[0]).effective_focal_length) == pytest.approx(100, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_search_without_a_lens_names_what_its_nearest_one_misses(plate):
     """F/5 is not F/3, which no linear model of one point excludes."""
     with pytest.raises(

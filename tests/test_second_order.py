@@ -72,6 +72,7 @@ def held(lens, limits):
     return rt.tolerances(lens, limits, compensators=[rt.Compensator(7, minimum=-0.1, maximum=0.1)])
 
 
+@pytest.mark.slow
 def test_expectation_within_limits_of_the_sensor_is_the_mean_of_the_trials(triplet):
     rows = held(triplet, "radius=0.1% air=0.05 element_decenter=0.05")
     found = rt.tolerance(triplet, rows, trials=400, seed=7)

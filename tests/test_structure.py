@@ -20,15 +20,18 @@ def test_a_computation_runs_through_few_files_and_calls_no_higher_layer(computat
 
 
 def helpers() -> dict[str, list[str]]:
-    """Where the functions of all test files stand that are no tests, by their bodies without docstring; methods not."""
+    """Where the functions of all test files stand that are no tests, by the lines of their bodies without docstring and
+    indentation; methods not."""
     found = defaultdict(list)
     for path in sorted(Path(__file__).parent.glob("*.py")):
         tree = parsed.__wrapped__(path)  # not stored
+        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
         methods = {id(part) for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for part in node.body}
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("test_") and id(node) not in methods:
                 body = node.body[ast.get_docstring(node) is not None :]
-                found["\n".join(map(ast.dump, body))].append(f"{path.name}:{node.lineno} {node.name}")
+                text = "\n".join(lines[body[0].lineno - 1 : node.end_lineno])
+                found[text].append(f"{path.name}:{node.lineno} {node.name}")
     return found
 
 

@@ -120,6 +120,7 @@ def test_many_trials_are_worth_compiling(triplet, monkeypatch):
         assert prepared == expected
 
 
+@pytest.mark.slow
 def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
     file = tmp_path / "trials.jsonl"
     first = rt.tolerance(triplet, limits=LIMITS, trials=1100, checkpoint=file)
@@ -202,6 +203,7 @@ def test_tolerances_of_a_file(file):
     assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.15)
 
 
+@pytest.mark.slow
 def test_no_error_alone_does_more_than_the_increment(triplet):
     free = rt.tolerance(triplet, limits=LIMITS, trials=0)
     held = rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.1)
@@ -305,6 +307,7 @@ def test_a_killed_study_loses_nothing(triplet, tmp_path):
     assert torch.equal(again.trials, rt.tolerance(triplet, limits=LIMITS, trials=trials).trials)
 
 
+@pytest.mark.slow
 def test_trials_without_light_are_counted_by_every_criterion():
     """A decentre of ±30 mm: some lenses let no light of a field through; they have neither spot nor wavefront."""
     lens = rt.read_lens("cooke_triplet").at(fields=[0, 11.9], ray_aiming="off")

@@ -775,6 +775,7 @@ def test_a_table_of_a_distribution_lies_beside_the_file(tmp_path):
         rt.read_lens(path)
 
 
+@pytest.mark.slow
 def test_a_group_is_at_its_limits_at_once_and_a_line_of_the_table(tmp_path):
     found = lines_of(tmp_path, "COMP 5 0", "TEZI 5 6 -3e-4 3e-4 4", "TSDR 4 0 -0.2 0.2", "ISOB 1 0 -1 1")
     lens = rt.read_lens(tmp_path / "made.zmx").at(fields=[0.0])

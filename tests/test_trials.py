@@ -404,6 +404,7 @@ def test_typical_and_worst_trials_leave_out_those_that_failed(study):
             _ = dataclasses.replace(study, trials=trials).typical
 
 
+@pytest.mark.slow
 def test_trials_are_saved_as_lens_files(study, tmp_path):
     folder = tmp_path / "built" / "here"
     for _ in range(2):  # the second time they replace those that are there

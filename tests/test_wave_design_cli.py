@@ -42,6 +42,7 @@ def test_unknown_rows_are_refused():
         table.main(["--rows", "holey"])
 
 
+@pytest.mark.slow
 def test_scenes_are_simulated_and_restored(capsys, tmp_path):
     """Behind a learned element restoration gains decibels at 0.5 m; a captured image alone has no PSNR."""
     scene = np.stack([leaves for leaves in dead_leaves(3, size=128, seed=2, smallest=3.0).samples], -1)

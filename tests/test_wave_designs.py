@@ -298,6 +298,7 @@ def test_the_fresnel_lens_keeps_its_light_in_green_alone():
     assert result[[0, 2]].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_the_achromat_shares_its_light_among_the_colours():
     """0.30, 0.25, 0.27 of the light in 15 µm, measured once; a Fresnel lens has 0.0016, 0.85, 0.0013."""
     (made,) = baseline("achromat", aim())

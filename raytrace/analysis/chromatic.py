@@ -11,6 +11,7 @@ from raytrace.maths.numerics import value
 from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import side_behind
 
 
 @value
@@ -72,6 +73,6 @@ def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: i
     focus = data.paraxial_image_distance
     if not bool(torch.isfinite(focus).all()):
         raise NothingToShow("nothing to show over wavelength: the lens has no image at a finite distance")
-    forward = 1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 == 0 else -1
+    forward = side_behind(lens.surfaces)
     depth = 0.5e-3 * primary / data.image_na[0] ** 2
     return ChromaticFocalShift(lens, places, forward * (focus[1:] - focus[0]), depth)

@@ -26,7 +26,7 @@ from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
-from raytrace.tracing.trace import is_bent
+from raytrace.tracing.trace import is_bent, side_behind
 
 _RINGS = 12  # of the pupil, where focus on the axis is found
 
@@ -230,7 +230,7 @@ def _behind(lens: Lens, distance: Tensor) -> Tensor:
         base = base_ray(lens)
         ahead = (distance - lens.surfaces[-2].thickness) * along_normal(lens) / base.direction[2]
         return (base.way_to_image + ahead > 0).detach()
-    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
+    side = side_behind(lens.surfaces)
     return (side * distance > 0).detach()
 
 

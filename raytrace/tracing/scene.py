@@ -21,7 +21,7 @@ from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import Crossing, lens_steps, points_at, sequence_of, steps, trace_lens, trace_surfaces
+from raytrace.tracing.trace import points_at, rays_at, sequence_of, side_behind, trace_lens, trace_surfaces
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: accepted error of interpolated rays
@@ -37,13 +37,13 @@ Bundle = tuple[Lens, Tensor, Tensor, Tensor]
 class _Front:
     """Rays behind the first `count` surfaces after the object, in the frame of the last of them (of surface 1 if 0).
 
-    crossings: of these surfaces, if recorded; indices: of all media, None if one depends on a variable; smooth: whether
-    polynomials in 1/distance reproduce the rays.
+    points: (2, ...) mm where they meet those of these surfaces that are asked for; indices: of all media, None if one
+    depends on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
     """
 
     count: int
-    rays: Rays
-    crossings: list[Crossing]
+    rays: Rays | None
+    points: list[Tensor]
     indices: list[Tensor] | None
     smooth: bool = False
 
@@ -97,46 +97,64 @@ class Memo:
         self._stored = [*self._stored, _Stored(structure, constants, result)][-(most or self._most) :]
         return result
 
-    def front(self, bundle: Bundle, *, recorded: bool) -> _Front:
-        """The rays in front of the first surface that depends on a variable; recorded: with their crossings."""
+    def front(self, bundle: Bundle, numbers: tuple[int, ...] | None = None) -> _Front:
+        """The rays in front of the first surface that depends on a variable.
+
+        numbers: of surfaces at which their points are asked for; then they have no paths, and no aperture stops them.
+        """
         distance, pupil = bundle[0].surfaces[0].thickness, bundle[3]
         # Where rays fail, each object distance may have its own pupil points.
         if self._range is not None and distance.dim() == 4 and (pupil.dim() == 2 or pupil.shape[1] == 1):
             low, high = self._range
             if bool(((distance >= low) & (distance <= high)).all()):
-                front = self._find_or_trace(_at_nodes(bundle, self._range), recorded, judge=_is_smooth)
+                front = self._find_or_trace(_at_nodes(bundle, self._range), numbers, judge=_is_smooth)
                 if front.smooth:
                     near, far = 1 / low, 1 / high
                     weights = _series_weights((2 / distance.flatten() - (near + far)) / (near - far))
                     return _at_distances(front, weights)
-        return self._find_or_trace(bundle, recorded, judge=lambda front: False)
+        return self._find_or_trace(bundle, numbers, judge=lambda front: False)
 
-    def _find_or_trace(self, bundle: Bundle, recorded: bool, *, judge: Callable[[_Front], bool]) -> _Front:
-        numbers, structure = pytree.tree_flatten((bundle, recorded))
-        structure = (structure, tuple(None if isinstance(n, Tensor) else n for n in numbers))
-        numbers = [n for n in numbers if isinstance(n, Tensor)]
+    def _find_or_trace(
+        self, bundle: Bundle, numbers: tuple[int, ...] | None, *, judge: Callable[[_Front], bool]
+    ) -> _Front:
+        leaves, structure = pytree.tree_flatten((bundle, numbers))
+        structure = (structure, tuple(None if isinstance(leaf, Tensor) else leaf for leaf in leaves))
 
         def trace() -> _Front:
-            front = _constant_front(bundle, recorded)
+            front = _constant_front(bundle, numbers)
             self.crossed += front.count
             return dataclasses.replace(front, smooth=judge(front))
 
-        return self.find(numbers, structure, trace)
+        return self.find([leaf for leaf in leaves if isinstance(leaf, Tensor)], structure, trace)
 
 
 def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:
     """The rays of field and pupil points at the image surface; everything broadcasts."""
+    lens, _, wavelength, _ = bundle
     if memo is None or in_transform():
-        return trace_lens(bundle[0], _launched(bundle), bundle[2])
-    return trace_surfaces(**_rest(bundle, memo.front(bundle, recorded=False), memo))
+        return trace_lens(lens, _launched(bundle), wavelength)
+    front = memo.front(bundle)
+    done, rays, indices = _resumed(bundle, front, memo)
+    return trace_surfaces(
+        sequence_of(lens)[done:],
+        rays,
+        indices=indices[done:],
+        wavelength=wavelength,
+        side=side_behind(lens.surfaces[1 : done + 1]),
+        gap=gap_behind(lens.surfaces[done]) if done else None,
+    )
 
 
-def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
-    """The crossings of the rays with every surface after the object."""
+def points_of_bundle(bundle: Bundle, numbers: tuple[int, ...], memo: Memo | None = None) -> tuple[list[Tensor], Tensor]:
+    """`points_at` of the rays of field and pupil points; everything broadcasts."""
+    lens, _, wavelength, _ = bundle
     if memo is None or in_transform():
-        return list(lens_steps(bundle[0], _launched(bundle), bundle[2]))
-    front = memo.front(bundle, recorded=True)
-    return [*front.crossings, *steps(**_rest(bundle, front, memo))]
+        return points_at(lens, _launched(bundle), wavelength, numbers)
+    front = memo.front(bundle, numbers)
+    done, rays, indices = _resumed(bundle, front, memo)
+    left = numbers[len(front.points) :]
+    each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, left, first=done, indices=indices)
+    return [*front.points, *(at.position[:2] for at in each)], (each[-1] if each else rays).valid
 
 
 def _launched(bundle: Bundle) -> Rays:
@@ -144,22 +162,15 @@ def _launched(bundle: Bundle) -> Rays:
     return rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
 
 
-def _rest(bundle: Bundle, front: _Front, memo: Memo) -> dict:
-    """Arguments of `steps` that resume from a front."""
-    (lens, _, wavelength, _), done = bundle, front.count
-    indices = media(lens, wavelength) if front.indices is None else front.indices
-    memo.crossed += len(lens.surfaces) - 1 - done
-    return {
-        "surfaces": sequence_of(lens)[done:],
-        "rays": _launched(bundle) if done == 0 and front.rays is None else front.rays,
-        "indices": indices[done:],
-        "wavelength": wavelength,
-        "side": -1 if sum(surface.is_mirror for surface in lens.surfaces[1 : done + 1]) % 2 else 1,
-        "gap": gap_behind(lens.surfaces[done]) if done else None,
-    }
+def _resumed(bundle: Bundle, front: _Front, memo: Memo) -> tuple[int, Rays, list[Tensor]]:
+    """Behind which surface the rays of a bundle go on, these rays, and the indices of all media."""
+    lens, _, wavelength, _ = bundle
+    memo.crossed += len(lens.surfaces) - 1 - front.count
+    rays = _launched(bundle) if front.rays is None else front.rays
+    return front.count, rays, media(lens, wavelength) if front.indices is None else front.indices
 
 
-def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
+def _constant_front(bundle: Bundle, numbers: tuple[int, ...] | None) -> _Front:
     """The rays traced until they depend on a variable; without rays where they do from the start."""
     lens, _, wavelength, _ = bundle
     with torch.enable_grad():
@@ -167,23 +178,25 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
     constant_indices = None if any(index.requires_grad for index in indices) else indices
     if any(t is not None and t.requires_grad for t in (rays.position, rays.direction, rays.opl)):
         return _Front(0, None, [], constant_indices)
-    surfaces, crossings = sequence_of(lens), []
+    surfaces, points = sequence_of(lens), []
     for count, surface in enumerate(surfaces):  # up to a surface whose position, shape or media depend on a variable
         gap = gap_behind(lens.surfaces[count]) if count else None
         shape = [getattr(surface, name) for name in (*SHAPE, "phase", "before")]
         phased = (wavelength,) if surface.phase is not None else ()
-        numbers = pytree.tree_leaves((gap, shape, *phased, *indices[count : count + 2]))
-        if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
+        leaves = pytree.tree_leaves((gap, shape, *phased, *indices[count : count + 2]))
+        if any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves):
             break
     else:
         count = len(surfaces)
     with torch.enable_grad():
-        if recorded:
-            crossings = list(steps(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength))
-            rays = crossings[-1].rays if crossings else rays
-        else:
+        if numbers is None:
             rays = trace_surfaces(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength)
-    return _Front(count, rays, crossings, constant_indices)
+        elif count:
+            passed = [number for number in numbers if number <= count]
+            stops = dict.fromkeys([*passed, count])
+            each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, [*stops], indices=indices)
+            rays, points = each[-1], [at.position[:2] for at in each[: len(passed)]]
+    return _Front(count, rays, points, constant_indices)
 
 
 # -- interpolation in object distance ---------------------------------------------------------------------------------
@@ -230,13 +243,8 @@ def _is_smooth(front: _Front) -> bool:
 
 def _at_distances(front: _Front, weights: Tensor) -> _Front:
     """The front of a range of object distances at those of the weights (D, K)."""
-
-    crossings = []
-    for crossing in front.crossings:
-        flags = (crossing.missed, crossing.totally_reflected, crossing.clipped)
-        flags = (flag[:1].expand(len(weights), *flag.shape[1:]) for flag in flags)
-        crossings.append(Crossing(_combined(crossing.rays, weights), *flags))
-    return dataclasses.replace(front, rays=_combined(front.rays, weights), crossings=crossings)
+    points = [_sum_of_nodes(at, weights) for at in front.points]
+    return dataclasses.replace(front, rays=_combined(front.rays, weights), points=points)
 
 
 def _part(rays: Rays, rows: slice) -> Rays:
@@ -248,9 +256,14 @@ def _part(rays: Rays, rows: slice) -> Rays:
 def _combined(rays: Rays, weights: Tensor) -> Rays:
     """Σ_k w_dk of the rays of the nodes; all of them are valid, or none of them."""
     rays = _part(rays, slice(None, _NODES))
-    position, direction = (torch.einsum("dk,ck...->cd...", weights, t) for t in (rays.position, rays.direction))
+    position, direction = (_sum_of_nodes(part, weights) for part in (rays.position, rays.direction))
     opl = None if rays.opl is None else torch.einsum("dk,k...->d...", weights, rays.opl)
     return Rays(position, direction, rays.valid[:1].expand(len(weights), *rays.valid.shape[1:]), opl)
+
+
+def _sum_of_nodes(vector: Tensor, weights: Tensor) -> Tensor:
+    """Σ_k w_dk of a vector (2 or 3, K, ...) of the nodes and, behind them, of the distances between."""
+    return torch.einsum("dk,ck...->cd...", weights, vector[:, :_NODES])
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
@@ -308,11 +321,6 @@ def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
     )
 
 
-def cross_scene(scene: Scene, pupil: Tensor) -> list[Crossing]:
-    """The crossings of the same rays with every surface after the object; axes D, F and W of equal rays may be 1."""
-    return cross_bundle(_bundle(scene, pupil), scene.memo)
-
-
 def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
     """Image points (2, D, F, W, P) on the sensor, crossings of every aperture, and which rays meet every surface.
 
@@ -322,22 +330,11 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
         rays = trace_scene(scene, disc)
         return rays.position[:2], [], rays.valid
     shape = (*scene.shape, disc.shape[-1])
-    if scene.memo is None or in_transform():
-        lens, _, wavelength, _ = bundle = _bundle(scene, disc)
-        numbers = [k for k, surface in enumerate(lens.surfaces) if k and surface.apertures]
-        hits, met = points_at(lens, _launched(bundle), wavelength, (*numbers, len(lens.surfaces) - 1))
-        *crossed, hit = (at.expand(2, *shape) for at in hits)
-        pairs = zip(numbers, crossed, strict=True)
-        return hit, [(a, at) for k, at in pairs for a in lens.surfaces[k].apertures], met.expand(shape)
-    crossings = cross_scene(scene, disc)
-    # Rays that fail at launch are invalid before the first surface.
-    met = crossings[0].rays.valid | crossings[0].clipped
-    crossed = []
-    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
-        met = met & ~crossing.missed & ~crossing.totally_reflected
-        hit = crossing.rays.position[:2]
-        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
-    return hit.expand(2, *shape), crossed, met.expand(shape)
+    numbers = [k for k, surface in enumerate(scene.lens.surfaces) if k and surface.apertures]
+    hits, met = points_of_bundle(_bundle(scene, disc), (*numbers, len(scene.lens.surfaces) - 1), scene.memo)
+    *crossed, hit = (at.expand(2, *shape) for at in hits)
+    pairs = zip(numbers, crossed, strict=True)
+    return hit, [(a, at) for k, at in pairs for a in scene.lens.surfaces[k].apertures], met.expand(shape)
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:

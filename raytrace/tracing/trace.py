@@ -213,7 +213,7 @@ def trace_surfaces(
         if expressible and uses_compiled(rays, indices[first], last - first):
             end = trace_compiled(surfaces[first:last], rays, **arguments, eager=_eager)
         rays = _eager(surfaces[first:last], rays, **arguments) if end is None else end
-        side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
+        side = side * side_behind(surfaces[first:last])
         gap, first = gap_behind(surfaces[last - 1]), last
     return rays
 
@@ -302,24 +302,41 @@ def without_apertures(lens: Lens) -> Lens:
     return dataclasses.replace(lens, surfaces=surfaces)
 
 
-def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
+def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: Sequence[int]) -> tuple[list[Tensor], Tensor]:
     """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
-    indices = media(lens, wavelength)
-    unclipped = (lens.surfaces[0], *sequence_of(without_apertures(lens)))
-    rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
+    *_, last = each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, numbers)
+    return [at.position[:2] for at in each], last.valid
+
+
+def rays_at(
+    lens: Lens,
+    rays: Rays,
+    wavelength: Tensor,
+    numbers: Sequence[int],
+    *,
+    first: int = 0,
+    indices: Sequence[Tensor] | None = None,
+) -> list[Rays]:
+    """Rays behind each of the surfaces of these ascending numbers; apertures stop none.
+
+    first: the surface that they are behind, 0 in front of surface 1; indices: of all media, computed by default.
+    """
+    indices = media(lens, wavelength) if indices is None else indices
+    unclipped, each = (lens.surfaces[0], *sequence_of(without_apertures(lens))), []
+    side = side_behind(unclipped[: first + 1])
     for last in numbers:
-        rays = trace_surfaces(
-            unclipped[first + 1 : last + 1],
-            rays,
-            indices=indices[first : last + 1],
-            wavelength=wavelength,
-            side=side,
-            gap=gap_behind(lens.surfaces[first]) if first else None,
-        )
-        side = -side if sum(surface.is_mirror for surface in unclipped[first + 1 : last + 1]) % 2 else side
-        points.append(rays.position[:2])
-        first = last
-    return points, rays.valid
+        between = unclipped[first + 1 : last + 1]
+        gap = gap_behind(lens.surfaces[first]) if first else None
+        between_media = indices[first : last + 1]
+        rays = trace_surfaces(between, rays, indices=between_media, wavelength=wavelength, side=side, gap=gap)
+        each.append(rays)
+        side, first = side * side_behind(between), last
+    return each
+
+
+def side_behind(surfaces: Sequence[Surface]) -> int:
+    """The axial direction of light that has entered them towards +z: -1 behind an odd number of mirrors."""
+    return -1 if sum(surface.is_mirror for surface in surfaces) % 2 else 1
 
 
 def is_bent(lens: Lens) -> bool:
