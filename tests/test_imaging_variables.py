@@ -377,14 +377,18 @@ def test_a_state_says_what_follows(lens):
         other.load_state_dict(state)
 
 
-def test_solves_of_the_file_are_followed(lens):
-    free = design_variables(lens, "curvature:1 sensor=marginal_height(0)")
-    lens = dataclasses.replace(free.lens, optimization_data=OptimizationData(solves=free.solves))
-    variables = moved(Variables(lens, "curvature"), curvature_1=0.05)
-    changed = variables()
-    distance = float(first_order(changed).paraxial_image_distance.detach())
-    assert float(changed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
-    assert "sensor" in moved(Variables(lens, "curvature sensor"), sensor=0.1).names  # a number that is named varies
+def test_solves_of_the_file_are_not_followed(lens):
+    """The sensor stays where it is put, and the numbers of a word are those of a file without solves."""
+    free = design_variables(lens, "curvature:1 sensor=marginal_height(0) curvature:3=curvature:1")
+    data = OptimizationData(solves=free.solves)
+    solved = dataclasses.replace(lens.at(sensor_distance=60.0), optimization_data=data)
+    variables = moved(Variables(solved, "curvature"), curvature_1=0.05)
+    assert variables.names == Variables(lens, "curvature").names
+    assert float(variables().surfaces[11].thickness) == 60.0
+    assert variables().optimization_data is data
+    followed = moved(Variables(solved, "curvature:1 sensor=marginal_height(0)"), curvature_1=0.05)()
+    distance = float(first_order(followed).paraxial_image_distance.detach())
+    assert float(followed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
 
 
 def test_temperature_and_pressure_are_parameters(lens):

@@ -280,8 +280,8 @@ class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 a4:3 temperature
-        curvature:6=-curvature:1". Solves and pickups of the file are followed, too. Glasses are not exchanged, and the
-        distance of the object is that of a camera.
+        curvature:6=-curvature:1". Solves and pickups are those named here alone: the sensor stays where it is put even
+        if the file solves for it. Glasses are not exchanged, and the distance of the object is that of a camera.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
@@ -585,14 +585,17 @@ class Variables(Owned):
 
 
 def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
-    """The variables, solves and pickups of variable syntax. Raises BadVariables for what a camera does not vary."""
+    """The variables, solves and pickups of variable syntax, without those of the file, in double precision on the
+    processor. Raises BadVariables for what a camera does not vary."""
     if not split_words(vary):
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
-    design = design_variables(to(lens, dtype=torch.float64, device="cpu"), vary)
+    lens, data = to(lens, dtype=torch.float64, device="cpu"), lens.optimization_data
+    unsolved = None if data is None else dataclasses.replace(data, solves=())
+    design = design_variables(dataclasses.replace(lens, optimization_data=unsolved), vary)
     for one in design.variables:
         if one.quantity == "glass" or (one.surface, one.quantity) == (0, "thickness"):
             raise BadVariables(f"`vary={joined(vary)}`: {name_of(one)} is a variable of optimize and jacobian alone")
-    return design
+    return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
 
 def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Variable, ...]:
