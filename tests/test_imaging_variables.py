@@ -358,6 +358,18 @@ def test_a_focal_length_is_held_with_pickups_by_a_number_that_they_leave_linear(
         Variables(lens, "curvature:3 curvature:8=-curvature:3", hold="efl")
 
 
+def test_a_focal_length_is_held_before_a_pickup_with_power(lens):
+    """Surface 8, behind the number that is solved, picks up curvature_1: the solve has the power that comes of it."""
+    variables = moved(Variables(lens, "curvature:1,3 curvature:8=-0.1*curvature:1", hold="efl"), curvature_1=0.3)
+    assert variables.held.by.name == "curvature_3"
+    assert focal_length(variables()) == pytest.approx(focal_length(lens), rel=1e-12)
+
+    def solved(offset):
+        return torch.func.functional_call(variables, {"curvature_1": offset}, ()).surfaces[3].curvature
+
+    assert gradcheck(solved, [variables.curvature_1.detach().clone().requires_grad_()], rtol=1e-6)
+
+
 def test_the_projection_follows_solves(lens):
     prepare()
     length = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
