@@ -325,7 +325,7 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
     if scene.memo is None or in_transform():
         lens, _, wavelength, _ = bundle = _bundle(scene, disc)
         numbers = [k for k, surface in enumerate(lens.surfaces) if k and surface.apertures]
-        hits, met = points_at(lens, _launched(bundle), wavelength, (*numbers, len(lens.surfaces) - 1))
+        hits, met = points_at(lens, wavelength, (*numbers, len(lens.surfaces) - 1))(_launched(bundle))
         *crossed, hit = (at.expand(2, *shape) for at in hits)
         pairs = zip(numbers, crossed, strict=True)
         return hit, [(a, at) for k, at in pairs for a in lens.surfaces[k].apertures], met.expand(shape)

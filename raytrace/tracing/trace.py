@@ -8,7 +8,7 @@ rays: in the compiled engine each ray carries its derivatives from surface to su
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -291,35 +291,42 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
 
 def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
     """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
-    (stop,), arrives = points_at(lens, rays, wavelength, (lens.stop,))
+    (stop,), arrives = points_at(lens, wavelength, (lens.stop,))(rays)
     return stop, arrives
 
 
 @shared
 def without_apertures(lens: Lens) -> Lens:
     """The lens without apertures: no ray is vignetted."""
-    surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
-    return dataclasses.replace(lens, surfaces=surfaces)
+    if not any(surface.apertures for surface in lens.surfaces):
+        return lens
+    return dataclasses.replace(lens, surfaces=_unclipped(lens.surfaces))
 
 
-def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
-    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
-    indices = media(lens, wavelength)
-    unclipped = (lens.surfaces[0], *sequence_of(without_apertures(lens)))
-    rays, first, side, points = dataclasses.replace(rays, opl=None), 0, 1, []
+def _unclipped(surfaces: Sequence[Surface]) -> tuple[Surface, ...]:
+    return tuple(dataclasses.replace(each, apertures=()) if each.apertures else each for each in surfaces)
+
+
+def points_at(
+    lens: Lens, wavelength: Tensor, numbers: tuple[int, ...]
+) -> Callable[[Rays], tuple[list[Tensor], Tensor]]:
+    """The map from rays to where they meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they
+    reach the last. Surfaces and media are prepared once, for searches that trace many batches in turn."""
+    indices, surfaces = media(lens, wavelength), (lens.surfaces[0], *_unclipped(sequence_of(lens)))
+    runs, first, side = [], 0, 1
     for last in numbers:
-        rays = trace_surfaces(
-            unclipped[first + 1 : last + 1],
-            rays,
-            indices=indices[first : last + 1],
-            wavelength=wavelength,
-            side=side,
-            gap=gap_behind(lens.surfaces[first]) if first else None,
-        )
-        side = -side if sum(surface.is_mirror for surface in unclipped[first + 1 : last + 1]) % 2 else side
-        points.append(rays.position[:2])
-        first = last
-    return points, rays.valid
+        run, gap = surfaces[first + 1 : last + 1], gap_behind(lens.surfaces[first]) if first else None
+        runs.append((run, {"indices": indices[first : last + 1], "side": side, "gap": gap, "wavelength": wavelength}))
+        first, side = last, -side if sum(surface.is_mirror for surface in run) % 2 else side
+
+    def points(rays: Rays) -> tuple[list[Tensor], Tensor]:
+        rays, landed = dataclasses.replace(rays, opl=None), []
+        for run, arguments in runs:
+            rays = trace_surfaces(run, rays, **arguments)
+            landed.append(rays.position[:2])
+        return landed, rays.valid
+
+    return points
 
 
 def is_bent(lens: Lens) -> bool:
