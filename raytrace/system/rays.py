@@ -44,12 +44,12 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
     """
     axes = max(position.dim(), direction.dim()) - 1
     position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
-    directed = torch.isfinite(direction).all(0) & (direction != 0).any(0)
-    usable = torch.isfinite(position).all(0) & directed
+    farthest, largest = (vector.detach().abs().amax(0) for vector in (position, direction))
+    usable = (farthest < torch.inf) & (largest > 0) & (largest < torch.inf)
     axis = direction.new_tensor([0.0, 0.0, 1.0]).reshape(3, *(1,) * axes)
     return Rays(
         position=torch.where(usable, position, 0.0),
-        direction=torch.where(usable, unit(torch.where(directed, direction, axis)), axis),
+        direction=unit(torch.where(usable, direction, axis)),
         valid=usable,
         opl=opl if opl is None else torch.where(usable, opl, 0.0),
     )
