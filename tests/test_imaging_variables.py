@@ -7,18 +7,21 @@ import torch
 from differences import gradcheck
 from problems import focal_length
 
+import raytrace as rt
 from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, patch_spectrum
 from raytrace.imaging.codesign import camera, closed_form, optimise
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
-from raytrace.imaging.variables import Variables
+from raytrace.imaging.variables import OtherLens, Variables
 from raytrace.io import read_lens
 from raytrace.materials.glass import abbe_number, nd
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.optimize import NotReached
-from raytrace.optimization.variables import VariedGlass
+from raytrace.optimization.variables import VariedGlass, design_variables
 from raytrace.settings import CodesignSettings
+from raytrace.system import configurations
 from raytrace.system.lens import media
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.paraxial import first_order
@@ -313,3 +316,119 @@ def test_a_frozen_lens_is_not_moved_and_a_frozen_number_neither(lens):
     variables.project()
     assert variables.numbers()["thickness_4"] == start["thickness_4"]
     assert sum(float(surface.thickness.detach()) for surface in variables().surfaces[2:5]) <= 18.1 + 1e-7
+
+
+# -- solves, pickups, temperature and configurations -------------------------------------------------------------------
+
+FOLLOWED = "curvature:1,3,10 curvature:8=-curvature:3 thickness:5 sensor=marginal_height(0)"
+
+
+def test_solves_and_pickups_are_followed_with_derivatives(lens):
+    """The paraxial image stays on the sensor, which is a number of the lens and no parameter."""
+    variables = Variables(lens, FOLLOWED)
+    assert tuple(dict(variables.named_parameters())) == variables.names
+    assert variables.names == ("curvature_1", "curvature_3", "curvature_10", "thickness_5")
+    moved(variables, curvature_3=0.05, thickness_5=0.3)
+    changed = variables()
+    assert float(changed.surfaces[8].curvature) == -float(changed.surfaces[3].curvature)
+    distance = float(first_order(changed).paraxial_image_distance.detach())
+    assert float(changed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
+
+    def radius(*offsets):
+        given = dict(zip(variables.names, offsets, strict=True))
+        made = torch.func.functional_call(variables, given, ())
+        return rt.spot(made, fields=[5.0]).whole.rms_radius.sum()
+
+    assert gradcheck(radius, [one.detach().clone().requires_grad_() for one in variables.parameters()], rtol=1e-5)
+
+
+def test_a_focal_length_is_held_with_pickups_by_a_number_that_they_leave_linear(lens):
+    """The power of the lens is no linear function of curvature_3, which surface 8 picks up, but of curvature_10."""
+    variables = Variables(lens, "curvature:1,10,3 curvature:8=-curvature:3 sensor=marginal_height(0)", hold="efl")
+    assert variables.held.by.name == "curvature_10"
+    moved(variables, curvature_1=0.1, curvature_3=-0.05)
+    changed = variables()
+    assert focal_length(changed) == pytest.approx(focal_length(lens), rel=1e-12)
+    assert float(changed.surfaces[8].curvature) == -float(changed.surfaces[3].curvature)
+    assert float(changed.surfaces[11].thickness) == pytest.approx(
+        float(first_order(changed).paraxial_image_distance.detach()), rel=1e-12
+    )
+    assert variables.numbers()["curvature_10"] == float(changed.surfaces[10].curvature)
+    with pytest.raises(BadVariables, match=r"none of the variables changes the focal length; .* whose pickups do not"):
+        Variables(lens, "curvature:3 curvature:8=-curvature:3", hold="efl")
+
+
+def test_the_projection_follows_solves(lens):
+    prepare()
+    length = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
+    variables = Variables(lens, FOLLOWED, hold=f"total_track<={length - 1!r} buildable")
+    variables.project()
+    changed = variables()
+    assert sum(float(surface.thickness.detach()) for surface in changed.surfaces[1:-1]) <= length - 1 + 1e-7
+    assert float(changed.surfaces[11].thickness) == pytest.approx(
+        float(first_order(changed).paraxial_image_distance.detach()), rel=1e-9
+    )
+
+
+def test_a_state_says_what_follows(lens):
+    state = Variables(lens, FOLLOWED).state_dict()
+    other = Variables(lens, FOLLOWED.replace("=-curvature:3", "=-curvature:1"))
+    with pytest.raises(OtherLens, match=r"with the solves .*curvature of surface 8 = -1 × curvature of surface 3"):
+        other.load_state_dict(state)
+
+
+def test_solves_of_the_file_are_followed(lens):
+    free = design_variables(lens, "curvature:1 sensor=marginal_height(0)")
+    lens = dataclasses.replace(free.lens, optimization_data=OptimizationData(solves=free.solves))
+    variables = moved(Variables(lens, "curvature"), curvature_1=0.05)
+    changed = variables()
+    distance = float(first_order(changed).paraxial_image_distance.detach())
+    assert float(changed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
+    assert "sensor" in moved(Variables(lens, "curvature sensor"), sensor=0.1).names  # a number that is named varies
+
+
+def test_temperature_and_pressure_are_parameters(lens):
+    """The unit is 10 °C and 0.1 atm; the lens is in air of 20 °C and 1 atm where nothing else is given."""
+    variables = Variables(lens, "temperature pressure sensor", bounds="temperature:-40..80")
+    start = rt.spot(lens.at(temperature=20.0, pressure=1.0), fields=[5.0]).whole.rms_radius
+    changed = variables()
+    assert float(rt.spot(changed, fields=[5.0]).whole.rms_radius.detach()) == pytest.approx(float(start), rel=1e-12)
+    rt.spot(changed, fields=[5.0]).whole.rms_radius.sum().backward()
+    ends = [
+        float(rt.spot(lens.at(temperature=20.0 + step, pressure=1.0), fields=[5.0]).whole.rms_radius)
+        for step in (0.1, -0.1)
+    ]
+    assert float(variables.temperature.grad) == pytest.approx(10 * (ends[0] - ends[1]) / 0.2, rel=1e-5)
+    moved(variables, temperature=100.0)
+    variables.project()
+    assert variables.numbers()["temperature"] == pytest.approx(80.0, rel=1e-15)
+
+
+def test_a_number_of_one_configuration_is_a_parameter(lens):
+    zoom = configurations.made(lens, thickness={5: [14.0, 15.0]})
+    variables = moved(Variables(zoom, "thickness:5 sensor"), **{"thickness_5@2": 0.5, "thickness_5@1": -0.25})
+    changed = variables()
+    thicknesses = [float(one.surfaces[5].thickness.detach()) for one in (changed, *changed.configurations)]
+    assert thicknesses == [13.75, 13.75, 15.5]
+
+
+def test_solves_are_followed_in_single_precision(lens):
+    variables = moved(Variables(lens, FOLLOWED, hold="efl").float(), curvature_1=0.02)
+    changed = variables()
+    assert changed.surfaces[11].thickness.dtype == torch.float32
+    exact = moved(Variables(lens, FOLLOWED, hold="efl"), curvature_1=0.02)()
+    assert float(changed.surfaces[11].thickness) == pytest.approx(float(exact.surfaces[11].thickness), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_camera_is_trained_with_what_follows(lens):
+    camera = rt.Camera(Variables(lens, FOLLOWED, step="blur"), torch.nn.Conv2d(1, 1, 1), model="paraxial", pixels=9)
+    optimizer = torch.optim.SGD(camera.variables.parameters(), 1e-4)
+    before = camera.variables.numbers()
+    camera(torch.rand(1, 16, 16), torch.tensor([2e4])).mean().backward()
+    assert all(bool(one.grad.isfinite()) and float(one.grad) for one in camera.variables.parameters())
+    optimizer.step()
+    assert camera.variables.numbers() != before
+    changed = camera.variables()
+    distance = float(first_order(changed).paraxial_image_distance.detach())
+    assert float(changed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 
 import raytrace as rt
 from raytrace.optimization.variables import DesignVariables, design_variables
+from raytrace.system import configurations
 from raytrace.system.lens import aligned
 from raytrace.tolerancing.jacobian import OF_RAYS
 from raytrace.tracing.compiled import trace_engine
@@ -243,3 +244,14 @@ def test_wrong_quantities_are_refused():
         rt.jacobian(COOKE, "curvature", of=lambda lens: 3)
     with pytest.raises(rt.BadVariables if hasattr(rt, "BadVariables") else ValueError, match="no variables"):
         rt.jacobian("cooke_triplet")
+
+
+def test_derivatives_reach_the_configuration_that_a_function_takes():
+    zoom = configurations.made(GAUSS, thickness={5: [14.0, 15.0]})
+
+    def track(lens: rt.Lens) -> torch.Tensor:
+        return sum(surface.thickness for surface in lens.configuration(2).surfaces[1:-1])
+
+    found = rt.jacobian(zoom, "thickness:5 thickness:6=2*thickness:3 thickness:3", of=track)
+    assert found.variables == ("thickness_5@1", "thickness_5@2", "thickness_3")
+    assert found.derivatives.tolist() == [0.0, 1.0, 3.0]

@@ -5,17 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
+from problems import focal_length
 from test_corpus import CORPUS
 from test_operands_boundaries import semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
 from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.optimization.lens_state import SOLVES
 from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system import configurations
 from raytrace.system.configurations import ScaledPath
+from raytrace.system.lens import SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import stored_number
 from raytrace.system.surface import sag
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.trace import trace_lens
@@ -31,6 +36,7 @@ RULES = {
     "edge_thickness": Solve(3, "thickness", "edge_thickness", (2.5, 10.0)),
     "power": Solve(10, "curvature", "power", (0.012,)),
     "position": Solve(7, "thickness", "position", (30.0,), source=3),
+    "focal_length": Solve(11, "curvature", "focal_length", (90.0,)),
 }
 
 
@@ -73,6 +79,8 @@ def test_solved_numbers_meet_their_rule(kind):
     elif kind == "power":
         before, behind = (refractive_index(lens.surfaces[k].glass, lens.wavelengths[0]) for k in (9, 10))
         assert float(surface.curvature * (behind - before)) == pytest.approx(0.012, rel=1e-13)
+    elif kind == "focal_length":
+        assert focal_length(lens) == pytest.approx(90, rel=1e-12)
     elif kind == "edge_thickness":
         near, far = (float(sag(lens.surfaces[k], torch.tensor(100.0, dtype=torch.float64))) for k in (3, 4))
         assert float(surface.thickness) + far - near == pytest.approx(2.5, rel=1e-13)
@@ -94,15 +102,21 @@ def test_derivatives_go_through(kind):
         assert slope[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-6, abs=1e-9)
 
 
-def test_solves_that_wait_for_one_another_settle():
+#: Rules that wait for one another.
+CHAIN = (
+    Solve(2, "curvature", "marginal_angle", (0.01,)),  # in front of the stop: moves the entrance pupil
+    Solve(3, "curvature", "pickup", source=8, scale=0.5),
+    Solve(8, "curvature", "pickup", source=1, scale=-0.7),
+    Solve(11, "thickness", "marginal_height", (0.0,)),
+)
+
+
+@pytest.mark.parametrize("is_solved", [False, True], ids=["moved", "where the lens is solved already"])
+def test_solves_that_wait_for_one_another_settle(is_solved):
     lens = rt.read_lens("double_gauss").at(f_number=3)
-    solves = (
-        Solve(2, "curvature", "marginal_angle", (0.01,)),  # in front of the stop: moves the entrance pupil
-        Solve(3, "curvature", "pickup", source=8, scale=0.5),
-        Solve(8, "curvature", "pickup", source=1, scale=-0.7),
-        Solve(11, "thickness", "marginal_height", (0.0,)),
-    )
-    model, x, found = moment_of(solves, lens=lens, duals=True)
+    model, x, found = moment_of(CHAIN, lens=lens, duals=True)
+    if is_solved:
+        model, x, found = moment_of(CHAIN, x, lens=model.lens_at(x), duals=True)
     here = model.lens_at(x)
     assert marginal_slope(here, 2)[0] == pytest.approx(0.01, rel=1e-9)
     assert float(here.surfaces[3].curvature) == pytest.approx(-0.35 * x[0], rel=1e-12)
@@ -112,6 +126,17 @@ def test_solves_that_wait_for_one_another_settle():
         for at, number in found.numbers.items():
             ahead, back = (model.views[0].state(x + s * step * np.eye(len(x))[k]).numbers[at] for s in (1, -1))
             assert number.slope[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-5, abs=1e-8)
+
+
+def test_a_solve_counts_the_power_of_terms_that_vary():
+    """a r² adds 2 a to the curvature at the vertex: the marginal ray comes to the last surface with another slope."""
+    lens = rt.read_lens("double_gauss").replace(3, coefficients=[1e-4, 0.0])
+    model = DesignVariables(lens, (Vary(3, "a2"),), (RULES["f_number"],))
+    here = model.lens_at(np.array([4e-4]))
+    bent = here.replace(3, curvature=here.surfaces[3].curvature + 2 * 4e-4)
+    assert marginal_slope(bent, 11)[0] == pytest.approx(-1 / 5, rel=1e-12)
+    exact, differences = differenced(model, np.array([4e-4]), (11, "curvature"))
+    assert exact == pytest.approx(differences, rel=1e-7)
 
 
 def test_a_solve_in_the_object_space_of_a_finite_object():
@@ -253,3 +278,82 @@ def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
     (solve,) = (one for one in lens.optimization_data.solves if one.kind == kind)
     found = DesignVariables(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]
     assert value_of(found) == pytest.approx(float(lens.surfaces[solve.surface].thickness), rel=near)
+
+
+# -- the lens as a function of tensors ---------------------------------------------------------------------------------
+
+
+def models() -> dict[str, DesignVariables]:
+    """Every rule, rules that wait for one another, and variables that are not numbers of a surface."""
+    lens = rt.read_lens("double_gauss")
+    cone = SystemAperture("object_na", torch.tensor(0.05, dtype=torch.float64))
+    near = dataclasses.replace(lens.at(object_distance=400.0), aperture=cone)
+    beam = (Vary(0, "aperture"), Vary(0, "thickness"), Vary(1, "curvature"))
+    follows = Solve(3, "thickness", "pickup", (0.0,), 1, 2.0, 0.1, configuration=2, operand=0)
+    term = lens.replace(3, coefficients=[1e-4, 0.0])
+    lit = dataclasses.replace(lens, optimization_data=OptimizationData(semi_diameter_margin=(5.0, 0.1)))
+    edge = Solve(3, "thickness", "edge_thickness", (2.0, 0.0))
+    return {
+        **{kind: DesignVariables(lens, VARY, (solve,)) for kind, solve in RULES.items()},
+        "real ray": DesignVariables(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.25, 0.7)),)),
+        "edge where the light ends": DesignVariables(lit, VARY[:2], (edge,)),
+        "pupil": DesignVariables(lens.at(f_number=3), VARY[:1], CHAIN[:1]),
+        "chain": DesignVariables(lens.at(f_number=3), VARY[:1], CHAIN),
+        "term of r²": DesignVariables(term, (Vary(3, "a2"), VARY[0]), (RULES["f_number"], RULES["marginal_height"])),
+        "object NA": DesignVariables(near, beam, (RULES["f_number"], RULES["marginal_height"])),
+        "fixed object NA": DesignVariables(near, VARY[:1], (RULES["marginal_height"],)),
+        "temperature": design_variables(lens.at(temperature=30.0), "temperature pressure curvature:11=f_number(4)"),
+        "configurations": DesignVariables(zoom(), (Vary(3, "thickness", 1, 0), Vary(1, "curvature", 2, 1)), (follows,)),
+    }
+
+
+def numbers_of(model: DesignVariables, x: torch.Tensor) -> torch.Tensor:
+    """All numbers that move (n,), or (L, n) of L lenses, and those of operands of configurations."""
+    lens, view = model.lens_at(x), model.views[model.lens.current_configuration - 1]
+    numbers = [stored_number(lens, at) for at in view.moved] + [n for one in lens.operands for n in one.numbers]
+    return torch.stack([n.reshape(-1).expand(x.shape[:-1]) if x.dim() > 1 else n for n in numbers], -1)
+
+
+SLOW = ("chain", "edge where the light ends", "object NA", "real ray", "temperature")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in models()]
+)
+def test_the_lens_of_tensors_is_that_of_numbers_and_has_its_derivatives(name):
+    """First and second order by the graph, and by tensors that carry derivatives; of a batch as of each lens."""
+    model = models()[name]
+    x = torch.tensor(model.start) * (1 + 0.01 * torch.arange(1, len(model.start) + 1))
+    numbers, view = numbers_of(model, x), model.views[0]
+    plain = [value_of(n) for n in view.state(x.numpy()).numbers.values()]
+    assert sorted(numbers[: len(plain)].tolist()) == pytest.approx(sorted(plain), rel=1e-14)
+    unit = torch.tensor([max(abs(n), 1e-3) for n in x.tolist()])
+
+    def scaled(y):
+        return numbers_of(model, unit * y)
+
+    y = (x / unit).requires_grad_()
+    assert gradcheck(scaled, (y,), eps=1e-6, rtol=1e-6, atol=1e-8)
+    assert gradgradcheck(scaled, (y,), eps=1e-6, rtol=1e-5, atol=1e-7)
+    by_graph = torch.autograd.functional.jacobian(scaled, y)
+    moving = numbers_of(model, with_tangents(x, torch.eye(len(x), dtype=x.dtype)))
+    torch.testing.assert_close(unit * tangents_of(moving, len(x)).T, by_graph, rtol=1e-12, atol=1e-14)
+    several = torch.stack([x, 1.002 * x])
+    torch.testing.assert_close(numbers_of(model, several), torch.stack([numbers_of(model, one) for one in several]))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
+        for name in ("f_number", "pupil", "chain", "edge where the light ends", "configurations")
+    ],
+)
+def test_transforms_of_torch_take_the_lens_of_tensors(name):
+    model = models()[name]
+    x = torch.tensor(model.start) * 1.01
+    several, of = torch.stack([x, 1.002 * x]), lambda x: numbers_of(model, x)
+    torch.testing.assert_close(torch.func.vmap(of)(several), of(several))
+    expected = torch.autograd.functional.jacobian(of, x)
+    for derivative in (torch.func.jacfwd, torch.func.jacrev):
+        torch.testing.assert_close(derivative(of)(x), expected, rtol=1e-12, atol=1e-14)

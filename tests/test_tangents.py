@@ -34,6 +34,7 @@ FUNCTIONS = {
     "powers": lambda x, y, z: x**2 + x**y + 2.0**x,
     "functions of one": lambda x, y, z: sum(getattr(torch, name)(x / 2) for name in UNARY.split()),
     "functions of two": lambda x, y, z: torch.hypot(x, y) + torch.atan2(y, x) + torch.addcmul(x, x, y),
+    "signs": lambda x, y, z: torch.copysign(x - 0.6, y - 0.7) + torch.copysign(X, y - 0.7) + torch.copysign(y, -X),
     "larger and smaller": lambda x, y, z: (
         torch.maximum(x, y) + torch.minimum(x, y) + x.clamp(0.4, 0.7) + x.clamp_min(0.5)
     ),

@@ -185,7 +185,7 @@ def least_of_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
     first = optimise_closed_form(camera, spectrum, distances=distances)
     reached = float(variables().surfaces[-2].thickness.detach())
     end = copy.deepcopy(variables.state_dict())
-    if "sensor" not in [variable.kind for variable in variables.variables] or camera.model not in _SCANNED:
+    if "sensor" not in [variable.name for variable in variables.variables] or camera.model not in _SCANNED:
         return first, reached
     variables.load_state_dict(start)
     with torch.no_grad():
@@ -216,7 +216,7 @@ def scan(camera: Camera, spectrum: Tensor, sensors: Sequence[float], distances: 
 
 @torch.no_grad()
 def _move_sensor(camera: Camera, sensor: float) -> None:
-    (variable,) = [variable for variable in camera.variables.variables if variable.kind == "sensor"]
+    (variable,) = [variable for variable in camera.variables.variables if variable.name == "sensor"]
     camera.variables.get_parameter(variable.name).fill_((sensor - variable.start) / variable.unit)
 
 

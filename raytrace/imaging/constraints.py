@@ -23,7 +23,7 @@ from raytrace.optimization.optimize import EXACT, NotReached
 from raytrace.optimization.problem import Condition, Problem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.optimization_data import Row
 from raytrace.words import calling_level
 
 _STEPS = 30  # quadratic programs at most
@@ -38,7 +38,7 @@ Limits = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray | None]]
 
 
 class GlassLimits:
-    """DesignVariables glasses within the convex hull of catalog glasses, as further limits.
+    """Model glasses within the convex hull of catalog glasses, as further limits.
 
     start: numbers (k,) of the model glass behind each surface; columns: (n,) variables as pairs (surface, number of the
     glass), None for others.
@@ -89,15 +89,14 @@ def joined_limits(limits: Sequence[Limits]) -> Limits | None:
 
 
 class Constraints:
-    """Conditions on the variables of a lens.
+    """Conditions on design variables.
 
     conditions: of constraint syntax; limits: further ones, or None; unit: (n,) of the variables; lower, upper: (n,).
     """
 
     def __init__(
         self,
-        lens: Lens,
-        variables: Sequence[Vary],
+        design: DesignVariables,
         conditions: Sequence[Condition],
         *,
         unit: np.ndarray,
@@ -105,7 +104,7 @@ class Constraints:
         upper: np.ndarray,
         limits: Limits | None = None,
     ):
-        self.problem = Problem(DesignVariables(lens, tuple(variables)), [*_rays(lens)], conditions)
+        self.problem = Problem(design, [*_rays(design.lens)], conditions)
         self.conditions, self.limits = tuple(conditions), limits
         self.unit, self.lower, self.upper = unit, lower, upper
         self._ends = lower, upper  # of the variables that move

@@ -6,12 +6,9 @@
     variables.project()                                 # after a step: onto bounds and constraints, rays brought back
     violation(changed, limits)                          # Σ (excess over a limit)², mm²; 0 can be fabricated
 
-Variable and bound syntax is that of `optimize` (`optimization.variables`). The parameters are offsets from the lens. A
-state carries the identity of its lens, which is compared when it is loaded (`Owned`).
-
-A solved number holds the focal length. The power φ of a lens is linear in the curvature and the thickness of each
-surface (Gauss's brackets), so that a number v follows from φ(0) + v [φ(1) - φ(0)] = |n′|/f, with its derivatives. A
-power is finite where the lens is afocal.
+`Variables` are a module around `DesignVariables`: variable and bound syntax, solves and pickups are those of `optimize`
+(`optimization.variables`). The parameters are offsets from the lens. A state carries the identity of its lens, which is
+compared when it is loaded (`Owned`). A focal length that is held is one more solve, of a number with power.
 
 `PhaseVariables` are the heights of a thin element as parameters.
 """
@@ -42,28 +39,28 @@ from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasse
 from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     BadHold,
+    DesignVariables,
     bounds_of,
     constraint_words,
+    design_variables,
     name_of,
     split_constraint,
     split_words,
     varied,
-    with_modelled,
 )
 from raytrace.system.identity import alike, digest, identity, other_lens
-from raytrace.system.lens import Lens, field_points, media
-from raytrace.system.optimization_data import Vary
+from raytrace.system.lens import Lens, field_points
+from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
-    APERTURE,
     GLASS,
-    OF_LENS,
     Address,
     BadVariables,
-    ParameterPath,
+    joined,
     number_at,
     path_of,
+    sensor,
+    stored_number,
     with_number,
-    with_numbers_of,
 )
 from raytrace.system.surface import medium_surfaces, sag_at
 from raytrace.tracing.geometry import edge_thickness, rims
@@ -239,7 +236,12 @@ def _floating(values: tuple) -> Tensor:
 
 # -- variables of a lens -----------------------------------------------------------------------------------------------
 
-_UNITS = {"thickness": 1.0, "x": 1.0, "y": 1.0, "z": 1.0, "index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01}
+#: Units of numbers that are not of a shape, and of numbers of the lens.
+_UNITS = {
+    **dict.fromkeys(("thickness", "x", "y", "z"), 1.0),
+    **{"index": 0.01, "abbe_number": 1.0, "partial_dispersion": 0.01},
+    **{"temperature": 10.0, "pressure": 0.1},
+}
 _APERTURE = 0.1  # of the number of the system aperture: its unit
 _BLUR_RAYS = 4, 8  # of units of blur
 _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not affect it
@@ -247,27 +249,23 @@ _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not aff
 
 @dataclass(frozen=True)
 class Variable:
-    """One number of one surface.
+    """One number of a lens as a parameter.
 
-    kind: its quantity, or "sensor" for the last thickness; start: its value in the lens; unit: of the parameter, in
-    that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the change that moves the
-    surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them. The system aperture, of
-    surface 0, is in tenths of its number at the start. `Variables(step="blur")` takes other units.
+    name: as of `optimization.variables.name_of`, or "sensor" of the last thickness; start: its value in the lens; unit:
+    of the parameter, in that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the
+    change that moves the surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them.
+    The system aperture is in tenths of its number at the start, the temperature in 10 °C, the pressure in 0.1 atm.
+    `Variables(step="blur")` takes other units.
     """
 
-    kind: str
-    surface: int
+    name: str
+    number: Vary
     start: float
     unit: float
-    path: ParameterPath
-
-    @property
-    def name(self) -> str:
-        return self.kind if self.kind in ("sensor", "aperture") else f"{self.kind}_{self.surface}"
 
     @property
     def address(self) -> Address:
-        return self.surface, "thickness" if self.kind == "sensor" else self.kind
+        return self.number.surface, self.number.quantity
 
 
 @dataclass(frozen=True)
@@ -281,8 +279,9 @@ class Held:
 class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
-    vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 curvature:1-4 a4:3",
-        without solves, pickups and exchangeable glasses.
+    vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 a4:3 temperature
+        curvature:6=-curvature:1". Solves and pickups of the file are followed, too. Glasses are not exchanged, and the
+        distance of the object is that of a camera.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
@@ -316,21 +315,20 @@ class Variables(Owned):
             raise BadVariables(f"step {step!r}: expected sag or blur")
         self.catalog = tuple(catalog)
         self.lens = lens = as_lens(lens, "Variables")
-        numbers, kinds = _named(lens, vary)
-        self._modelled, words = with_modelled(lens, numbers), constraint_words(hold)
+        #: The variables in double precision on the processor, and the lens with all of them modelled.
+        self.design, words = _design(lens, vary), constraint_words(hold)
+        self._modelled = to(self.design.lens, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
         efl = [word for word in words if re.fullmatch("efl(=.*)?", word)]
         self.conditions = tuple(word for word in words if word not in efl)
-        every = tuple(
-            _variable(self._modelled, one.surface, kind, one.quantity) for one, kind in zip(numbers, kinds, strict=True)
-        )
-        self.held = self._held(" ".join(efl), every)
-        self.variables = tuple(one for one in every if self.held is None or one is not self.held.by)
-        self.names = tuple(variable.name for variable in every)
-        lower, upper = bounds_of(lens, numbers, bounds)
+        self._all = _variables(self.design, vary)
+        self.held = self._held(" ".join(efl))
+        self.variables = tuple(one for one in self._all if self.held is None or one is not self.held.by)
+        self.names = tuple(variable.name for variable in self._all)
+        lower, upper = bounds_of(lens, self.design.variables, bounds)
         ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
-        self._ends, self._numbers, self._all = (lower, upper), numbers, every
+        self._ends = lower, upper
         self._held_to = self._conditions()
         if "catalog" in self.conditions:
             self._glasses  # noqa: B018 - refuses lenses whose glasses do not vary
@@ -350,13 +348,9 @@ class Variables(Owned):
         """Units of equal blur: the RMS distance from the centroid by which rays of all fields move."""
         like, count = self.lens.wavelengths, len(self.variables)
         pupil, weights = gauss_rings(*_BLUR_RAYS, dtype=like.dtype, device=like.device)
-        units = torch.eye(count, dtype=like.dtype, device=like.device)
-        moving = {
-            variable.name: with_tangents(self.get_parameter(variable.name).detach(), unit)
-            for variable, unit in zip(self.variables, units, strict=True)
-        }
+        units = torch.diag(like.new_tensor([variable.unit for variable in self.variables]))
         with torch.enable_grad():
-            lens = torch.func.functional_call(self, moving, ())
+            lens = self._free.lens_at(with_tangents(self._numbers(), units), self._modelled)
             rays = image_rays(lens, pupil, fields=field_points(None, like=self.lens))
         moved, weight = tangents_of(rays.position, count)[:, :2], weights * rays.valid
         about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), weight.sum(-1, keepdim=True))
@@ -372,14 +366,12 @@ class Variables(Owned):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
         self.lens, self._modelled = converted((self.lens, self._modelled), fn)
-        self.__dict__.pop("_constraints", None)
-        self.__dict__.pop("_glasses", None)
         return super()._apply(fn, recurse)
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value:.6g}" for name, value in self.numbers().items())
 
-    def _held(self, hold: str, variables: Sequence[Variable]) -> Held | None:
+    def _held(self, hold: str) -> Held | None:
         """The focal length of "efl" or "efl=100", and the last variable that changes it. Raises BadVariables."""
         if not hold:
             return None
@@ -394,34 +386,43 @@ class Variables(Owned):
             length = math.nan
         if length == 0 or not math.isfinite(length):
             raise BadVariables(f"hold {hold!r}: expected efl, the focal length of the file, or one in mm as efl=100")
-        for variable in reversed(variables):
-            power, change = (part.abs() for part in self._power(self._modelled, variable))
-            if variable.kind not in GLASS and bool(change > _NEGLIGIBLE * power):
+        for variable in reversed(self._all):
+            if variable.number.operand is None and variable.number.quantity not in GLASS and self._has_power(variable):
                 return Held(length, variable)
         raise BadVariables(
-            f"hold {hold!r}: none of the variables changes the focal length; vary a thickness or a curvature"
+            f"hold {hold!r}: none of the variables changes the focal length; vary a thickness or a curvature "
+            "whose pickups do not change it, too"
         )
 
-    def _power(self, lens: Lens, variable: Variable) -> tuple[Tensor, Tensor]:
-        """The power at 0 of a variable, and its change to 1; 1/mm."""
-        zero = torch.zeros_like(lens.surfaces[-2].thickness)
-        at_zero, at_one = (first_order(_with_values(lens, [variable], [zero + k])).power for k in range(2))
-        return at_zero, at_one - at_zero
+    def _has_power(self, variable: Variable) -> bool:
+        """Whether the power of the lens is linear in a variable, with all that follows it, and is not constant."""
+        design = dataclasses.replace(self.design, variables=(variable.number,))
+        view = design.views[self.lens.current_configuration - 1]
+        numbers = 0.0, 1.0, variable.start
+        at_zero, at_one, here = (
+            -view.state(np.array([v])).gaussian(view.lens.primary_wavelength - 1).C for v in numbers
+        )
+        change = at_one - at_zero
+        off = here - (at_zero + variable.start * change)
+        return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(off) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_one))
+
+    @functools.cached_property
+    def _free(self) -> DesignVariables:
+        """The variables that are parameters, and the solve of the focal length."""
+        if self.held is None:
+            return self.design
+        solve = Solve(*self.held.by.address, "focal_length", (self.held.focal_length,))
+        free = tuple(variable.number for variable in self.variables)
+        return dataclasses.replace(self.design, variables=free, solves=(*self.design.solves, solve))
+
+    def _numbers(self) -> Tensor:
+        """The numbers (n,) of the variables that are parameters, which are tensors under functional_call."""
+        numbers = [variable.start + variable.unit * getattr(self, variable.name) for variable in self.variables]
+        return torch.stack(numbers) if numbers else self.lens.wavelengths.new_zeros(0)
 
     def forward(self) -> Lens:
         """The lens with the current values of its variables."""
-        lens = self._free()
-        return lens if self.held is None else _with_values(lens, [self.held.by], [self._solved(lens)])
-
-    def _free(self) -> Lens:
-        """The lens without its solved number."""
-        return _with_values(self._modelled, self.variables, [self.number(variable) for variable in self.variables])
-
-    def _solved(self, lens: Lens) -> Tensor:
-        """The solved number () of the lens with all others."""
-        at_zero, change = self._power(lens, self.held.by)
-        *_, index, _ = media(lens, lens.primary)
-        return (index.abs() / self.held.focal_length - at_zero) / change
+        return self._free.lens_at(self._numbers(), self._modelled)
 
     def _every(self) -> tuple[Variable, ...]:
         return self.variables if self.held is None else (*self.variables, self.held.by)
@@ -430,7 +431,8 @@ class Variables(Owned):
         """The lens (`identity.identity`), and each variable's number in it and unit."""
         starts = {variable.name: [variable.start, variable.unit] for variable in self._every()}
         held = None if self.held is None else ["efl", self.held.focal_length, self.held.by.name]
-        further = {"constraints": [*self.conditions]} if self.conditions else {}
+        further = {"constraints": [*self.conditions], "solves": [*map(str, self.design.solves)]}
+        further = {name: words for name, words in further.items() if words}
         return {**identity(self.lens), "variables": starts, "hold": held, **further}
 
     def difference(self, before: dict) -> str:
@@ -443,9 +445,10 @@ class Variables(Owned):
                 return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
             if not alike(before["hold"], now["hold"]):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
-            if before.get("constraints") != now.get("constraints"):
-                stored, current = (" ".join(one.get("constraints", ["none"])) for one in (before, now))
-                return f"variables with the constraints {stored}, not {current}"
+            for further, joint in (("constraints", " "), ("solves", ", ")):
+                if before.get(further) != now.get(further):
+                    stored, current = (joint.join(one.get(further, ["none"])) for one in (before, now))
+                    return f"variables with the {further} {stored}, not {current}"
             for name, pair in before["variables"].items():
                 if not alike(pair, now["variables"][name]):
                     return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
@@ -455,29 +458,24 @@ class Variables(Owned):
             return "a lens of a damaged identity"
         return ""
 
-    def number(self, variable: Variable) -> Tensor:
-        """The lens's number, 1/mm or mm."""
-        if self.held is not None and variable is self.held.by:
-            return self._solved(self._free())
-        return variable.start + variable.unit * getattr(self, variable.name)  # a tensor under functional_call
-
     @torch.no_grad()
     def numbers(self) -> dict[str, float]:
         """The number of every variable in the lens, by name."""
-        numbers = {variable.name: float(self.number(variable)) for variable in self._every()}
+        numbers = dict(zip((variable.name for variable in self.variables), self._numbers().tolist(), strict=True))
+        if self.held is not None:
+            numbers[self.held.by.name] = float(stored_number(self(), self.held.by.address))
         return {name: numbers[name] for name in self.names}
 
-    @torch.no_grad()
     def beyond(self) -> str:
         """Why the solved number is beyond its bounds; "" where it is not."""
         if self.held is None:
             return ""
-        value, (low, high) = float(self.number(self.held.by)), self._range()
+        value, (low, high) = self.numbers()[self.held.by.name], self._range()
         return "" if low <= value <= high else f"{self.held.by.name} would be {value:.6g}, not from {low:g} to {high:g}"
 
     def _range(self) -> tuple[float, float]:
         """Bounds of the solved number; a thickness without any is at least 0."""
-        least = 0.0 if self.held.by.kind == "thickness" else -math.inf
+        least = 0.0 if self.held.by.number.quantity == "thickness" else -math.inf
         return self.bounds.get(self.held.by.name, (least, math.inf))
 
     @torch.no_grad()
@@ -504,9 +502,8 @@ class Variables(Owned):
                 self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
         self._before = self._values()
 
-    @torch.no_grad()
     def _values(self) -> np.ndarray:
-        return np.array([float(self.number(variable)) for variable in self._all])
+        return np.array([*self.numbers().values()])
 
     def _load_from_state_dict(self, *arguments) -> None:
         super()._load_from_state_dict(*arguments)
@@ -521,23 +518,22 @@ class Variables(Owned):
         words = [word for word in self.conditions if word not in ("buildable", "catalog")]
         words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
         try:
-            return conditions_in_unit(to(self._modelled, dtype=torch.float64, device="cpu"), words, 1.0)
+            return conditions_in_unit(self.design.lens, words, 1.0)
         except BadHold as error:
             raise BadVariables(str(error)) from error
 
     @functools.cached_property
     def _constraints(self) -> Constraints | None:
         """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
-        if not self.conditions and all(variable.kind in ("sensor", "aperture") for variable in self._all):
+        if not self.conditions and all(name in ("sensor", "aperture") for name in self.names):
             return None
-        lens, limits = to(self._modelled, dtype=torch.float64, device="cpu"), []
+        limits = []
         if "buildable" in self.conditions:
             limits.append(self._excess)
         if "catalog" in self.conditions:
             limits.append(self._glasses)
         return Constraints(
-            lens,
-            self._numbers,
+            self.design,
             self._held_to,
             unit=np.array([abs(variable.unit) for variable in self._all]),
             lower=self._ends[0],
@@ -548,11 +544,12 @@ class Variables(Owned):
     @functools.cached_property
     def _glasses(self) -> GlassLimits:
         """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
-        columns = [(one.surface, GLASS[one.kind]) if one.kind in GLASS else None for one in self._all]
+        numbers = self.design.variables
+        columns = [(one.surface, GLASS[one.quantity]) if one.quantity in GLASS else None for one in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
             raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
-        lens = to(self._modelled, dtype=torch.float64, device="cpu")
+        lens = self.design.lens
         pool = pool_of(lens, catalogs_of(lens, self.catalog))
         start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
         return GlassLimits(pool, start, columns)
@@ -570,8 +567,7 @@ class Variables(Owned):
         numbers = torch.tensor(x)
         with torch.set_grad_enabled(derivatives):
             numbers = with_tangents(numbers, torch.eye(len(x), dtype=numbers.dtype)) if derivatives else numbers
-            lens = to(self._modelled, dtype=torch.float64, device="cpu")
-            each = [*_shortfalls(_with_values(lens, self._all, numbers.unbind()), self.limits)]
+            each = [*_shortfalls(self.design.lens_at(numbers), self.limits)]
         excess = np.array([float(one.detach()) for one in each])
         if not derivatives:
             return excess, None
@@ -583,47 +579,46 @@ class Variables(Owned):
         total = violation(lens, self.limits)
         if self.held is None:
             return total
-        value, unit = number_at(lens.surfaces[self.held.by.surface], self.held.by.path), self.held.by.unit
+        value, unit = stored_number(lens, self.held.by.address), self.held.by.unit
         low, high = self._range()
         return total + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
 
 
-def _with_values(lens: Lens, variables: Sequence[Variable], values: Sequence[Tensor]) -> Lens:
-    """The lens with other numbers of variables."""
-    numbers = {variable.address: value for variable, value in zip(variables, values, strict=True)}
-    return with_numbers_of(lens, numbers, {variable.address: variable.path for variable in variables})
-
-
-def _named(lens: Lens, vary: str) -> tuple[tuple[Vary, ...], tuple[str, ...]]:
-    """The numbers of variable syntax, and the kind of each: its quantity, or "sensor". Raises BadVariables."""
-    kinds: dict[Vary, str] = {}
-    for word in split_words(vary):
-        if "=" in word:
-            raise BadVariables(f"{word!r}: solves and pickups are for optimize; name variables alone")
-        for one in varied(lens, word):
-            is_alone = one.surface or (one.surface, one.quantity) == APERTURE
-            if one.quantity == "glass" or one.operand is not None or not is_alone:
-                raise BadVariables(f"{word!r}: {name_of(one)} is a variable of optimize and jacobian alone")
-            kinds[one] = "sensor" if word == "sensor" else one.quantity
-    if not kinds:
+def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
+    """The variables, solves and pickups of variable syntax. Raises BadVariables for what a camera does not vary."""
+    if not split_words(vary):
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
-    return tuple(kinds), tuple(kinds.values())
+    design = design_variables(to(lens, dtype=torch.float64, device="cpu"), vary)
+    for one in design.variables:
+        if one.quantity == "glass" or (one.surface, one.quantity) == (0, "thickness"):
+            raise BadVariables(f"`vary={joined(vary)}`: {name_of(one)} is a variable of optimize and jacobian alone")
+    return design
 
 
-def _variable(lens: Lens, number: int, kind: str, quantity: str) -> Variable:
-    """A variable of a lens in which it is modelled. Raises BadVariables where it changes nothing.
+def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Variable, ...]:
+    """The variables of a design; the last thickness has the name of the word that names it last. Raises BadVariables
+    where one changes nothing."""
+    lens, last = design.lens, sensor(design.lens)
+    naming = [word for word in split_words(vary) if "=" not in word and Vary(last, "thickness") in varied(lens, word)]
+    names = [name_of(one) for one in design.variables]
+    if naming and naming[-1] == "sensor":
+        names = ["sensor" if name == f"thickness_{last}" else name for name in names]
+    numbers = zip(names, design.variables, design.start.tolist(), strict=True)
+    return tuple(Variable(name, one, start, _unit(lens, one, start)) for name, one, start in numbers)
+
+
+def _unit(lens: Lens, number: Vary, start: float) -> float:
+    """The unit of a variable of a lens in which it is modelled. Raises BadVariables where it changes nothing.
 
     Units of numbers of the shape follow from the first term of the series z ≈ c r²/2 + (1 + k) c³ r⁴/8 + … at the
     semi-diameter, or at the radius of the entrance pupil where the surface has none.
     """
-    if (number, quantity) == APERTURE:
-        start = float(lens.aperture.value)
-        return Variable(kind, number, start, _APERTURE * start, OF_LENS[APERTURE])
-    surface = lens.surfaces[number]
-    path = path_of(surface, quantity)
-    start = number_at(surface, path).detach()
+    quantity = number.quantity
+    if quantity == "aperture":
+        return _APERTURE * start
     if quantity in _UNITS:
-        return Variable(kind, number, float(start), _UNITS[quantity], path)
+        return _UNITS[quantity]
+    surface = lens.surfaces[number.surface]
     edge = surface.semi_diameter or float(first_order(lens).entrance_pupil_diameter) / 2
     if quantity == "curvature":
         moved = edge**2 / 2
@@ -632,15 +627,17 @@ def _variable(lens: Lens, number: int, kind: str, quantity: str) -> Variable:
     elif quantity.startswith("tilt_"):
         moved = math.radians(edge)
     else:
-        angle = torch.linspace(0, 2 * math.pi, 33, dtype=start.dtype, device=start.device)
+        path = path_of(surface, quantity)
+        held = number_at(surface, path).detach()
+        angle = torch.linspace(0, 2 * math.pi, 33, dtype=held.dtype, device=held.device)
         x, y = edge * torch.cos(angle), edge * torch.sin(angle)
         with torch.enable_grad():
-            moving = with_number(surface, path, with_tangents(start, torch.ones_like(start)[None]))
+            moving = with_number(surface, path, with_tangents(held, torch.ones_like(held)[None]))
             moved = float(tangents_of(sag_at(moving, x, y), 1).abs().max())
     if moved == 0:
         why = "is flat, and a conic constant" if quantity == "conic" else "has a number that"
-        raise BadVariables(f"'{kind}:{number}': the surface {why} changes nothing there")
-    return Variable(kind, number, float(start), 1 / moved, path)
+        raise BadVariables(f"'{quantity}:{number.surface}': the surface {why} changes nothing there")
+    return 1 / moved
 
 
 # -- variables of an element -------------------------------------------------------------------------------------------

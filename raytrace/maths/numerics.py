@@ -277,7 +277,10 @@ def divide(a, b):
 
 def select(condition, a, b):
     """a where a condition holds, else b: entry by entry of tensors, else one or the other number."""
-    return torch.where(condition, a, b) if isinstance(condition, Tensor) else a if condition else b
+    if not isinstance(condition, Tensor):
+        return a if condition else b
+    # Of two plain numbers torch.where makes a tensor of 32 bits.
+    return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64))
 
 
 def root(x):

@@ -166,6 +166,12 @@ def _angle(y, x):
     return _sum(torch.atan2(y, x), ((y, x / square), (x, -y / square)))
 
 
+def _signed(x, sign):
+    """The rule of |x| with the sign of another, of which it is no function between its jumps."""
+    value = torch.copysign(x, sign)
+    return _sum(value, ((x, torch.sign(x) * torch.sign(value)),)) if isinstance(x, MovingTensor) else value
+
+
 def _length_of_two(a, b):
     length = torch.hypot(a, b)
     safe = torch.where(length == 0, torch.ones_like(length), length)
@@ -631,6 +637,7 @@ _row(["__rpow__"], lambda a, b: _power(b, a))
 _row(["addcmul"], _add_product)
 _row(["atan2", "arctan2"], _angle)
 _row(["hypot"], _length_of_two)
+_row(["copysign"], _signed)
 _row(["maximum"], _extreme(torch.maximum))
 _row(["minimum"], _extreme(torch.minimum))
 _row(["max"], _chosen(torch.max))

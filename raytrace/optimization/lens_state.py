@@ -1,7 +1,8 @@
 """LensState: a lens in one configuration at given variables: its numbers, first-order data and rays, with derivatives.
 
-Numbers are plain, or dual (`maths.numerics`) where derivatives are computed; the formulas are the same. SOLVES computes
-the numbers of a lens that follow from others, at the primary wavelength; n is signed, ω = n u.
+Numbers are plain, or dual (`maths.numerics`) where derivatives are computed, or the tensors of
+`DesignVariables.lens_at`; the formulas are the same. SOLVES computes the numbers of a lens that follow from others, at
+the primary wavelength; n is signed, ω = n u.
 
 A `Bundle` launches and traces all rays of a merit function's rows in one pass. Rays start as in `tracing.launch`. Rays
 that depend on the lens only through its first-order data are launched and aimed in numpy: 126 rays and 21 variables
@@ -13,6 +14,7 @@ Ray aiming solves s(a, x) = p r(x) for the pupil points a, s the hit on the stop
 of the stop: by Newton's method from the last solution, and ∂a/∂x = (∂s/∂a)⁻¹ (p ∂r/∂x - ∂s/∂x).
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -21,17 +23,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.numerics import Dual, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.system.lens import Lens, index_behind, media
+from raytrace.system.lens import Lens, index_behind, media, per_lens
 from raytrace.system.optimization_data import Solve
+from raytrace.system.parameter_paths import with_numbers_of
 from raytrace.system.rays import Rays
-from raytrace.system.surface import is_flat, sag_at, signed, vertex_curvature
+from raytrace.system.surface import is_flat, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
 from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, semi_diameter_margin
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
-from raytrace.tracing.trace import aiming_of, ends, is_bent, pushed, pushed_everywhere, sequence_of, trace_surfaces
+from raytrace.tracing.trace import (
+    aiming_of,
+    ends,
+    is_bent,
+    pushed,
+    pushed_everywhere,
+    sequence_of,
+    trace_surfaces,
+    without_apertures,
+)
 
 
 def _marginal_ray_before(state, surface: int):
@@ -81,7 +93,7 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     ratio = N / torch.where(crosses, M, torch.ones_like(M))
     at = z.new_tensor(height)
     thickness = z + ratio * (at - y) - sag_at(lens.surfaces[k + 1], torch.zeros_like(at), at)
-    return torch.where(crosses, thickness, torch.nan).reshape(())
+    return torch.where(crosses, thickness, torch.nan)
 
 
 def _edge_thickness(state, solve: Solve):
@@ -91,7 +103,7 @@ def _edge_thickness(state, solve: Solve):
     def thickness(lens: Lens) -> list[Tensor]:
         at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
         near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
-        return [(edge - edge_thickness(0.0, near, far)).reshape(())]
+        return [edge - edge_thickness(0.0, near, far)]
 
     return state.through_torch(thickness)[0]
 
@@ -104,9 +116,9 @@ def semi_diameter(lens: Lens, k: int) -> Tensor:
     field = torch.stack([lens.fields.x, lens.fields.y])[:, None, :, None]
     points = lens.wavelengths.new_tensor(ENDS).T[:, None, None]
     rays = _behind(lens, k, field, vignette(lens, field, points), lens.wavelengths[:, None, None])
-    height = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0).amax().sqrt()
+    squares = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0)
     factor, length = semi_diameter_margin(lens, k)
-    return factor * height + length
+    return factor * per_lens(squares.amax((-3, -2, -1)).sqrt()) + length
 
 
 def _behind(lens: Lens, k: int, field: Tensor, pupil: Tensor, wavelength: Tensor) -> Rays:
@@ -128,6 +140,18 @@ def _position(state, solve: Solve):
     return solve.numbers[0] - sum(state.thickness[j] for j in others)
 
 
+def _focal_length(state, solve: Solve):
+    """v with φ(0) + v [φ(1) - φ(0)] = |n′|/f: by Gauss's brackets the power φ of a lens is linear in each curvature and
+    thickness v. It is finite where the lens is afocal."""
+    powers = []
+    for number in (0.0, 1.0):
+        state.numbers[solve.surface, solve.quantity] = number
+        state.forget()
+        powers.append(-state.gaussian(state.primary).C)
+    wanted = abs(state.index(state.primary)[-2]) / solve.numbers[0]
+    return (wanted - powers[0]) / (powers[1] - powers[0])
+
+
 #: The number of a state that a solve sets, by kind.
 SOLVES = {
     "pickup": _pickup,
@@ -137,27 +161,38 @@ SOLVES = {
     "edge_thickness": _edge_thickness,
     "power": _power,
     "position": _position,
+    "focal_length": _focal_length,
 }
 
 
 _PASSES = 60  # through solves that depend on one another
-_CONVERGED = 1e-15  # relative
+_CONVERGED = 5  # units of rounding
+_SLOPES = 1e-12  # relative to the largest derivative of a number
+_FREE = 1e-9  # |1 - ∂P/∂s| of solves that leave a number free
 
 #: What a state is made of; all else is computed of it.
 _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 
 
 class LensState:
-    """view: `variables.View`; variables: (n,) numbers, or a Dual of them."""
+    """view: `variables.View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
 
-    def __init__(self, view, variables):
-        self.view, self.lens, self.variables = view, view.lens, variables
+    lens: of tensors, that of the view in their dtype and on their device.
+    """
+
+    def __init__(self, view, variables, lens: Lens | None = None):
+        self.view, self.lens, self.variables = view, lens or view.lens, variables
         self.numbers: dict = {
             at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
             for at, (number, scale, offset) in view.variables.items()
         }
         self._kept: dict = {}
-        self._solve()
+        if view.solves:
+            self._solve()
+
+    @property
+    def is_of_tensors(self) -> bool:
+        return isinstance(self.variables, tuple)
 
     @property
     def count(self) -> int:
@@ -188,7 +223,7 @@ class LensState:
         """1/mm of every surface at its vertex, terms of r² included."""
         if self.view.is_plain:
             return [c + bend for c, bend in zip(self.curvature, self.view.further_power[0], strict=True)]
-        return self.through_torch(lambda lens: [vertex_curvature(surface).reshape(()) for surface in lens.surfaces])
+        return self.through_torch(lambda lens: [vertex_curvature(surface) for surface in lens.surfaces])
 
     def of_surfaces(self, quantity: str):
         """A number (S,) of all surfaces, of `View.of_surfaces`; 0 where a surface has none."""
@@ -225,23 +260,26 @@ class LensState:
         glasses, waves = self.view.glasses, self.lens.wavelengths
         moved = [at for addresses in glasses.values() for at in addresses]
         numbers = self.through_torch(
-            lambda lens: [n for k in glasses for n in index_behind(lens, k, waves)], only=moved
+            lambda lens: [index_behind(lens, k, wave) for k in glasses for wave in waves], only=moved
         )
         each = [numbers[k : k + len(waves)] for k in range(0, len(numbers), len(waves))]
-        return {surface: listed(indices, self.count) for surface, indices in zip(self.view.glasses, each, strict=True)}
+        each = each if self.is_of_tensors else [listed(indices, self.count) for indices in each]
+        return dict(zip(glasses, each, strict=True))
 
     def power(self, k: int, wavelength: int):
         """Power in 1/mm of a surface."""
+        if not self.view.is_plain:
+            return self.kept(_powers, wavelength)[k - 1]
         n = self.index(wavelength)
         return self.curvature[k] * (n[k] - n[k - 1]) + self.further_power(k, wavelength)
 
     def further_power(self, k: int, wavelength: int):
         """Power in 1/mm of a surface in addition to c Δn: of terms of r² and of a phase."""
-        bend, phase = self.view.further_power
-        if bend[k] == 0:
-            return phase[wavelength, k]
         n = self.index(wavelength)
-        return bend[k] * (n[k] - n[k - 1]) + phase[wavelength, k]
+        if not self.view.is_plain:
+            return self.power(k, wavelength) - self.curvature[k] * (n[k] - n[k - 1])
+        bend, phase = self.view.further_power
+        return bend[k] * (n[k] - n[k - 1]) + phase[wavelength, k] if bend[k] else phase[wavelength, k]
 
     def matrix(self, first: int, last: int, wavelength: int, *, to_next: bool = False):
         """(A, B, C, D) from the vertex of a surface, before it, to behind another, or to the vertex after that."""
@@ -295,7 +333,7 @@ class LensState:
     @property
     def object_distance(self):
         distance = self.thickness[0]
-        return np.finfo(float).tiny ** 0.5 if not isinstance(distance, Dual) and distance == 0 else distance
+        return np.finfo(float).tiny ** 0.5 if isinstance(distance, float) and distance == 0 else distance
 
     @cached_property
     def entrance_pupil_diameter(self):
@@ -310,7 +348,9 @@ class LensState:
         kind, number = self.lens.aperture.kind, self.number(0, "aperture")
         if kind not in CONES:
             return None
-        return np.tan(np.arcsin(number / self.index(self.primary)[0]) if kind == "object_na" else np.deg2rad(number))
+        number = number / self.index(self.primary)[0] if kind == "object_na" else number
+        of = torch if isinstance(number, Tensor) else np
+        return of.tan(of.arcsin(number) if kind == "object_na" else of.deg2rad(number))
 
     @cached_property
     def marginal_height(self):
@@ -323,21 +363,66 @@ class LensState:
 
     def _solve(self) -> None:
         """Solves and pickups in the order of surfaces, repeated until they converge where one depends on later ones."""
-        solves = self.view.solves
-        if not solves:
-            return
-        self.numbers |= {(one.surface, one.quantity): self.view.stored[one.surface, one.quantity] for one in solves}
-        for _ in range(_PASSES):
-            before = dict(self.numbers)
-            for one in solves:
-                self.numbers[one.surface, one.quantity] = SOLVES[one.kind](self, one)
-                self._forget()
-            pairs = ((value_of(number), value_of(before[at])) for at, number in self.numbers.items())
-            moved = (abs(a - b) / max(abs(a), abs(b), 1e-300) if a != b else 0.0 for a, b in pairs)
-            if not self.view.waits or all(step <= _CONVERGED for step in moved):
-                break
+        stored = [self.view.stored[one.surface, one.quantity] for one in self.view.solves]
+        if not self.view.waits:
+            self._passed(stored)
+        elif self.is_of_tensors:
+            self._solve_tensors(stored)
+        else:
+            self._settled(stored)
 
-    def _forget(self) -> None:
+    def _passed(self, solved: Sequence) -> list:
+        """What a pass through all solves makes of their numbers."""
+        passed = []
+        self._take(solved)
+        for one in self.view.solves:
+            passed.append(SOLVES[one.kind](self, one))
+            self.numbers[one.surface, one.quantity] = passed[-1]
+            self.forget()
+        return passed
+
+    def _settled(self, solved: Sequence) -> Sequence:
+        """The numbers of the solves that a pass does not change, with their derivatives."""
+        for _ in range(_PASSES):
+            before, solved = solved, self._passed(solved)
+            if all(map(_is_settled, solved, before)):
+                break
+        return solved
+
+    def _solve_tensors(self, stored: Sequence) -> None:
+        """The numbers s = P(s, x) of solves, P a pass through all of them, with derivatives of any number of variables.
+
+        Passes without derivatives come to s. From there a step of Newton's method has the first derivatives of s by x,
+        ds/dx = (1 - ∂P/∂s)⁻¹ ∂P/∂x, and a second step the second ones.
+        """
+        ats = [(one.surface, one.quantity) for one in self.view.solves]
+
+        def passed(state: LensState, solved: Tensor) -> Tensor:
+            state._passed(solved.unbind())
+            return torch.stack([state.tensors[at].expand(solved.shape[1:]) for at in ats])
+
+        still = copy.copy(self)
+        still._kept, still.numbers = {}, {at: number.detach() for at, number in self.numbers.items()}
+        with torch.no_grad():
+            still._settled(stored)
+        solved = torch.stack(torch.broadcast_tensors(*(still.tensors[at] for at in ats)))
+        unit = torch.eye(len(ats), dtype=solved.dtype, device=solved.device)
+        units = unit.reshape(*unit.shape, *[1] * (solved.dim() - 1)).expand(-1, *solved.shape)
+        with torch.enable_grad():
+            slopes = tangents_of(passed(still, with_tangents(solved, units)), len(ats))
+        matrix = unit - slopes.movedim((0, 1), (-1, -2))
+        is_free = torch.linalg.det(matrix).abs()[..., None, None] < _FREE
+        inverse = torch.linalg.inv(torch.where(is_free, unit, matrix)).movedim((-2, -1), (0, 1))
+        for _ in range(2):
+            solved = solved + (inverse * (passed(self, solved) - solved)).sum(1)
+        self._take(solved.unbind())
+
+    def _take(self, solved: Sequence) -> None:
+        """Other numbers of the solves."""
+        self.numbers |= {(one.surface, one.quantity): n for one, n in zip(self.view.solves, solved, strict=True)}
+        self.forget()
+
+    def forget(self) -> None:
         """Drop all results of numbers that have changed."""
         for name in vars(self).keys() - _GIVEN:
             del vars(self)[name]
@@ -350,12 +435,15 @@ class LensState:
     ) -> list:
         """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
-        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on.
+        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on. Of
+        tensors it has none, and all numbers.
         """
         view = self.view.clipping if clips else self.view
+        if self.is_of_tensors:
+            return [*function(with_numbers_of(without_apertures(self.lens), self.tensors, view.places))]
         with torch.set_grad_enabled(self.count > 0):
             leaves = {at: _tensor(self.numbers[at]).requires_grad_() for at in only or self.numbers}
-            numbers = function(view.held(leaves))
+            numbers = [number.reshape(()) for number in function(view.held(leaves))]
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
     def _chained(self, number: Tensor, leaves: dict) -> Dual:
@@ -369,16 +457,21 @@ class LensState:
                     slope = slope + float(derivative) * moved.slope
         return Dual(value, slope)
 
-    def moving_lens(self, *, clips: bool = False) -> Lens:
-        """The lens, whose numbers carry their derivatives by all variables: of many numbers in one forward pass.
-
-        clips: whether the lens has its apertures.
-        """
+    @property
+    def tensors(self) -> dict:
+        """The numbers as tensors, by address; dual ones carry their derivatives by all variables."""
+        if self.is_of_tensors:
+            like = self.lens.wavelengths
+            return {at: n if isinstance(n, Tensor) else like.new_tensor(n) for at, n in self.numbers.items()}
         numbers = {at: _tensor(number) for at, number in self.numbers.items()}
-        if self.count:
-            slopes = {at: torch.tensor(slope_of(number, self.count)) for at, number in self.numbers.items()}
-            numbers = {at: with_tangents(number, slopes[at]) for at, number in numbers.items()}
-        return (self.view.clipping if clips else self.view).held(numbers)
+        if not self.count:
+            return numbers
+        slopes = {at: torch.tensor(slope_of(number, self.count)) for at, number in self.numbers.items()}
+        return {at: with_tangents(number, slopes[at]) for at, number in numbers.items()}
+
+    def moving_lens(self) -> Lens:
+        """The lens, whose numbers carry their derivatives by all variables: of many numbers in one forward pass."""
+        return self.view.held(self.tensors)
 
     def each_through_torch(self, function: Callable, arrays: Sequence):
         """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
@@ -396,6 +489,30 @@ class LensState:
 def _tensor(number) -> Tensor:
     """The value () of a number."""
     return torch.tensor(float(value_of(number)), dtype=torch.float64)
+
+
+def _is_settled(number, before) -> bool:
+    """Whether a number of a solve, with its derivatives, is that before a pass, but for rounding."""
+    a, b = value_of(number), value_of(before)
+    if isinstance(a, Tensor):
+        return not is_any((a != b) & ~((a - b).abs() <= _CONVERGED * torch.finfo(a.dtype).eps * a.abs()))
+    if a != b and not abs(a - b) <= _CONVERGED * np.finfo(float).eps * abs(a):
+        return False
+    if not isinstance(number, Dual):
+        return True
+    change = np.abs(number.slope - slope_of(before, len(number.slope)))
+    return bool((change <= _SLOPES * np.abs(number.slope).max(initial=0.0)).all())
+
+
+def _powers(state: LensState, wavelength: int) -> list:
+    """Powers in 1/mm of the surfaces from 1 to that before the image, of any kind of number that varies."""
+
+    def powers(lens: Lens) -> list[Tensor]:
+        at, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
+        n = signed(surfaces, media(lens, at)[:-1])
+        return [power(*part, at) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
+
+    return state.through_torch(powers)
 
 
 def _gaussian(state: LensState, wavelength: int) -> Gaussian:

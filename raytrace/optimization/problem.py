@@ -24,6 +24,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from raytrace.analysis.chief import SAMPLES
@@ -477,8 +478,7 @@ class FunctionMerit:
     def __init__(
         self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()
     ):
-        self.view = model.views[model.lens.current_configuration - 1]
-        self.function, self.evaluations, self.evaluated = function, 0, [*evaluated]
+        self.model, self.function, self.evaluations, self.evaluated = model, function, 0, [*evaluated]
         self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -487,9 +487,13 @@ class FunctionMerit:
         x = np.array(x, dtype=float)
         if (known := self.known.get(x.tobytes())) is not None:
             return float(known[len(x)]), known[len(x) + 1 :].copy()
-        state = self.view.state(Dual(x, np.eye(len(x))))
-        (merit,) = state.through_torch(lambda lens: [self.function(lens).reshape(())], clips=True)
-        value, slope = float(value_of(merit)), slope_of(merit, len(x))
+        variables = torch.tensor(x, requires_grad=True)
+        with torch.enable_grad():
+            merit = self.function(self.model.lens_at(variables)).reshape(())
+        slope = np.zeros(len(x))
+        if merit.requires_grad:
+            slope = torch.autograd.grad(merit, variables, materialize_grads=True)[0].numpy()
+        value = float(merit.detach())
         self.evaluated.append(np.array([*x, value, *slope]))
         return value, slope
 

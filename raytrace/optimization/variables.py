@@ -38,8 +38,8 @@ from raytrace.materials.glass import (
 )
 from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.optimization.lens_state import LensState
-from raytrace.system.configurations import Operand, ScaledPath, same
-from raytrace.system.lens import Lens, is_round_about_axis, media, with_environment
+from raytrace.system.configurations import Operand, ScaledPath, same, with_entry
+from raytrace.system.lens import Lens, is_round_about_axis, media, per_lens, with_environment
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     GLASS,
@@ -133,30 +133,34 @@ class DesignVariables:
     @cached_property
     def start(self) -> np.ndarray:
         """The current variables (n,)."""
-        numbers = []
-        for one in self.variables:
-            if one.operand is not None:
-                numbers.append(float(self.lens.operands[one.operand].numbers[one.configuration - 1]))
-                continue
-            stored = stored_number(self.lens, (one.surface, one.quantity))
-            numbers.append(0.0 if stored is None else float(stored))
-        return np.array(numbers)
+        return np.array(
+            [
+                _plain(self.lens, (one.surface, one.quantity))
+                if one.operand is None
+                else float(self.lens.operands[one.operand].numbers[one.configuration - 1])
+                for one in self.variables
+            ]
+        )
 
-    def lens_at(self, variables: np.ndarray) -> Lens:
-        """The lens with its variables there, and with all that follows from them."""
-        lens = self.lens
-        like = lens.wavelengths
-        operands = list(lens.operands)
-        for configuration in range(1, len(self.lens.configurations) + 1) if operands else ():
+    def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
+        """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+
+        lens: this one in another dtype or on another device, those of the variables.
+
+        Differentiable to first and second order by tensors: by their graph, by transforms of torch.func, and by
+        tensors that carry derivatives (`maths.tangents`). Numbers of L lenses are (L, 1, 1, 1), as of `perturbed`.
+        """
+        lens = lens or self.lens
+        if not isinstance(variables, Tensor):
+            variables = lens.wavelengths.new_tensor(variables, dtype=torch.float64)
+        each, operands = tuple(map(per_lens, variables.unbind(-1))), list(lens.operands)
+        for configuration in range(1, len(lens.configurations) + 1) if operands else ():
             for k, (variable, scale, offset) in followed(self, configuration).items():
-                numbers = operands[k].numbers.clone()
-                numbers[configuration - 1] = scale * float(variables[variable]) + offset
+                numbers = with_entry(operands[k].numbers, (configuration - 1,), scale * each[variable] + offset)
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
-        lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
-        current = self.views[lens.current_configuration - 1]
-        numbers = current.state(np.asarray(variables, dtype=float)).numbers
-        there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
-        return with_numbers_of(lens, there)
+        view = self.views[lens.current_configuration - 1]
+        lens = dataclasses.replace(lens, operands=tuple(operands))
+        return with_numbers_of(lens, LensState(view, each, lens).tensors, view.places)
 
 
 def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> DesignVariables:
@@ -526,9 +530,6 @@ def split_constraint(word: str) -> tuple[str, int, str, str]:
 
 # -- the lens as a function of its variables ---------------------------------------------------------------------------
 
-#: Numbers that a surface keeps at 0 as None.
-_AT_ZERO = ("curvature", "conic")
-
 #: Power of length of what a pickup between configurations adds.
 _POWERS = {"thickness": 1, "curvature": -1}
 
@@ -557,10 +558,14 @@ class View:
         self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
         moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
-        self.lens = _modelled(lens, self.moved)
+        surfaces = list(lens.surfaces)
+        for surface, quantity in self.moved:
+            surfaces[surface] = modelled(surfaces[surface], quantity)
+        self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
-        self._held = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
+        #: Where the lens holds the numbers that move.
+        self.places = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
@@ -583,6 +588,11 @@ class View:
                 return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
             if one.kind in ("power", "position"):
                 return one.source > one.surface
+            last = sensor(self.lens), "thickness"  # which changes no power
+            if one.kind == "focal_length":
+                return any((later.surface, later.quantity) != last for later in self.solves[position + 1 :])
+            if (one.surface, one.quantity) == last:
+                return False
             if one.kind == "edge_thickness":
                 shape = [
                     at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
@@ -597,8 +607,7 @@ class View:
 
     def number(self, at: Address) -> float:
         """A number of the lens as it is stored."""
-        held = stored_number(self.lens, at)
-        return 0.0 if held is None else float(held)
+        return _plain(self.lens, at)
 
     @cached_property
     def wavelengths(self) -> list[float]:
@@ -678,7 +687,7 @@ class View:
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
         """The lens with other numbers."""
-        return with_numbers_of(self.lens, numbers, self._held)
+        return with_numbers_of(self.lens, numbers, self.places)
 
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
@@ -698,6 +707,12 @@ class View:
 
     def state(self, variables) -> LensState:
         return LensState(self, variables)
+
+
+def _plain(lens: Lens, at: Address) -> float:
+    """A number of a lens as it is stored, 0 where it is not modelled."""
+    number = stored_number(lens, at)
+    return 0.0 if number is None else float(number)
 
 
 def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
@@ -758,13 +773,3 @@ def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
         moved |= {(one.surface, name) for name in names}
         found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
     return found
-
-
-def _modelled(lens: Lens, moved: Sequence[Address]) -> Lens:
-    """The lens with what moves modelled, also where it is 0 now."""
-    surfaces = list(lens.surfaces)
-    for surface, quantity in moved:
-        if quantity in _AT_ZERO and getattr(surfaces[surface], quantity) is None:
-            zero = torch.zeros_like(surfaces[surface].thickness)
-            surfaces[surface] = dataclasses.replace(surfaces[surface], **{quantity: zero})
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))

@@ -175,7 +175,7 @@ def taken(operand: Operand, lens: Whole, k: int) -> Operand:
     parts = tuple(part(lens, scaled.path) for scaled in operand.paths)
     if operand.numbers is not None:
         number = torch.zeros_like(operand.numbers[k]) if parts[0] is None else parts[0]
-        return dataclasses.replace(operand, numbers=_with_entry(operand.numbers, (k,), number))
+        return dataclasses.replace(operand, numbers=with_entry(operand.numbers, (k,), number))
     if operand.media:
         return dataclasses.replace(operand, media=(*operand.media[:k], parts[0], *operand.media[k + 1 :]))
     return dataclasses.replace(operand, words=(*operand.words[:k], parts, *operand.words[k + 1 :]))
@@ -202,7 +202,7 @@ def with_part(whole: Whole, path: Path, new, *, like=None) -> Whole:
         is_short = isinstance(whole, Tensor)
         whole = torch.cat([whole, whole.new_zeros(len(like) - len(whole))]) if is_short else like
     if isinstance(whole, Tensor):
-        return _with_entry(whole, step, new)
+        return with_entry(whole, step, new)
     inner = with_part(part(whole, (step,)), tuple(rest), new, like=part(like, (step,)))
     if isinstance(step, str):
         return dataclasses.replace(whole, **{step: inner})
@@ -244,8 +244,14 @@ def same(one, other) -> bool:
     return one == other
 
 
-def _with_entry(numbers: Tensor, entry: tuple[int, ...], number: Tensor) -> Tensor:
-    """A copy of a tensor with another number at one entry."""
-    is_there = torch.zeros(numbers.shape, dtype=torch.bool, device=numbers.device)
+def with_entry(numbers: Tensor, entry: tuple[int, ...], number: Tensor) -> Tensor:
+    """A copy of a tensor with another number at one entry; numbers of L lenses (L, ...) have their axes behind it."""
+    spread = spread_for(numbers, number, len(entry))
+    is_there = torch.zeros(spread.shape, dtype=torch.bool, device=numbers.device)
     is_there[entry] = True
-    return torch.where(is_there, number, numbers)
+    return torch.where(is_there, number, spread)
+
+
+def spread_for(numbers: Tensor, number: Tensor, axes: int = 1) -> Tensor:
+    """Numbers with so many axes by themselves, and trailing ones for those of a number of L lenses."""
+    return numbers.reshape(*numbers.shape, *(1,) * (number.dim() + axes - numbers.dim()))

@@ -179,6 +179,11 @@ def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
     return _mapped(lens, align)
 
 
+def per_lens(number: Tensor) -> Tensor:
+    """A number of one lens (), or of L lenses (L,) as (L, 1, 1, 1)."""
+    return number.reshape(-1, 1, 1, 1) if number.dim() else number
+
+
 def one_lens(lens: "Lens", number: int | slice | Tensor) -> "Lens":
     """Lens `number` of a batch, from 0; of a slice or of a tensor of numbers, a batch of them.
 

@@ -50,6 +50,7 @@ class Solve:
     "position": the thickness by which those from surface `source` to this one have the sum numbers[0] mm; of a `source`
         behind this surface, those from this one up to it.
     "power": the curvature by which the surface has the power numbers[0], in 1/mm.
+    "focal_length": the curvature, or thickness, with which the lens has the effective focal length numbers[0] mm.
 
     "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, value
+from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
@@ -160,12 +160,12 @@ def jacobian(
                 + (did_you_mean(of, known) if isinstance(of, str) else "")
             )
         errors = 0 if perturbation is None else len(perturbation.rows)
-        moving = moving_lens(model, further=errors)
-        if perturbation is not None:
-            count = len(model.variables) + errors
-            zero = lens.wavelengths.new_zeros(errors)
-            moving = perturbation(with_tangents(zero, torch.eye(count, dtype=zero.dtype)[:, count - errors :]), moving)
-        quantity, derivatives = derivatives_of(function, moving, len(model.variables) + errors)
+        start = torch.from_numpy(np.append(model.start, np.zeros(errors)))
+        at = with_tangents(start, torch.eye(len(start), dtype=start.dtype))
+        with torch.enable_grad():
+            moving = model.lens_at(at[: len(model.variables)])
+            moving = moving if perturbation is None else perturbation(at[len(model.variables) :], moving)
+        quantity, derivatives = derivatives_of(function, moving, len(start))
     rows = () if perturbation is None else Tolerances(perturbation.rows).labels
     return Jacobian(
         quantity,
@@ -185,15 +185,6 @@ def _perturbation(
     if tolerances is None and not (grade or limits):
         return None
     return Perturbation(lens, tolerances_of(lens, limits, grade=grade) if tolerances is None else tolerances)
-
-
-def moving_lens(model: DesignVariables, *, further: int = 0) -> Lens:
-    """The lens at its own variables, whose numbers carry their derivatives by all of them.
-
-    further: derivatives that follow, of which its numbers have none.
-    """
-    view, count = model.views[model.lens.current_configuration - 1], len(model.start)
-    return view.state(Dual(model.start, np.eye(count + further, count))).moving_lens(clips=True)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ from torch import Tensor
 from raytrace.materials.glass import has_abbe_number, is_air
 from raytrace.maths.numerics import in_transform
 from raytrace.system import configurations
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, per_lens
 from raytrace.system.optimization_data import Solve
 from raytrace.system.parameter_paths import ParameterPath, modelled, number_at, parameter_paths, with_number
 from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, rows_of_both, undone
@@ -80,7 +80,7 @@ class Perturbation:
         if errors.dim() not in (1, 2) or errors.shape[-1] != len(rows):
             shape, count = tuple(errors.shape), len(rows)
             raise BadTolerance(f"errors of shape {shape}: expected ({count},), an error for each row, or (L, {count})")
-        values = [_per_lens(error) for error in errors.unbind(-1)]
+        values = [per_lens(error) for error in errors.unbind(-1)]
         pairs = list(zip(rows, values, strict=True))
         gauges = _gauges(lens, pairs, self.wavelength, self.radii)
         start = with_operands(lens, [pair for pair in pairs if pair[0].kind == "operand"])
@@ -100,11 +100,6 @@ class Perturbation:
             numbers[k] = dataclasses.replace(numbers[k], thickness=surface.thickness)
         operands = _operands(start, tuple(numbers), moved)
         return dataclasses.replace(start, surfaces=tuple(surfaces), operands=operands)
-
-
-def _per_lens(number: Tensor) -> Tensor:
-    """A number of one lens (), or of L lenses (L,) as (L, 1, 1, 1)."""
-    return number.reshape(-1, 1, 1, 1) if number.dim() else number
 
 
 # -- numbers ----------------------------------------------------------------------------------------------------------
@@ -340,14 +335,9 @@ def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Ten
 
 
 def _raised(operand: configurations.Operand, row: Tolerance | Compensator, value: Tensor) -> configurations.Operand:
-    one = torch.zeros_like(operand.numbers)
-    one[row.configuration - 1] = 1.0
-    return dataclasses.replace(operand, numbers=_spread(operand.numbers, value) + _spread(one, value) * value)
-
-
-def _spread(numbers: Tensor, value: Tensor) -> Tensor:
-    """Numbers (C, ...) with trailing axes for those of a value."""
-    return numbers.reshape(*numbers.shape, *(1,) * (value.dim() + 1 - numbers.dim()))
+    k = row.configuration - 1
+    numbers = configurations.with_entry(operand.numbers, (k,), operand.numbers[k] + value)
+    return dataclasses.replace(operand, numbers=numbers)
 
 
 def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[int, int]]) -> tuple:
@@ -370,7 +360,7 @@ def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[in
         old, new = (None, None) if path is None else (configurations.part(one, path) for one in (lens, changed))
         if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old and not isinstance(path[-1], tuple):
             step = (new - old) / operand.paths[0].factor
-            operand = dataclasses.replace(operand, numbers=_spread(operand.numbers, step) + step)
+            operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
         found.append(operand)
     return tuple(found)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
 from raytrace.system import configurations
-from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis
+from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis, per_lens
 from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
@@ -256,10 +256,7 @@ def is_plain_sensor(surface: Surface) -> bool:
 
 def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tensor) -> Lens:
     """The lens with compensators moved by (C,), or L lenses with those moved by (L, C)."""
-    pairs = [
-        (one, change.reshape(-1, 1, 1, 1) if change.dim() else change)
-        for one, change in zip(compensators, changes.unbind(-1), strict=True)
-    ]
+    pairs = [*zip(compensators, map(per_lens, changes.unbind(-1)), strict=True)]
     lens = with_operands(lens, [pair for pair in pairs if pair[0].operand is not None])
     surfaces = list(lens.surfaces)
     for one, change in (pair for pair in pairs if pair[0].operand is None):
