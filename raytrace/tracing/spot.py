@@ -200,7 +200,7 @@ def arrivals(
     helps = "ask for fewer, or by `rays`, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
     size = piece(RAY_BYTES * F * W * P)  # lenses at once; fields, where those of one lens are more than a chunk
-    lenses = [lens] if L <= size else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]
+    lenses = [lens] if size >= L else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]
     some_fields = fields.split(piece(min(L, size) * RAY_BYTES * W * P), 1)
     each = []  # of every chunk, rays (3, F, W, P) on the sensor, whether they reach it, and their status if one fails
     for some, part in progress([(some, part) for some in some_fields for part in lenses]):
