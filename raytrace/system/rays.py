@@ -45,11 +45,12 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
     axes = max(position.dim(), direction.dim()) - 1
     position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
     farthest, largest = (vector.detach().abs().amax(0) for vector in (position, direction))
-    usable = (farthest < torch.inf) & (largest > 0) & (largest < torch.inf)
+    directed = (largest > 0) & (largest < torch.inf)
+    usable = (farthest < torch.inf) & directed
     axis = direction.new_tensor([0.0, 0.0, 1.0]).reshape(3, *(1,) * axes)
     return Rays(
         position=torch.where(usable, position, 0.0),
-        direction=unit(torch.where(usable, direction, axis)),
+        direction=torch.where(usable, unit(torch.where(directed, direction, axis)), axis),
         valid=usable,
         opl=opl if opl is None else torch.where(usable, opl, 0.0),
     )
