@@ -256,7 +256,7 @@ def rays_behind(view, k: int, pupil):
     """Rays of pupil points (2, P) behind surface k."""
     lens = aligned(view.lens, 3)
     rays = launch(lens, pupil, fields=view.fields, wavelengths=view.wavelengths)
-    return rays_at(lens, rays, view.wavelengths[:, None], (k,))[0]
+    return rays_at(lens, view.wavelengths[:, None], (k,))(rays)[0]
 
 
 def window(view, pitch=0.002, size=15):

@@ -184,7 +184,7 @@ class Sensor:
             wavelength, fields, known = wavelengths_of(lens, wavelengths), fields[..., None], known[..., None]
         lens = aligned(lens, fields.dim() - 1)
         rays = rays_of_field(lens, fields, torch.zeros_like(fields), wavelength=wavelength)
-        (points,), arrives = points_at(lens, rays, wavelength, (len(lens.surfaces) - 1,))
+        (points,), arrives = points_at(lens, wavelength, (len(lens.surfaces) - 1,))(rays)
         return torch.where(arrives & known, points, torch.nan)
 
     # -- colours -------------------------------------------------------------------------------------------------------

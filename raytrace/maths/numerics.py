@@ -145,7 +145,7 @@ def unit(vector: Tensor) -> Tensor:
     A zero or non-finite vector comes back as NaN-free zeros, which callers flag by `norm == 0`.
     """
     largest = vector.detach().abs().amax(0)
-    usable = (largest > 0) & torch.isfinite(largest)
+    usable = (largest > 0) & (largest < torch.inf)
     scaled = torch.where(usable, vector, 0.0) / torch.where(usable, largest, 1.0)
     norm = torch.sqrt(torch.where(usable, dot(scaled, scaled), 1.0))
     return scaled / norm

@@ -75,21 +75,19 @@ def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
     return torch.stack(terms)
 
 
-def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """∂Z/∂x and ∂Z/∂y, each (J, ...), at points (...).
+def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
+    """∂Z/∂x and ∂Z/∂y (2, J, ...) at points (...).
 
     ∇(P H) = H P' 4 (x, y) + P ∇H with d(x + iy)^|m| = |m| (x + iy)^(|m| - 1) (dx + i dy); P' by its recurrence.
     """
     t, pairs, known = 2 * (x * x + y * y) - 1, harmonics(orders, x, y), {}
-    along_x, along_y = [], []
+    at, terms = torch.stack([x, y]), []
+    turned = [(torch.stack([c, -s]), torch.stack([s, c])) for c, s in pairs]
     for n, m in orders:
-        size, (value, slope) = abs(m), jacobi(known, n, m, t, 1)
-        c, s = pairs[max(size - 1, 0)]
-        by_x, by_y = (c, -s) if m >= 0 else (s, c)
-        bent = 4 * slope * pairs[size][0 if m >= 0 else 1]
-        along_x.append(norm(n, m) * (bent * x + size * value * by_x))
-        along_y.append(norm(n, m) * (bent * y + size * value * by_y))
-    return torch.stack(along_x), torch.stack(along_y)
+        size, place, (value, slope) = abs(m), 0 if m >= 0 else 1, jacobi(known, n, m, t, 1)
+        by = turned[max(size - 1, 0)][place]
+        terms.append(norm(n, m) * (4 * slope * pairs[size][place] * at + size * value * by))
+    return torch.stack(terms, 1)
 
 
 def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -167,17 +165,20 @@ def jacobi(
     k, odd = divmod(n - abs(m), 2)
     if k < 0 or odd:
         raise ValueError(f"no Zernike polynomial has n = {n}, m = {m}: n - |m| must be even and not negative")
-    m, zero = abs(m), torch.zeros_like(t)
-    rows = known.setdefault(m, [(torch.ones_like(t), zero, zero)[: highest + 1]])
+    m, rows = abs(m), known.setdefault(abs(m), [])
     for i in range(len(rows), k + 1):
-        if i == 1:
-            rows.append((0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), zero)[: highest + 1])
+        if i < 2:
+            linear = 0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), torch.zeros_like(t)
+            rows.append((linear if i else (torch.ones_like(t), linear[2], linear[2]))[: highest + 1])
             continue
-        a, before, last = 2 * i + m, rows[-2], rows[-1]
-        factor, row = a * (a - 2) * t - m * m, []
-        for order, (p, q) in enumerate(zip(last, before, strict=True)):
-            lead = factor * p if order == 0 else factor * p + order * a * (a - 2) * last[order - 1]
-            row.append(((a - 1) * lead - 2 * (i - 1) * (i + m - 1) * a * q) / (2 * i * (i + m) * (a - 2)))
+        # P_i = (α t + β) P_(i-1) - γ P_(i-2)
+        a, last, row = 2 * i + m, rows[-1], []
+        whole = 2 * i * (i + m) * (a - 2)
+        lead, back = (a - 1) * a * (a - 2) / whole, 2 * (i - 1) * (i + m - 1) * a / whole
+        factor = lead * t - (a - 1) * m * m / whole
+        for order, (p, q) in enumerate(zip(last, rows[-2], strict=True)):
+            new = factor * p if order == 0 else torch.add(factor * p, last[order - 1], alpha=order * lead)
+            row.append(torch.sub(new, q, alpha=back))
         rows.append(tuple(row))
     return rows[k]
 

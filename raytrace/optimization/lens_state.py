@@ -25,13 +25,13 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.system.lens import Lens, index_behind, media, per_lens
+from raytrace.system.lens import Lens, index_behind, media
 from raytrace.system.optimization_data import Solve
 from raytrace.system.parameter_paths import with_numbers_of
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_flat, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of
-from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, semi_diameter_margin
+from raytrace.tracing.geometry import edge_thickness, semi_diameter
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import (
@@ -40,6 +40,7 @@ from raytrace.tracing.trace import (
     is_bent,
     pushed,
     pushed_everywhere,
+    rays_at,
     sequence_of,
     trace_surfaces,
     without_apertures,
@@ -87,7 +88,8 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     """t = z + (N/M)(h - y) - z′(h) with which a real axial ray meets the next surface at the height h, or nan."""
     k, (height, part) = solve.surface, solve.numbers
     like = lens.wavelengths
-    rays = _behind(lens, k, like.new_zeros(2), like.new_tensor([0.0, part]), lens.primary)
+    rays = rays_of_field(lens, like.new_zeros(2), like.new_tensor([0.0, part]), wavelength=lens.primary)
+    (rays,) = rays_at(lens, lens.primary, (k,))(rays)
     (_, y, z), (_, M, N) = rays.position, rays.direction
     crosses = rays.valid & (M != 0)
     ratio = N / torch.where(crosses, M, torch.ones_like(M))
@@ -106,25 +108,6 @@ def _edge_thickness(state, solve: Solve):
         return [edge - edge_thickness(0.0, near, far)]
 
     return state.through_torch(thickness)[0]
-
-
-def semi_diameter(lens: Lens, k: int) -> Tensor:
-    """mm, as `tracing.geometry.semi_diameters`, with derivatives: fixed, or the extent of the rays with its margin."""
-    fixed = fixed_semi_diameters(lens)
-    if k in fixed:
-        return lens.wavelengths.new_tensor(fixed[k])
-    field = torch.stack([lens.fields.x, lens.fields.y])[:, None, :, None]
-    points = lens.wavelengths.new_tensor(ENDS).T[:, None, None]
-    rays = _behind(lens, k, field, vignette(lens, field, points), lens.wavelengths[:, None, None])
-    squares = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0)
-    factor, length = semi_diameter_margin(lens, k)
-    return factor * per_lens(squares.amax((-3, -2, -1)).sqrt()) + length
-
-
-def _behind(lens: Lens, k: int, field: Tensor, pupil: Tensor, wavelength: Tensor) -> Rays:
-    """Rays behind surface k, in the axes of its vertex."""
-    rays = rays_of_field(lens, field, pupil, wavelength=wavelength)
-    return trace_surfaces(sequence_of(lens)[:k], rays, indices=media(lens, wavelength)[: k + 1], wavelength=wavelength)
 
 
 def _power(state, solve: Solve):

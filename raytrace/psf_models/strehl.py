@@ -182,8 +182,11 @@ def _dense(scene: Scene, front: Wavefront, series: Tensor, orders: Sequence, rin
     harmonic = (of_term == every).to(series).T  # (J, 2 N + 1)
     cosine, sine = torch.cos(every.abs() * angle), torch.sin(every.abs() * angle)
     along, across = torch.where(every < 0, sine, cosine), torch.where(every < 0, cosine, -sine) * every.abs()
-    plain, zero = [(n, abs(m)) for n, m in orders], torch.zeros_like(radius)
-    values, slopes = zernike.polynomials(plain, radius, zero).T, zernike.gradients(plain, radius, zero)[0].T
+    plain, zero = [(n, m) for n, m in orders if m >= 0], torch.zeros_like(radius)  # the same along the radius as of -m
+    places = [plain.index((n, abs(m))) for n, m in orders]
+    values, slopes = (
+        part[places].T for part in (zernike.polynomials(plain, radius, zero), zernike.gradients(plain, radius, zero)[0])
+    )
     by_harmonic = (series[..., None, :] * values) @ harmonic  # (3, D, F, W, rings, 2 N + 1)
     W, L, M = (by_harmonic @ along).flatten(-2)
     by_r = (series[1:, ..., None, :] * slopes) @ harmonic @ along

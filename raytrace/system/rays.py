@@ -44,8 +44,9 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
     """
     axes = max(position.dim(), direction.dim()) - 1
     position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
-    directed = torch.isfinite(direction).all(0) & (direction != 0).any(0)
-    usable = torch.isfinite(position).all(0) & directed
+    farthest, largest = (vector.detach().abs().amax(0) for vector in (position, direction))
+    directed = (largest > 0) & (largest < torch.inf)
+    usable = (farthest < torch.inf) & directed
     axis = direction.new_tensor([0.0, 0.0, 1.0]).reshape(3, *(1,) * axes)
     return Rays(
         position=torch.where(usable, position, 0.0),

@@ -165,8 +165,8 @@ class AsBuiltTerm:
                 self.lenses(state.moving_lens(), self.errors), self.sampling.points, fields=self.sampling.fields
             )
             offsets = factor * self._offsets(rays.position, rays.direction, rays.valid).reshape(-1)
-        slopes = tangents_of(offsets, state.count).numpy().T if state.count else None
-        return value_of(offsets).numpy(), slopes, int((~rays.valid).sum())
+        slopes = tangents_of(offsets, state.count).detach().numpy().T if state.count else None
+        return value_of(offsets).detach().numpy(), slopes, int((~rays.valid).sum())
 
 
 def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:

@@ -16,9 +16,9 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import broadcast_shape, in_transform, is_any, safe_divide, varies, with_batch_axes
 from raytrace.maths.sampling import gauss_rings
 from raytrace.maths.tangents import values_alone
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, batch_shape
 from raytrace.system.rays import Rays
-from raytrace.tracing.trace import at_stop, points_at
+from raytrace.tracing.trace import points_at
 
 _STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
 _STEPS = 8  # Newton steps at each stage
@@ -50,9 +50,10 @@ def aim_at_stop(
     """
     pupil = with_batch_axes(pupil, radius.dim())  # the radius may have an axis of object distances that points lack
     target, first = turned(pupil), through((pupil[..., :1] if pupil.dim() > 1 else pupil).detach(), 1.0)
+    on_stop = points_at(lens, wavelength, (lens.stop,))
 
     def missed(aim: Tensor, fraction: float, target: Tensor = target) -> tuple[Tensor, Tensor]:
-        position, arrives = at_stop(lens, through(aim, fraction), wavelength)
+        (position,), arrives = on_stop(through(aim, fraction))
         return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
 
     def near() -> tuple[Tensor, Tensor]:
@@ -78,7 +79,9 @@ def aim_at_stop(
 
     of_one_pupil = broadcast_shape(first.shape, wavelength.shape)[-1:] == (1,) and pupil.shape[-1] >= _MANY
     given = lens, first, target, radius, wavelength
-    aim, found = _root(missed, pupil, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
+    batch = broadcast_shape(pupil.shape[1:], first.shape, wavelength.shape, batch_shape(lens))
+    start = pupil.detach().expand(2, *batch)
+    aim, found = _root(missed, start, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
     return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
 
 
@@ -90,8 +93,10 @@ def aim_at_middle(
     through(points): rays; size: () mm, the scale of the residual. Second derivatives are exact too.
     """
 
+    on_stop = points_at(lens, wavelength, (lens.stop,))
+
     def missed(point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
-        position, arrives = at_stop(lens, through(point), wavelength)
+        (position,), arrives = on_stop(through(point))
         return position / size, arrives
 
     root, found = _root(missed, start, origin=lambda start: start, given=(lens, through(start.detach()), size))
@@ -110,18 +115,20 @@ def aim_at_image(
     wavelength = lens.primary
     size = torch.linalg.vector_norm(height.detach(), dim=0)
     size = torch.where(size > 0, size, 1.0)
+    landing = points_at(lens, wavelength, (lens.stop, len(lens.surfaces) - 1))
 
     def missed(unknown: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
         pupil = torch.zeros_like(unknown[:2]) if radius is None else unknown[2:]
-        rays = through(unknown[:2], pupil)
-        (stop, image), arrives = points_at(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
+        (stop, image), arrives = landing(through(unknown[:2], pupil))
         off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
         if radius is not None:  # at the stop, chief rays of all heights may share one point
             off = torch.broadcast_tensors(*off, *(at / radius for at in stop))
         return torch.stack(off), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
-    given = lens, height, through(start[:2].detach(), torch.zeros_like(start[:2])), radius
+    first = through(start[:2].detach(), torch.zeros_like(start[:2]))
+    given = lens, height, first, radius
+    start = start.detach().expand(len(start), *broadcast_shape(first.shape, height.shape[1:], batch_shape(lens)))
     unknown, found = _root(missed, start, origin=torch.zeros_like, given=given)
     return torch.where(found, unknown[:2], 0.0), found
 
@@ -134,17 +141,14 @@ def _root(
     given: object,
     near: Callable[[], tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); origin: axial roots.
+    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); start: of every root;
+    origin: axial roots; given: all numbers on which the residuals depend.
 
     near: makes starts (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first.
     """
-    with torch.no_grad():
-        first = start[..., :1] if start.dim() > 1 else start  # one ray of the last axis shows the others
-        batch = broadcast_shape(start.shape[1:], residual(first, 1.0)[0].shape[1:])
-    start = torch.stack([part.expand(batch) for part in start.detach()])
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
     # Roots not found are evaluated on the axis, where every derivative is finite.
-    root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
+    root, found = origin(start), torch.zeros_like(start[0], dtype=torch.bool)
     last_step, close = torch.zeros_like(root), _CLOSE * tolerance
     searches = [partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES]
     if near is not None and not in_transform():

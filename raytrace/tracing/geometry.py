@@ -14,13 +14,14 @@ Frames: position and rotation of every surface in the axes that rays start in.
 import dataclasses
 import math
 import warnings
+from itertools import islice
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import detached, value
-from raytrace.system.lens import Lens, media
+from raytrace.maths.numerics import detached, dot_2, safe_sqrt, value
+from raytrace.system.lens import Lens, media, per_lens
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
@@ -111,12 +112,35 @@ def semi_diameters(lens: Lens) -> list[float]:
     found = [fixed.get(k, math.nan) for k in range(last + 1)]
     if all(map(math.isfinite, found[1:last])):
         return found
-    for k, reach in enumerate(_reaches(lens), 1):
+    try:
+        reaches = [math.nan, *map(float, _reaches(lens, last))]
+    except (ValueError, RuntimeError):
+        reaches = [math.nan] * (last + 1)
+    for k, reach in enumerate(reaches):
         if math.isnan(found[k]):
             factor, length = semi_diameter_margin(lens, k)
             found[k] = factor * reach + length
     stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
     return [own if math.isnan(reach) else reach for reach, own in zip(found, stored, strict=True)]
+
+
+def semi_diameter(lens: Lens, k: int) -> Tensor:
+    """mm () of surface k, from 1, as in `semi_diameters`, with derivatives; of a batch of lenses (L, 1, 1, 1)."""
+    if size := fixed_semi_diameters(lens).get(k):
+        return lens.wavelengths.new_tensor(size)
+    factor, length = semi_diameter_margin(lens, k)
+    return factor * per_lens(_reaches(lens, k)[-1]) + length
+
+
+def _reaches(lens: Lens, last: int) -> list[Tensor]:
+    """Largest √(x² + y²) mm () of the outermost rays on the surfaces 1 to `last`; nan where none arrives."""
+    points = lens.wavelengths.new_tensor(ENDS, dtype=torch.float64).T
+    rays, reaches = launch(lens, points, wavelengths=lens.wavelengths), []
+    for crossing in islice(lens_steps(lens, rays, lens.wavelengths[:, None]), last):
+        position, valid = crossing.rays.position, crossing.rays.valid
+        farthest = torch.where(valid, dot_2(position, position), -1.0).amax((-3, -2, -1))
+        reaches.append(torch.where(farthest < 0, torch.nan, safe_sqrt(farthest)))
+    return reaches
 
 
 def rims(heights, ends: np.ndarray, is_glass: np.ndarray):
@@ -136,20 +160,6 @@ def rims(heights, ends: np.ndarray, is_glass: np.ndarray):
 def edge_thickness(thickness, front, back):
     """mm between two surfaces where their sags are `front` and `back`; of any number type."""
     return thickness + (back - front)
-
-
-def _reaches(lens: Lens) -> list[float]:
-    """Largest √(x² + y²) mm of the outermost rays on every surface from 1; nan where none arrives."""
-    points = lens.wavelengths.new_tensor(ENDS, dtype=torch.float64).T
-    try:
-        rays, found = launch(lens, points, wavelengths=lens.wavelengths), []
-        for crossing in lens_steps(lens, rays, lens.wavelengths[:, None]):
-            x, y, _ = crossing.rays.position
-            reach = torch.where(crossing.rays.valid, torch.hypot(x, y), -1.0).max()
-            found.append(float(reach) if reach >= 0 else math.nan)
-    except (ValueError, RuntimeError):
-        return [math.nan] * (len(lens.surfaces) - 1)
-    return found
 
 
 def edge_radius(surface: Surface) -> float:

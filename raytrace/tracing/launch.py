@@ -37,7 +37,6 @@ from raytrace.maths.numerics import (
     unit,
     value,
     varies,
-    with_batch_axes,
 )
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import (
@@ -177,9 +176,8 @@ def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays
 
     direction: (3, ...) of any length; aim: (3, ...) mm in the frame of surface 1; index: (...) of the object space.
     """
-    axes = max(aim.dim(), direction.dim()) - 1
-    aim, direction = with_batch_axes(aim, axes), with_batch_axes(direction, axes)
-    return start(aim, direction, index * dot(aim, unit(direction)))
+    rays = start(aim, direction)
+    return dataclasses.replace(rays, opl=index * dot(rays.position, rays.direction))
 
 
 def is_at_infinity(lens: Lens) -> bool:
@@ -411,12 +409,14 @@ def _map_of(lens: Lens, field: Tensor) -> Tensor:
     maps = torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy])
     first = (listed[:, :, None] == listed[:, None]).all(0).to(torch.int64).argmax(1)  # of equal fields it alone counts
     maps = _rotated(maps, torch.cos(angle), torch.sin(angle))[:, first]
+    same = (listed.reshape(2, -1, *(1,) * (field.dim() - 1)) == field[:, None]).all(0)
+    at_listed = maps[:, same.to(torch.int64).argmax(0)]
+    if not any(map(varies, (field, lens.fields.x, lens.fields.y))) and not is_any(~same.any(0)):
+        return at_listed  # what lies between fields serves derivatives by the field alone
     axes = (1,) * (field.dim() - 1)
     listed, is_first = listed.reshape(2, -1, *axes), (first.diff(prepend=first[:1] - 1) > 0).reshape(-1, *axes)
     between = _between(listed, maps.reshape(5, -1, *axes), is_first, field[:, None])
-    same = (listed == field[:, None]).all(0)
-    rounding = maps[:, same.to(torch.int64).argmax(0)] - between
-    return between + torch.where(same.any(0), rounding, 0.0).detach()
+    return between + torch.where(same.any(0), at_listed - between, 0.0).detach()
 
 
 def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
@@ -445,14 +445,23 @@ def _between(listed: Tensor, maps: Tensor, is_first: Tensor, field: Tensor) -> T
     along, across = dot_2(line, listed), _cross(line, listed)
     on_line = (across.abs() <= _OFF_LINE * largest).all(0)
     one_sided = (along >= -_OFF_LINE * largest).all(0)
-    by_radius = _by_radius(radius, maps, line, field)
-    by_line = _at_least(maps, along)[:, 0] + _rise(along, maps, dot_2(line, field))
-    # Weights 1/distance², relative to the nearest, which has 1: smooth, and level at the fields.
+    rules = (
+        (on_line & one_sided, lambda: _by_radius(radius, maps, line, field)),
+        (on_line & ~one_sided, lambda: _at_least(maps, along)[:, 0] + _rise(along, maps, dot_2(line, field))),
+        (~on_line, lambda: _by_distance(listed, maps, is_first, field)),
+    )
+    (_, result), *others = [(applies, rule()) for applies, rule in rules if is_any(applies)]
+    for applies, other in others:  # of fields that `torch.func.vmap` batches
+        result = torch.where(applies, other, result)
+    return result
+
+
+def _by_distance(listed: Tensor, maps: Tensor, is_first: Tensor, field: Tensor) -> Tensor:
+    """Weights 1/distance², relative to the nearest, which has 1: smooth, and level at the fields."""
     distance = dot_2(listed - field, listed - field)
     nearest, place = distance.min(0, keepdim=True)
     weight = is_first * safe_divide(nearest, distance).scatter(0, place, 1.0)
-    by_distance = (weight * maps).sum(1) / weight.sum(0)
-    return torch.where(on_line, torch.where(one_sided, by_radius, by_line), by_distance)
+    return (weight * maps).sum(1) / weight.sum(0)
 
 
 def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Tensor:

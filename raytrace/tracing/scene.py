@@ -149,11 +149,12 @@ def points_of_bundle(bundle: Bundle, numbers: tuple[int, ...], memo: Memo | None
     """`points_at` of the rays of field and pupil points; everything broadcasts."""
     lens, _, wavelength, _ = bundle
     if memo is None or in_transform():
-        return points_at(lens, _launched(bundle), wavelength, numbers)
+        return points_at(lens, wavelength, numbers)(_launched(bundle))
     front = memo.front(bundle, numbers)
     done, rays, indices = _resumed(bundle, front, memo)
     left = numbers[len(front.points) :]
-    each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, left, first=done, indices=indices)
+    trace = rays_at(lens, wavelength, left, first=done, indices=indices)
+    each = trace(dataclasses.replace(rays, opl=None))
     return [*front.points, *(at.position[:2] for at in each)], (each[-1] if each else rays).valid
 
 
@@ -194,7 +195,8 @@ def _constant_front(bundle: Bundle, numbers: tuple[int, ...] | None) -> _Front:
         elif count:
             passed = [number for number in numbers if number <= count]
             stops = dict.fromkeys([*passed, count])
-            each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, [*stops], indices=indices)
+            trace = rays_at(lens, wavelength, [*stops], indices=indices)
+            each = trace(dataclasses.replace(rays, opl=None))
             rays, points = each[-1], [at.position[:2] for at in each[: len(passed)]]
     return _Front(count, rays, points, constant_indices)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford, afford_rays, piece
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import Lens, field_points, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
@@ -93,15 +93,14 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
     mean = (share * offset).sum(-1, keepdim=True)
     centre = mean if about is None else about[..., None] - reference
     centred = torch.where(valid, offset - centre, 0.0)
-    mean_square = (share * dot_2(centred, centred)).sum(-1)
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)
     scaled = centred / scale
-    square = dot_2(scaled, scaled)
+    square, scale = dot_2(scaled, scaled), scale[..., 0]
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
-    rms, geometric = (scale[..., 0] * safe_sqrt(t) for t in (scaled_mean, largest))
-    return total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric
+    rms, geometric = (scale * safe_sqrt(t) for t in (scaled_mean, largest))
+    return total[..., 0] != 0, (reference + mean)[..., 0], scale * (scale * scaled_mean), rms, geometric
 
 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
@@ -200,24 +199,39 @@ def arrivals(
     count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
     helps = "ask for fewer, or by `rays`, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
-    each = []  # of every chunk, rays (3, F, W, P) on the sensor, their status, and whether they reach it
-    for some in progress(fields.split(piece(L * RAY_BYTES * W * P), 1)):
-        launched = launch(lens, pupil, fields=some, ray_aiming=ray_aiming)
+    size = piece(RAY_BYTES * F * W * P)  # lenses at once; fields, where those of one lens are more than a chunk
+    lenses = [lens] if size >= L else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]
+    some_fields = fields.split(piece(min(L, size) * RAY_BYTES * W * P), 1)
+    each = []  # of every chunk, rays (3, F, W, P) on the sensor, whether they reach it, and their status if one fails
+    for some, part in progress([(some, part) for some in some_fields for part in lenses]):
+        launched = launch(part, pupil, fields=some, ray_aiming=ray_aiming)
         launched = dataclasses.replace(launched, opl=None)
-        rays = trace_lens(lens, launched, lens.wavelengths[:, None])
-        on_sensor = rays, torch.zeros_like(rays.valid, dtype=torch.int64), rays.valid
+        rays = trace_lens(part, launched, lens.wavelengths[:, None])
+        on_sensor = rays, rays.valid, None
         if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails
             reached = launched.valid
-            for crossing, status in ray_status(lens, launched, lens.wavelengths[:, None]):
+            for crossing, status in ray_status(part, launched, lens.wavelengths[:, None]):
                 reached = reached & ~crossing.missed & ~crossing.totally_reflected
-                on_sensor = crossing.rays, status, reached
+                on_sensor = crossing.rays, reached, status
         each.append(on_sensor)
-    parts = [[rays.position, rays.direction, rays.valid, *rest] for rays, *rest in each]
-    *joined, status, reached = (torch.cat(pieces, -3) for pieces in zip(*parts, strict=True)) if parts[1:] else parts[0]
-    joined = Rays(*joined)
+
+    def joined(parts: Sequence[Tensor]) -> Tensor:
+        rows = [parts[k : k + len(lenses)] for k in range(0, len(parts), len(lenses))]
+        return _cat([_cat(row, -4) for row in rows], -3)
+
+    reached, none = joined([reached for _, reached, _ in each]), torch.zeros((), dtype=torch.int64).to(fields.device)
+    if all(status is None for *_, status in each):
+        status = none.expand(reached.shape)
+    else:
+        status = joined([none.expand(reached.shape) if s is None else s for _, reached, s in each])
+    rays = Rays(*(joined([getattr(rays, part) for rays, *_ in each]) for part in ("position", "direction", "valid")))
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     weight = shares[:, None] * weights / weights.sum()
-    return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
+    return Arrivals(rays, status, reached, weight, pupil, fields, lens.wavelengths)
+
+
+def _cat(parts: Sequence[Tensor], dim: int) -> Tensor:
+    return torch.cat(parts, dim) if len(parts) > 1 else parts[0]
 
 
 def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ rays: in the compiled engine each ray carries its derivatives from surface to su
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -291,47 +291,58 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
 
 def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
     """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
-    (stop,), arrives = points_at(lens, rays, wavelength, (lens.stop,))
+    (stop,), arrives = points_at(lens, wavelength, (lens.stop,))(rays)
     return stop, arrives
 
 
 @shared
 def without_apertures(lens: Lens) -> Lens:
     """The lens without apertures: no ray is vignetted."""
-    surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
-    return dataclasses.replace(lens, surfaces=surfaces)
+    if not any(surface.apertures for surface in lens.surfaces):
+        return lens
+    return dataclasses.replace(lens, surfaces=_unclipped(lens.surfaces))
 
 
-def points_at(lens: Lens, rays: Rays, wavelength: Tensor, numbers: Sequence[int]) -> tuple[list[Tensor], Tensor]:
-    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
-    *_, last = each = rays_at(lens, dataclasses.replace(rays, opl=None), wavelength, numbers)
-    return [at.position[:2] for at in each], last.valid
+def _unclipped(surfaces: Sequence[Surface]) -> tuple[Surface, ...]:
+    return tuple(dataclasses.replace(each, apertures=()) if each.apertures else each for each in surfaces)
+
+
+def points_at(lens: Lens, wavelength: Tensor, numbers: Sequence[int]) -> Callable[[Rays], tuple[list[Tensor], Tensor]]:
+    """The map from rays to where they meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they
+    reach the last."""
+    trace = rays_at(lens, wavelength, numbers)
+
+    def points(rays: Rays) -> tuple[list[Tensor], Tensor]:
+        *_, last = each = trace(dataclasses.replace(rays, opl=None))
+        return [at.position[:2] for at in each], last.valid
+
+    return points
 
 
 def rays_at(
-    lens: Lens,
-    rays: Rays,
-    wavelength: Tensor,
-    numbers: Sequence[int],
-    *,
-    first: int = 0,
-    indices: Sequence[Tensor] | None = None,
-) -> list[Rays]:
-    """Rays behind each of the surfaces of these ascending numbers; apertures stop none.
+    lens: Lens, wavelength: Tensor, numbers: Sequence[int], *, first: int = 0, indices: Sequence[Tensor] | None = None
+) -> Callable[[Rays], list[Rays]]:
+    """The map from rays to those behind each of the surfaces of these ascending numbers; apertures stop none.
 
-    first: the surface that they are behind, 0 in front of surface 1; indices: of all media, computed by default.
+    Surfaces and media are prepared once, for searches that trace many batches in turn. first: the surface that the rays
+    are behind, 0 in front of surface 1; indices: of all media, computed by default.
     """
     indices = media(lens, wavelength) if indices is None else indices
-    unclipped, each = (lens.surfaces[0], *sequence_of(without_apertures(lens))), []
-    side = side_behind(unclipped[: first + 1])
+    surfaces, runs = (lens.surfaces[0], *_unclipped(sequence_of(lens))), []
+    side = side_behind(surfaces[: first + 1])
     for last in numbers:
-        between = unclipped[first + 1 : last + 1]
-        gap = gap_behind(lens.surfaces[first]) if first else None
-        between_media = indices[first : last + 1]
-        rays = trace_surfaces(between, rays, indices=between_media, wavelength=wavelength, side=side, gap=gap)
-        each.append(rays)
-        side, first = side * side_behind(between), last
-    return each
+        run, gap = surfaces[first + 1 : last + 1], gap_behind(lens.surfaces[first]) if first else None
+        runs.append((run, {"indices": indices[first : last + 1], "side": side, "gap": gap, "wavelength": wavelength}))
+        first, side = last, side * side_behind(run)
+
+    def trace(rays: Rays) -> list[Rays]:
+        each = []
+        for run, arguments in runs:
+            rays = trace_surfaces(run, rays, **arguments)
+            each.append(rays)
+        return each
+
+    return trace
 
 
 def side_behind(surfaces: Sequence[Surface]) -> int:
