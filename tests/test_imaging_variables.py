@@ -418,6 +418,7 @@ def test_temperature_and_pressure_are_parameters(lens):
     moved(variables, temperature=100.0)
     variables.project()
     assert variables.numbers()["temperature"] == pytest.approx(80.0, rel=1e-15)
+    assert Variables(lens, "curvature:10 temperature pressure", hold="efl").held.by.name == "curvature_10"
 
 
 def test_a_number_of_one_configuration_is_a_parameter(lens):

@@ -53,6 +53,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     GLASS,
+    OF_LENS,
     Address,
     BadVariables,
     joined,
@@ -387,7 +388,8 @@ class Variables(Owned):
         if length == 0 or not math.isfinite(length):
             raise BadVariables(f"hold {hold!r}: expected efl, the focal length of the file, or one in mm as efl=100")
         for variable in reversed(self._all):
-            if variable.number.operand is None and variable.number.quantity not in GLASS and self._has_power(variable):
+            is_solvable = variable.number.quantity not in GLASS and variable.address not in OF_LENS
+            if is_solvable and variable.number.operand is None and self._has_power(variable):
                 return Held(length, variable)
         raise BadVariables(
             f"hold {hold!r}: none of the variables changes the focal length; vary a thickness or a curvature "
@@ -398,13 +400,10 @@ class Variables(Owned):
         """Whether the power of the lens is linear in a variable, with all that follows it, and is not constant."""
         design = dataclasses.replace(self.design, variables=(variable.number,))
         view = design.views[self.lens.current_configuration - 1]
-        numbers = 0.0, 1.0, variable.start
-        at_zero, at_one, here = (
-            -view.state(np.array([v])).gaussian(view.lens.primary_wavelength - 1).C for v in numbers
-        )
-        change = at_one - at_zero
-        off = here - (at_zero + variable.start * change)
-        return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(off) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_one))
+        states = (view.state(np.array([number])) for number in (0.0, 1.0, 2.0))
+        at_zero, at_one, at_two = (state.gaussian(state.primary).C for state in states)
+        change, bend = at_one - at_zero, at_two - 2 * at_one + at_zero
+        return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(bend) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_two))
 
     @functools.cached_property
     def _free(self) -> DesignVariables:
