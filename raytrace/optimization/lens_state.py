@@ -234,17 +234,15 @@ class LensState:
 
     @cached_property
     def media(self) -> dict:
-        """Indices (W,) of variable media, by the surface in front of them."""
-        if not self.view.glasses:
+        """Indices (W,) of variable media, by the surface in front of them; of tensors (W, ...)."""
+        glasses = self.view.glasses
+        if not glasses:
             return {}
-        glasses, waves = self.view.glasses, self.lens.wavelengths
         moved = [at for addresses in glasses.values() for at in addresses]
-        numbers = self.through_torch(
-            lambda lens: [index_behind(lens, k, wave) for k in glasses for wave in waves], only=moved
-        )
-        each = [numbers[k : k + len(waves)] for k in range(0, len(numbers), len(waves))]
-        each = each if self.is_of_tensors else [listed(indices, self.count) for indices in each]
-        return dict(zip(glasses, each, strict=True))
+        axes = max((number.dim() for number in self.variables), default=0) if self.is_of_tensors else 0
+        waves = self.lens.wavelengths.reshape(-1, *[1] * axes)
+        indices = self.in_one_pass(lambda lens: [index_behind(lens, k, waves) for k in glasses], only=moved)
+        return dict(zip(glasses, indices, strict=True))
 
     def power(self, k: int, wavelength: int):
         """Power in 1/mm of a surface."""
@@ -379,13 +377,13 @@ class LensState:
 
         def passed(state: LensState, solved: Tensor) -> Tensor:
             state._passed(solved.unbind())
-            return torch.stack([state.tensors[at].expand(solved.shape[1:]) for at in ats])
+            return torch.stack([number.expand(solved.shape[1:]) for number in state.tensors(ats).values()])
 
         still = copy.copy(self)
         still._kept, still.numbers = {}, {at: number.detach() for at, number in self.numbers.items()}
         with torch.no_grad():
             still._settled(stored)
-        solved = torch.stack(torch.broadcast_tensors(*(still.tensors[at] for at in ats)))
+        solved = torch.stack(torch.broadcast_tensors(*still.tensors(ats).values()))
         unit = torch.eye(len(ats), dtype=solved.dtype, device=solved.device)
         units = unit.reshape(*unit.shape, *[1] * (solved.dim() - 1)).expand(-1, *solved.shape)
         with torch.enable_grad():
@@ -410,20 +408,16 @@ class LensState:
 
     # -- functions of torch ----------------------------------------------------------------------------------------
 
-    def through_torch(
-        self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False, only: Sequence | None = None
-    ) -> list:
+    def through_torch(self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False) -> list:
         """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
-        clips: whether the lens has its apertures; only: addresses of the numbers that the function depends on. Of
-        tensors it has none, and all numbers.
+        clips: whether the lens has its apertures; that of tensors has none.
         """
-        view = self.view.clipping if clips else self.view
         if self.is_of_tensors:
-            return [*function(with_numbers_of(without_apertures(self.lens), self.tensors, view.places))]
+            return [*function(self.moving_lens())]
         with torch.set_grad_enabled(self.count > 0):
-            leaves = {at: _tensor(self.numbers[at]).requires_grad_() for at in only or self.numbers}
-            numbers = [number.reshape(()) for number in function(view.held(leaves))]
+            leaves = {at: _tensor(number).requires_grad_() for at, number in self.numbers.items()}
+            numbers = [n.reshape(()) for n in function((self.view.clipping if clips else self.view).held(leaves))]
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
     def _chained(self, number: Tensor, leaves: dict) -> Dual:
@@ -437,21 +431,36 @@ class LensState:
                     slope = slope + float(derivative) * moved.slope
         return Dual(value, slope)
 
-    @property
-    def tensors(self) -> dict:
-        """The numbers as tensors, by address; dual ones carry their derivatives by all variables."""
+    def in_one_pass(self, function: Callable[[Lens], Sequence[Tensor]], only: Sequence | None = None) -> list:
+        """Numbers or arrays that a function takes from a lens with torch, with their derivatives in one forward pass.
+
+        only: addresses of the numbers that the function depends on.
+        """
+        if self.is_of_tensors:
+            return [*function(self.moving_lens(only))]
+        with torch.set_grad_enabled(self.count > 0):
+            return [*map(self._taken, function(self.moving_lens(only)))]
+
+    def _taken(self, number: Tensor):
+        """A number or an array from torch, with its derivatives by the variables."""
+        value = number.detach().numpy()[()]
+        return Dual(value, tangents_of(number, self.count).detach().numpy()) if self.count else value
+
+    def tensors(self, only: Sequence | None = None) -> dict:
+        """The numbers, or some, as tensors, by address; dual ones carry their derivatives by all variables."""
+        numbers = {at: self.numbers[at] for at in only or self.numbers}
         if self.is_of_tensors:
             like = self.lens.wavelengths
-            return {at: n if isinstance(n, Tensor) else like.new_tensor(n) for at, n in self.numbers.items()}
-        numbers = {at: _tensor(number) for at, number in self.numbers.items()}
+            return {at: n if isinstance(n, Tensor) else like.new_tensor(n) for at, n in numbers.items()}
         if not self.count:
-            return numbers
-        slopes = {at: torch.tensor(slope_of(number, self.count)) for at, number in self.numbers.items()}
-        return {at: with_tangents(number, slopes[at]) for at, number in numbers.items()}
+            return {at: _tensor(number) for at, number in numbers.items()}
+        return {at: with_tangents(_tensor(n), torch.tensor(slope_of(n, self.count))) for at, n in numbers.items()}
 
-    def moving_lens(self) -> Lens:
-        """The lens, whose numbers carry their derivatives by all variables: of many numbers in one forward pass."""
-        return self.view.held(self.tensors)
+    def moving_lens(self, only: Sequence | None = None) -> Lens:
+        """The lens without apertures, whose numbers carry their derivatives by all variables."""
+        if self.is_of_tensors:
+            return with_numbers_of(without_apertures(self.lens), self.tensors(only), self.view.places)
+        return self.view.held(self.tensors(only))
 
     def each_through_torch(self, function: Callable, arrays: Sequence):
         """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
@@ -460,10 +469,7 @@ class LensState:
             with_tangents(entry, torch.tensor(array.full())) if isinstance(array, Dual) else entry
             for entry, array in zip(entries, arrays, strict=True)
         ]
-        with torch.set_grad_enabled(self.count > 0):
-            numbers = function(self.moving_lens(), *entries)
-        values = numbers.detach().numpy()
-        return Dual(values, tangents_of(numbers, self.count).detach().numpy()) if self.count else values
+        return self.in_one_pass(lambda lens: [function(lens, *entries)])[0]
 
 
 def _tensor(number) -> Tensor:
@@ -492,7 +498,7 @@ def _powers(state: LensState, wavelength: int) -> list:
         n = signed(surfaces, media(lens, at)[:-1])
         return [power(*part, at) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
 
-    return state.through_torch(powers)
+    return state.in_one_pass(powers)
 
 
 def _gaussian(state: LensState, wavelength: int) -> Gaussian:

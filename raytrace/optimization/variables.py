@@ -160,7 +160,7 @@ class DesignVariables:
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
         view = self.views[lens.current_configuration - 1]
         lens = dataclasses.replace(lens, operands=tuple(operands))
-        numbers = LensState(view, each, lens).tensors if view.solves else view.numbers(each)
+        numbers = LensState(view, each, lens).tensors() if view.solves else view.numbers(each)
         return with_numbers_of(lens, numbers, view.places)
 
 
