@@ -358,6 +358,18 @@ def test_a_focal_length_is_held_with_pickups_by_a_number_that_they_leave_linear(
         Variables(lens, "curvature:3 curvature:8=-curvature:3", hold="efl")
 
 
+def test_a_focal_length_is_held_before_a_pickup_with_power(lens):
+    """Surface 8, behind the number that is solved, picks up curvature_1: the solve has the power that comes of it."""
+    variables = moved(Variables(lens, "curvature:1,3 curvature:8=-0.1*curvature:1", hold="efl"), curvature_1=0.3)
+    assert variables.held.by.name == "curvature_3"
+    assert focal_length(variables()) == pytest.approx(focal_length(lens), rel=1e-12)
+
+    def solved(offset):
+        return torch.func.functional_call(variables, {"curvature_1": offset}, ()).surfaces[3].curvature
+
+    assert gradcheck(solved, [variables.curvature_1.detach().clone().requires_grad_()], rtol=1e-6)
+
+
 def test_the_projection_follows_solves(lens):
     prepare()
     length = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
@@ -377,14 +389,18 @@ def test_a_state_says_what_follows(lens):
         other.load_state_dict(state)
 
 
-def test_solves_of_the_file_are_followed(lens):
-    free = design_variables(lens, "curvature:1 sensor=marginal_height(0)")
-    lens = dataclasses.replace(free.lens, optimization_data=OptimizationData(solves=free.solves))
-    variables = moved(Variables(lens, "curvature"), curvature_1=0.05)
-    changed = variables()
-    distance = float(first_order(changed).paraxial_image_distance.detach())
-    assert float(changed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
-    assert "sensor" in moved(Variables(lens, "curvature sensor"), sensor=0.1).names  # a number that is named varies
+def test_solves_of_the_file_are_not_followed(lens):
+    """The sensor stays where it is put, and the numbers of a word are those of a file without solves."""
+    free = design_variables(lens, "curvature:1 sensor=marginal_height(0) curvature:3=curvature:1")
+    data = OptimizationData(solves=free.solves)
+    solved = dataclasses.replace(lens.at(sensor_distance=60.0), optimization_data=data)
+    variables = moved(Variables(solved, "curvature"), curvature_1=0.05)
+    assert variables.names == Variables(lens, "curvature").names
+    assert float(variables().surfaces[11].thickness) == 60.0
+    assert variables().optimization_data is data
+    followed = moved(Variables(solved, "curvature:1 sensor=marginal_height(0)"), curvature_1=0.05)()
+    distance = float(first_order(followed).paraxial_image_distance.detach())
+    assert float(followed.surfaces[11].thickness) == pytest.approx(distance, rel=1e-12)
 
 
 def test_temperature_and_pressure_are_parameters(lens):
@@ -402,6 +418,7 @@ def test_temperature_and_pressure_are_parameters(lens):
     moved(variables, temperature=100.0)
     variables.project()
     assert variables.numbers()["temperature"] == pytest.approx(80.0, rel=1e-15)
+    assert Variables(lens, "curvature:10 temperature pressure", hold="efl").held.by.name == "curvature_10"
 
 
 def test_a_number_of_one_configuration_is_a_parameter(lens):

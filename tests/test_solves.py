@@ -128,6 +128,15 @@ def test_solves_that_wait_for_one_another_settle(is_solved):
             assert number.slope[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-5, abs=1e-8)
 
 
+def test_the_last_gap_waits_for_nothing():
+    """It changes neither the focal length nor the pupils, also where the aperture is an F-number of the image."""
+    lens = rt.read_lens("double_gauss").at(f_number=3)
+    model, x, _ = moment_of((RULES["marginal_height"],), lens=lens)
+    assert not model.views[0].waits
+    assert marginal_slope(model.lens_at(x), 11)[1] == pytest.approx(0.5, rel=1e-11)
+    assert moment_of((RULES["f_number"],), lens=lens)[0].views[0].waits
+
+
 def test_a_solve_counts_the_power_of_terms_that_vary():
     """a r² adds 2 a to the curvature at the vertex: the marginal ray comes to the last surface with another slope."""
     lens = rt.read_lens("double_gauss").replace(3, coefficients=[1e-4, 0.0])

@@ -43,7 +43,9 @@ EXAMPLES = """examples:
 #: The options by the field of `CodesignSettings`.
 ROWS = {
     "model": option("PSF model of step 1", "MODEL", choices=MODELS),
-    "vary": option("variables: sensor (default), thickness:5,6 curvature:1-4 conic:3, of surfaces", "WHAT", nargs="+"),
+    "vary": option(
+        "variables: sensor (default), thickness:5,6 curvature:1-4; pickups curvature:6=-curvature:1", "WHAT", nargs="+"
+    ),
     "bounds": option("of variables: sensor:57.5,58 curvature_3:-0.04,0 (mm, 1/mm)", "NAME:LOW,HIGH", nargs="+"),
     "hold": option(
         "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "

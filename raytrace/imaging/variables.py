@@ -53,6 +53,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     GLASS,
+    OF_LENS,
     Address,
     BadVariables,
     joined,
@@ -280,8 +281,8 @@ class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 a4:3 temperature
-        curvature:6=-curvature:1". Solves and pickups of the file are followed, too. Glasses are not exchanged, and the
-        distance of the object is that of a camera.
+        curvature:6=-curvature:1". Solves and pickups are those named here alone: the sensor stays where it is put even
+        if the file solves for it. Glasses are not exchanged, and the distance of the object is that of a camera.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
@@ -387,7 +388,8 @@ class Variables(Owned):
         if length == 0 or not math.isfinite(length):
             raise BadVariables(f"hold {hold!r}: expected efl, the focal length of the file, or one in mm as efl=100")
         for variable in reversed(self._all):
-            if variable.number.operand is None and variable.number.quantity not in GLASS and self._has_power(variable):
+            is_solvable = variable.number.quantity not in GLASS and variable.address not in OF_LENS
+            if is_solvable and variable.number.operand is None and self._has_power(variable):
                 return Held(length, variable)
         raise BadVariables(
             f"hold {hold!r}: none of the variables changes the focal length; vary a thickness or a curvature "
@@ -398,13 +400,10 @@ class Variables(Owned):
         """Whether the power of the lens is linear in a variable, with all that follows it, and is not constant."""
         design = dataclasses.replace(self.design, variables=(variable.number,))
         view = design.views[self.lens.current_configuration - 1]
-        numbers = 0.0, 1.0, variable.start
-        at_zero, at_one, here = (
-            -view.state(np.array([v])).gaussian(view.lens.primary_wavelength - 1).C for v in numbers
-        )
-        change = at_one - at_zero
-        off = here - (at_zero + variable.start * change)
-        return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(off) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_one))
+        states = (view.state(np.array([number])) for number in (0.0, 1.0, 2.0))
+        at_zero, at_one, at_two = (state.gaussian(state.primary).C for state in states)
+        change, bend = at_one - at_zero, at_two - 2 * at_one + at_zero
+        return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(bend) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_two))
 
     @functools.cached_property
     def _free(self) -> DesignVariables:
@@ -585,14 +584,17 @@ class Variables(Owned):
 
 
 def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
-    """The variables, solves and pickups of variable syntax. Raises BadVariables for what a camera does not vary."""
+    """The variables, solves and pickups of variable syntax, without those of the file, in double precision on the
+    processor. Raises BadVariables for what a camera does not vary."""
     if not split_words(vary):
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
-    design = design_variables(to(lens, dtype=torch.float64, device="cpu"), vary)
+    lens, data = to(lens, dtype=torch.float64, device="cpu"), lens.optimization_data
+    unsolved = None if data is None else dataclasses.replace(data, solves=())
+    design = design_variables(dataclasses.replace(lens, optimization_data=unsolved), vary)
     for one in design.variables:
         if one.quantity == "glass" or (one.surface, one.quantity) == (0, "thickness"):
             raise BadVariables(f"`vary={joined(vary)}`: {name_of(one)} is a variable of optimize and jacobian alone")
-    return design
+    return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
 
 def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Variable, ...]:

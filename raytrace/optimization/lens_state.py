@@ -165,10 +165,7 @@ class LensState:
 
     def __init__(self, view, variables, lens: Lens | None = None):
         self.view, self.lens, self.variables = view, lens or view.lens, variables
-        self.numbers: dict = {
-            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
-            for at, (number, scale, offset) in view.variables.items()
-        }
+        self.numbers: dict = view.numbers(variables)
         self._kept: dict = {}
         if view.solves:
             self._solve()

@@ -160,7 +160,8 @@ class DesignVariables:
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
         view = self.views[lens.current_configuration - 1]
         lens = dataclasses.replace(lens, operands=tuple(operands))
-        return with_numbers_of(lens, LensState(view, each, lens).tensors, view.places)
+        numbers = LensState(view, each, lens).tensors if view.solves else view.numbers(each)
+        return with_numbers_of(lens, numbers, view.places)
 
 
 def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None) -> DesignVariables:
@@ -604,6 +605,13 @@ class View:
             )
 
         return any(is_late(*found) for found in enumerate(self.solves))
+
+    def numbers(self, variables) -> dict[Address, object]:
+        """The numbers that variables move, without those that are solved."""
+        return {
+            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
+            for at, (number, scale, offset) in self.variables.items()
+        }
 
     def number(self, at: Address) -> float:
         """A number of the lens as it is stored."""
