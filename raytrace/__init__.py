@@ -122,7 +122,7 @@ PUBLIC = {
     "Wave": "psf_models",
     "Incomplete": "analysis.setting",
     "NothingToShow": "analysis.setting",
-    "compare": "analysis",
+    "compare": "analysis.compare",
     "distortion": "analysis.chief",
     "distortion_grid": "analysis.grid",
     "encircled_energy": "analysis.encircled",

@@ -1,11 +1,11 @@
 # ruff: noqa: I001
 """Signatures of the public API for editors; written by `python tests/test_stub.py`."""
 
-from raytrace.analysis import compare as compare
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
 from raytrace.analysis.chromatic import chromatic_focal_shift as chromatic_focal_shift
+from raytrace.analysis.compare import compare as compare
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan

@@ -13,8 +13,9 @@ from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS
 from raytrace.io.source import Place, decode
+from raytrace.system.lens import aligned
 from raytrace.tracing import aiming
-from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
+from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, rays_of_field, warn_of_filling
 from raytrace.tracing.trace import aiming_of, at_stop, trace_lens
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
@@ -218,3 +219,18 @@ def test_few_rays_of_many_are_differentiated_in_aiming(monkeypatch):
     monkeypatch.setattr(aiming, "_error_and_jacobian", lambda r, p, f: counts.append(p.shape[-1]) or plain(r, p, f))
     launch(rt.read_lens("retrofocus"), rt.gauss_rings(20, 64)[0])
     assert max(counts) < 300
+
+
+@pytest.mark.parametrize("kind", ["paraxial", "real"])
+def test_points_of_the_pupil_may_have_fewer_axes_than_the_lens(kind):
+    """Those of a field each, and a lens with an axis of object distances before that."""
+    lens = aligned(rt.read_lens("cooke_triplet").at(ray_aiming=kind), 3)
+    field, points = torch.tensor([[0.0, 0.0], [0.0, 8.0]], dtype=torch.float64), rt.gauss_rings(2, 6)[0]
+    each = points[:, None, None] * torch.tensor([1.0, 0.9], dtype=torch.float64)[:, None, None]
+    many = lens.replace(0, thickness=torch.tensor([1e3, 2e3, 4e3], dtype=torch.float64).reshape(3, 1, 1, 1))
+    found = rays_of_field(many, field[:, :, None, None], each, wavelength=lens.wavelengths[:, None])
+    assert bool(found.valid.all())
+    for k, distance in enumerate((1e3, 2e3, 4e3)):
+        alone = lens.replace(0, thickness=torch.tensor(distance, dtype=torch.float64))
+        rays = rays_of_field(alone, field[:, :, None, None], each, wavelength=lens.wavelengths[:, None])
+        torch.testing.assert_close(found.position[:, k].expand_as(rays.position), rays.position, atol=1e-9, rtol=0)

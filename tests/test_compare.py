@@ -1,6 +1,5 @@
 """The models side by side: one sensor, kernels as `psf` gives them, and numbers that show what each can represent."""
 
-import importlib
 import json
 import math
 import warnings
@@ -10,7 +9,8 @@ import pytest
 import torch
 from problems import MICROMETRE, NANOMETRE
 
-from raytrace import analysis, read_lens
+from raytrace import read_lens
+from raytrace.analysis import compare
 from raytrace.cli import main
 from raytrace.maths.sampling import gauss_rings, grid
 from raytrace.psf_models import NotConverged, psf
@@ -23,19 +23,19 @@ SENSOR, RMS_SENSOR = 57.8817685, 57.662  # mm, of the double Gauss for an object
 
 
 def opened(name: str, focus_distance: float = 25_000.0, **options):
-    return analysis.common_focus(read_lens(LENSES / f"{name}.zmx"), focus_distance, wavelength=0.53, **options)
+    return compare.common_focus(read_lens(LENSES / f"{name}.zmx"), focus_distance, wavelength=0.53, **options)
 
 
 def compared(lens, *distances: float):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)
-        return analysis.side_by_side(lens, lens.wavelengths.new_tensor(distances))
+        return compare.side_by_side(lens, lens.wavelengths.new_tensor(distances))
 
 
 @pytest.fixture(scope="module")
 def measured():
     """What the models can represent, of a lens that is quick to trace."""
-    return analysis.abilities(opened("singlet"))
+    return compare.abilities(opened("singlet"))
 
 
 @pytest.fixture
@@ -149,8 +149,7 @@ def strict(text: str) -> dict:
 
 
 def test_json_and_figure(capsys, tmp_path, monkeypatch, measured):
-    comparing = importlib.import_module("raytrace.analysis.compare")
-    monkeypatch.setattr(comparing, "abilities", lambda lens, pixels: measured)  # seconds of work done above
+    monkeypatch.setattr(compare, "abilities", lambda lens, pixels: measured)  # seconds of work done above
     picture = tmp_path / "compare.png"
     words = ["compare", "singlet", "--object-distance", "20000", "inf", "--start", "rms", "--plot", str(picture)]
     assert main([*words, "--json"]) == 0
@@ -179,7 +178,7 @@ def test_json_and_figure(capsys, tmp_path, monkeypatch, measured):
 def test_every_number_means_something_on_other_lenses(name, focus_distance):
     """Also of a lens whose blur is far below a pixel, and of two mirrors around a hole."""
     lens = opened(name, focus_distance)
-    frame = analysis.abilities(lens).to_frame().set_index("model")
+    frame = compare.abilities(lens).to_frame().set_index("model")
     traced, ideal = ["DRT", "Gaussian DRT", "wave"], ["paraxial", "Fourier"]
     assert (frame.conic[ideal] == 0).all()
     assert (frame.conic[traced] > 1e-3).all()

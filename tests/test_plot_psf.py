@@ -10,7 +10,8 @@ import torch
 from page import outside
 from problems import number, own_fields
 
-from raytrace import analysis, read_lens
+from raytrace import read_lens
+from raytrace.analysis import compare
 from raytrace.cli import main
 from raytrace.maths.sampling import grid
 from raytrace.plotting import style
@@ -141,8 +142,8 @@ def test_lines_are_as_wide_as_the_page():
 
 
 def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
-    lens = analysis.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
-    result = analysis.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
+    lens = compare.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
+    result = compare.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
     assert all(one.kernel.shape[-2:] == (11, 11) for one in result.psfs)
     assert all(float(one.grid.pitch) == 0.002 for one in result.psfs)
     figure = result.plot(log=True)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace import analysis
+from raytrace.analysis import compare
 from raytrace.maths.result import Result
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
@@ -59,7 +59,7 @@ def results() -> dict[str, tuple]:
         "spot of many rays": (lambda: rt.spot(double, rays=1000), "centroid_y rms_radius_um geometric_radius_um"),
         "focus": (lambda: rt.focus(double, object_distances=[3000]), "sensor_distance rms_radius_um"),
         "compare": (lambda: rt.compare(single, object_distances=[10e3, 20e3]), "object_distance sigma_um difference"),
-        "abilities": (lambda: analysis.abilities(single), "conic anisotropy"),
+        "abilities": (lambda: compare.abilities(single), "conic anisotropy"),
         "psf": (
             lambda: rt.psf(single, "fourier", tol=1e-2),
             "centroid_y sigma_x_um sigma_y_um ray_sigma_x_um ray_sigma_y_um energy",

@@ -25,10 +25,3 @@ To add an analysis: a file with a function, whose docstring has an entry for eac
 `cli/commands.py`. The text, CSV, JSON and the options of the command follow from those. Tests: `test_analysis` (all of
 them), `test_plot_analysis` (figures), `test_result` (units) and `test_NAME` (each by itself).
 """
-
-from raytrace.analysis.compare import Abilities as Abilities
-from raytrace.analysis.compare import Comparison as Comparison
-from raytrace.analysis.compare import abilities as abilities
-from raytrace.analysis.compare import common_focus as common_focus
-from raytrace.analysis.compare import compare as compare
-from raytrace.analysis.compare import side_by_side as side_by_side

@@ -505,7 +505,10 @@ def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.devic
 
 
 def detached(instance):
-    """The same value as plain numbers, without gradients: to be shown or drawn. Tensors that were one stay one."""
+    """The same value as plain numbers, without gradients: to be shown or drawn. Tensors that were one stay one, and a
+    value of plain numbers is itself."""
+    if not any(map(varies, pytree.tree_leaves(instance))):
+        return instance
     seen: dict[int, torch.Tensor] = {}
 
     def plain(leaf):

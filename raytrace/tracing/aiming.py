@@ -80,7 +80,7 @@ def aim_at_stop(
     of_one_pupil = broadcast_shape(first.shape, wavelength.shape)[-1:] == (1,) and pupil.shape[-1] >= _MANY
     given = lens, first, target, radius, wavelength
     batch = broadcast_shape(pupil.shape[1:], first.shape, wavelength.shape, batch_shape(lens))
-    start = pupil.detach().expand(2, *batch)
+    start = with_batch_axes(pupil.detach(), len(batch)).expand(2, *batch)
     aim, found = _root(missed, start, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
     return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
 
@@ -128,7 +128,8 @@ def aim_at_image(
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
     first = through(start[:2].detach(), torch.zeros_like(start[:2]))
     given = lens, height, first, radius
-    start = start.detach().expand(len(start), *broadcast_shape(first.shape, height.shape[1:], batch_shape(lens)))
+    batch = broadcast_shape(first.shape, height.shape[1:], batch_shape(lens))
+    start = with_batch_axes(start.detach(), len(batch)).expand(len(start), *batch)
     unknown, found = _root(missed, start, origin=torch.zeros_like, given=given)
     return torch.where(found, unknown[:2], 0.0), found
 

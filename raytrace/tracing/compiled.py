@@ -424,7 +424,7 @@ def task_of(
     wavelength = None if wavelength is None else wavelength.to(rays.direction.dtype)
     structure, numbers = structure_of(surfaces, indices, side, gap, wavelength)
     parts = [rays.position[0], rays.direction[0], rays.valid, *([] if rays.opl is None else [rays.opl]), *numbers]
-    shape = broadcast_shape(*(part.shape for part in parts))
+    shape = broadcast_shape(*{part.shape for part in parts})
     if 0 in shape or any(n.dtype != rays.direction.dtype or (n.dim() and n.shape[-1] != 1) for n in numbers):
         return None
     position, direction = (
@@ -432,12 +432,17 @@ def task_of(
     )
     opl = None if rays.opl is None else rays.opl.expand(shape).contiguous()
     # A row for all rays of the last axis; numbers that are the same in all rows are put into them together.
-    single = [k for k, n in enumerate(numbers) if n.dim() == 0]
-    table = torch.stack([numbers[k] for k in single])[None] if single else None
+    single = [k for k, n in enumerate(numbers) if n.numel() == 1]
+    table = (
+        torch.stack([n if n.dim() == 0 else n.reshape(()) for n in map(numbers.__getitem__, single)])[None]
+        if single
+        else None
+    )
     if len(single) < len(numbers):
-        several = [k for k, n in enumerate(numbers) if n.dim()]
+        several = [k for k, n in enumerate(numbers) if n.numel() > 1]
         rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1).reshape(-1, len(several))
-        columns = torch.tensor([*single, *several]).argsort()
+        places = {k: place for place, k in enumerate((*single, *several))}
+        columns = torch.tensor([places[k] for k in range(len(numbers))])
         table = rows if table is None else torch.cat([table.expand(len(rows), -1), rows], -1)[:, columns]
     return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
 

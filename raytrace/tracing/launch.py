@@ -285,23 +285,15 @@ def stop_radius(lens: Lens) -> Tensor:
     The paraxial ray with paraxial ray aiming, or where the real one does not reach the stop; else the real one. At the
     primary wavelength. Where the axis bends it is measured from the base ray.
     """
-    return _stop_radius(lens, axial_beam(lens), _entrance(lens))[0]
+    return _stop_radius(lens, lens.ray_aiming, axial_beam(lens), _entrance(lens))[0]
 
 
-def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
-    """The points (2, ...) mm of the stop that rays of pupil points (2, ...) are aimed at; and its radius, mm."""
-    beam, entrance = axial_beam(lens), _entrance(lens)
-    radius = _stop_radius(lens, beam, entrance)[0]
-    target = pupil if entrance is None else _turned(entrance.turn, pupil)
-    return _scaled(target, _signed(radius, beam, entrance)), radius
-
-
-def _stop_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
+def _stop_radius(lens: Lens, ray_aiming: str, beam: Beam, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
     """And whether the real marginal ray reaches the stop; None if that is not traced."""
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value, None
     estimate = beam.stop_height.abs() if entrance is None else entrance.radius
-    if lens.ray_aiming == "paraxial":
+    if ray_aiming == "paraxial":
         return estimate, None
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(beam.entrance_pupil_diameter.dtype)
     index = index_behind(lens, 0, lens.primary).to(edge.dtype)
@@ -318,7 +310,7 @@ def _signed(radius: Tensor, beam: Beam, entrance: Entrance | None) -> Tensor:
 
 def _aimed_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> Tensor:
     """As `_signed`; warns MarginalRayLost."""
-    radius, arrives = _stop_radius(lens, beam, entrance)
+    radius, arrives = _stop_radius(lens, lens.ray_aiming, beam, entrance)
     if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=calling_level())
@@ -542,7 +534,9 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
     wavelength, points = lens.primary, fields[:, :, None, None]
     five = fields.new_tensor([[0.0, 0.0, 0.0, -1.0, 1.0], [0.0, -1.0, 1.0, 0.0, 0.0]])
     pupil = vignette(lens, points, five)
-    target, radius = points_of_stop(with_ray_aiming(lens, "real"), pupil)
+    beam, entrance = axial_beam(lens), entrance_of(lens) if is_bent(lens) and not lens.fields.telecentric else None
+    radius = _stop_radius(lens, "real", beam, entrance)[0]
+    target = _scaled(pupil if entrance is None else _turned(entrance.turn, pupil), _signed(radius, beam, entrance))
     position, arrives = at_stop(lens, rays_of_field(lens, points, pupil, wavelength=wavelength), wavelength)
     missed = torch.linalg.vector_norm(position - target, dim=0) / radius
     missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)[..., 0, :]

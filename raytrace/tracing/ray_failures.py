@@ -1,5 +1,6 @@
 """Ray failures: where the rays of every field and wavelength fail or are vignetted, and messages about them."""
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 
@@ -13,7 +14,7 @@ from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, one_lens
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import axial_beam
-from raytrace.tracing.trace import Crossing, lens_steps
+from raytrace.tracing.trace import Crossing, lens_steps, trace_lens
 from raytrace.words import RaytraceWarning, calling_level
 
 #: Status of a ray, and its wording at a surface.
@@ -136,6 +137,7 @@ def warn_of_failures(
         _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")
 
 
+@torch.no_grad()
 def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> None:
     """Report fields (2, F), by default the lens's, whose rays all fail at the primary wavelength, with a remedy.
 
@@ -148,13 +150,18 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer `fields`")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of aiming: the failures are reported below
-        found = ray_failures(lens, pupil, fields=tried, wavelengths=primary)
-    dark = (found.arrived[:, 0] == 0).nonzero()[:, 0].tolist()
+        rays = launch(lens, pupil, fields=tried, wavelengths=primary)
+        arrives = trace_lens(lens, dataclasses.replace(rays, opl=None), primary[:, None]).valid
+        dark = (~arrives.any(-1)[:, 0]).nonzero()[:, 0].tolist()
+        if not dark:
+            return
+        found = ray_failures(lens, pupil, fields=tried[:, dark], wavelengths=primary)
+    names, help_words = [_named(lens, tried[:, f]) for f in dark], _help(lens, fields)
     messages = [
-        f"no ray of field {_named(lens, tried[:, f])} reaches the sensor: {found.words(f, 0)}; {_help(lens, fields)}"
-        for f in dark
+        f"no ray of field {name} reaches the sensor: {found.words(place, 0)}; {help_words}"
+        for place, name in enumerate(names)
     ]
-    if dark and (every or len(dark) == tried.shape[1]):
+    if every or len(dark) == tried.shape[1]:
         raise OutOfReach(messages[0])
     for words in messages:
         _warn(words)
