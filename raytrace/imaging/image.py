@@ -85,7 +85,7 @@ def blur_adjoint(image: Tensor, kernel: Tensor, *, boundary: str = "valid", orig
     image: (..., H, W) as returned by `blur` with this boundary; returns images, larger than `image` for "valid".
     """
     more = [n - 1 if boundary == "valid" else 0 for n in kernel.shape[-2:]]
-    batch = torch.broadcast_shapes(image.shape[:-2], kernel.shape[:-2])
+    batch = broadcast_shape(image.shape[:-2], kernel.shape[:-2])
     picture = image.new_zeros(*batch, *(n + m for n, m in zip(image.shape[-2:], more, strict=True)))
     _, transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)
     return transpose(image.expand(*batch, *image.shape[-2:]))[0]

@@ -16,6 +16,8 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Self
@@ -47,7 +49,7 @@ from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.imaging.warp import resampled
 from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
-from raytrace.maths.numerics import varies
+from raytrace.maths.numerics import placed, varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
@@ -72,6 +74,7 @@ _ROUNDS = 4
 _PLANES = 8
 _AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
 _EDGE, _PARTS = 0.01, 20  # pixels, to which it is known; parts of a range that are searched at once
+_ABOUT = 1 / 400  # of the corner's distance, to which it is known where sensors are refused
 _BEYOND_FIELDS = 1.5  # image heights of the largest field, to the corners of a sensor
 _MOST_NUMBERS = 2**27  # of kernels there: about a minute for the blur of a picture of 240 × 160 pixels
 _SIZES = 12  # of sensors among which the largest is searched
@@ -290,8 +293,7 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
-    circle = None if is_stop_alone(lens) else _image_circle(lens, sensor, like)
-    corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
+    named = lens
     how = {"lateral_colour": lateral_colour, "elements": elements}
     if wavelengths is not None:
         lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
@@ -299,7 +301,10 @@ def optics(
     over_response = wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1
     if not is_stop_alone(lens):
         few = _at_wavelengths(lens, *band(sensor.response), _WAVELENGTHS[0]) if over_response else lens
-        _check_reach(few, sensor, circle, model, size, nodes, distances, lateral_colour, tol)
+        about = partial(_image_circle, named, sensor, like)
+        _check_reach(few, sensor, about, model, size, nodes, distances, lateral_colour, tol)
+    circle = None if is_stop_alone(lens) else _image_circle(named, sensor, like)
+    corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     if over_response and not is_stop_alone(lens):
         sampled = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
     weights = sensor.weights(sampled.wavelengths, sampled.wavelength_weights).to(like)
@@ -329,7 +334,7 @@ def optics(
 def _check_reach(
     lens: Lens,
     sensor: Sensor,
-    circle: tuple[Tensor, Tensor] | None,
+    image_circle: Callable[[float], tuple[Tensor, Tensor] | None],
     model: str | None,
     size: int | None,
     nodes: tuple[int, int] | None,
@@ -341,12 +346,12 @@ def _check_reach(
 
     There the blur grows so fast that the tolerance needs the largest number of nodes. Raises WindowTooLarge or
     OverBudget, with the largest sensor of the same shape, where kernels of them as large as those of the corners cannot
-    be computed.
+    be computed; image_circle: known to a number of mm.
     """
     corner, height = float(torch.hypot(*sensor.corners).max()), _image_height(lens, sensor)
     if not height or corner <= _BEYOND_FIELDS * height:
         return
-    weights = sensor.weights(lens.wavelengths, lens.wavelength_weights)
+    weights, circle = sensor.weights(lens.wavelengths, lens.wavelength_weights), image_circle(_ABOUT * corner)
 
     def check(share: float) -> None:
         part = dataclasses.replace(sensor, size=tuple(share * side for side in sensor.size))
@@ -531,11 +536,12 @@ def _afford_kernels(nodes: tuple[int, int], count: int, weights: Tensor, size: i
     afford(each * channels * columns * rows, what, helps="take a picture of fewer pixels")
 
 
-def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Tensor] | None:
+def _image_circle(lens: Lens, sensor: Sensor, like: Tensor, edge: float | None = None) -> tuple[Tensor, Tensor] | None:
     """Middle (2, 1) mm and radii (A,) mm of the image circle at equidistant azimuths, or None if it holds the sensor.
 
-    Outside no chief ray arrives, or no light. Of a round lens a single radius.
+    Outside no chief ray arrives, or no light. Of a round lens a single radius. edge: mm to which radii are known.
     """
+    edge = _EDGE * sensor.pitch if edge is None else edge
     with torch.no_grad(), warnings.catch_warnings():
         round_ = is_round_about_axis(lens)
         middle = like.new_zeros(2, 1) if round_ else sensor.landing(lens, like.new_zeros(2, 1)).nan_to_num(0.0)
@@ -547,7 +553,7 @@ def _image_circle(lens: Lens, sensor: Sensor, like: Tensor) -> tuple[Tensor, Ten
         warnings.simplefilter("ignore", RaytraceWarning)  # of rays outside
         if bool(_has_light(lens, sensor, middle + width * ray).all()):
             return None
-        for _ in range(math.ceil(math.log(float(width) / (_EDGE * sensor.pitch), _PARTS))):
+        for _ in range(math.ceil(math.log(float(width) / edge, _PARTS))):
             width = width / _PARTS
             places = middle[..., None] + (inside + width * parts) * ray[:, None]  # (2, parts, A)
             arrives = _has_light(lens, sensor, places.flatten(1)).unflatten(0, places.shape[1:])
@@ -703,11 +709,11 @@ def _illumination(
 def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     fields = sensor.fields(lens, points)
     arrives = ~fields.isnan().any(0)
-    try:
-        values = relative_illumination(lens, fields=fields.nan_to_num(0.0)).illumination
-    except OutOfReach:  # of all of them
-        values = torch.zeros_like(fields[0])
-    return torch.where(arrives & ~values.isnan(), values, 0.0)
+    values = torch.zeros_like(fields[0, arrives])
+    if len(values):
+        with suppress(OutOfReach):  # of all of them
+            values = relative_illumination(lens, fields=fields[:, arrives]).illumination
+    return placed(values.nan_to_num(0.0), arrives)
 
 
 def _ideal(

@@ -11,7 +11,7 @@ from numpy.polynomial import legendre
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import is_wrapped, safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import broadcast_shape, is_wrapped, safe_divide, safe_sqrt, value
 from raytrace.maths.sampling import Grid, centres, edges, gauss_rings, sobol
 from raytrace.maths.tangents import applied
 from raytrace.psf_models.drt import histogram
@@ -173,7 +173,7 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
     if any(map(is_wrapped, (*across, *along, xx, xy, yy))):
         return _rule(across, along, xx, xy, yy, det)  # a choice by values cannot be mapped
     width = across[3] * safe_sqrt(safe_divide(torch.maximum(xx, yy), det))
-    batch = torch.broadcast_shapes(*(t.shape[:-2] for t in (xx, across[2], along[2])))
+    batch = broadcast_shape(*(t.shape[:-2] for t in (xx, across[2], along[2])))
     narrow = ((det > 0) & (width <= _WIDEST)).expand(*batch, 1, 1).flatten()
     rows, columns = along[2].shape[-2], across[2].shape[-1]
 
