@@ -19,8 +19,8 @@
 
 To add:
 
-- a shape: its sag and derivatives in `shapes`, a row of KINDS, and its terms in tracing/cpp/sags.h for the compiled
-  trace (`code=None`: torch alone);
+- a shape: its sag and derivatives in `shapes`, a row of KINDS, and its sag in tracing/cpp/sags.h for the compiled trace
+  (`code=None`: torch alone);
 - sag terms: a value and its functions in `sag_terms`, a row of SAG_TERMS;
 - an aperture: its edges in `apertures`, a row of SHAPES, and its lines in tracing/cpp/apertures.h;
 - a phase: a value and its path in `phases`, a row of PHASES.

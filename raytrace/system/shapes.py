@@ -8,8 +8,8 @@ A toroid is the curve g turned about a line along y through z = 1/c_x. Of toroid
 are those of the section along y; the other numbers are coefficients. Beyond its edge a surface keeps the height there.
 
 KINDS has a row for each `Surface.kind`, `sag_terms.SAG_TERMS` one for each class of `Surface.sag_terms`, D(x, y). A new
-kind is a new row, which tracing, derivatives, first order, variables, figures and files read, and its terms in
-tracing/cpp/sags.h, if the compiled engine is to trace it.
+kind is a function and a new row, which tracing, derivatives, first order, variables, tolerances, figures and files read,
+and a function in tracing/cpp/sags.h, from which the compiled engine derives its trace, adjoint and tangents.
 """
 
 import dataclasses
@@ -93,13 +93,14 @@ class Form:
 
     sag: with its derivatives up to the highest; covers: where there is a surface, on the sheet of the vertex;
     extent: of c, k, a and a limit (...) mm, how far that sheet goes along x and y, at most to the limit;
-    size: of c, a and points, what the sag adds up from, by which its rounding is judged.
+    size: of c, a and points, what the sag adds up from beside its height, by which its rounding is judged.
+    By default a sag covers the plane.
     """
 
     sag: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, int], Sag]
-    covers: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
-    extent: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-    size: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+    covers: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor] = lambda c, k, a, x, y: torch.isfinite(x + y)
+    extent: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] = lambda c, k, a, limit: (limit, limit)
+    size: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor] = lambda c, a, x, y: torch.zeros_like(x + y)
 
 
 def _section(c: Tensor, k: Tensor, a: Tensor, y: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -218,7 +219,8 @@ class Kind:
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: entries of the column "type" of a table; an empty one is resolved by the powers of the terms.
-    code: the kind in tracing/cpp/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
+    code: the place among `Kind` of tracing/cpp/sags.h, which traces up to `compiled` coefficients; None: traced by torch
+    alone.
     """
 
     name: str
@@ -254,10 +256,10 @@ class Kind:
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
-        Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4, compiled=8),
-        Kind("toroidal", zemax="TOROIDAL", form=TOROIDAL, heads=("curvature_x",), least=1, most=8, code=5, compiled=8),
-        Kind("biconic", zemax="BICONICX", form=BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2, code=6),
+        Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=4),
+        Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=5, compiled=8),
+        Kind("toroidal", zemax="TOROIDAL", form=TOROIDAL, heads=("curvature_x",), least=1, most=8, code=6, compiled=8),
+        Kind("biconic", zemax="BICONICX", form=BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2, code=7),
     )
 }
 

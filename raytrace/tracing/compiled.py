@@ -114,7 +114,7 @@ def _available(*, build: bool) -> bool:
 # -- surfaces as integers and numbers ----------------------------------------------------------------------------------
 
 _TURN, _PLANE, _SPHERE, _CONIC = range(-1, 3)  # and the codes of shapes.KINDS
-_WITH_SAG_TERMS, _FRAME = 7, 4  # kWithSagTerms of sags.h; kFrame of sag_terms.h, its numbers before the coefficients
+_WITH_SAG_TERMS, _FRAME = 3, 4  # kWithSagTerms of sags.h; kFrame of sag_terms.h, its numbers before the coefficients
 _NONE, _REFRACT, _REFLECT = range(3)
 
 #: What a phase becomes before it is traced, by `Form` of paths.h.

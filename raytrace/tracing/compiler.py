@@ -140,7 +140,7 @@ def _link(name: str, folder: int, path: Path) -> Path | None:
 #: The folder of the C++ sources.
 CPP = Path(__file__).absolute().parent / "cpp"
 SOURCES = (
-    *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "sag_terms.h", "loops.h", "facets.h", "phases.h"),
+    *("block.h", "jet.h", "sags.h", "apertures.h", "paths.h", "sag_terms.h", "loops.h", "facets.h", "phases.h"),
     *("search.h", "careful.h", "adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")

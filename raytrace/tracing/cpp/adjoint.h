@@ -27,36 +27,33 @@ struct Sums {
   T gap = 0, c = 0, k = 0, n1 = 0, n2 = 0, a[kTerms] = {};
 };
 
+// What variable i gets from the cotangents of the normal, and from s.
+template <int i, typename T, typename Face>
+[[gnu::always_inline]] inline T pulled(const Face& F, T gnx, T gny, T gnz) {
+  return as<T>(BY(F, kX, i) * gnx + BY(F, kY, i) * gny + BY(F, kZ, i) * gnz);
+}
+template <int i, typename T, typename Face>
+[[gnu::always_inline]] inline T pulled(const Face& F, T gnx, T gny, T gnz, T s_bar) {
+  return pulled<i, T>(F, gnx, gny, gnz) - as<T>(BY(F, i) * s_bar);
+}
+
 template <typename T, int kind, int bend, bool path, int terms>
 Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n, const Surface<T>& s) {
-  const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2;
+  const T gap = s.gap, n1 = s.n1, n2 = s.n2;
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2, side = T(s.at->side);
   const bool has_gap = s.at->gap >= 0;
   if constexpr (has_sag_terms(kind)) sag_terms_on<true>(to, notes, n, s);
-  T sum_gap = 0, sum_c = 0, sum_k = 0, sum_n1 = 0, sum_n2 = 0, sum_first = 0, sum_second = 0;
-#pragma omp simd reduction(+ : sum_gap, sum_c, sum_k, sum_n1, sum_n2, sum_first, sum_second)
+  T sum_gap = 0, sum_c = 0, sum_k = 0, sum_n1 = 0, sum_n2 = 0, sum_0 = 0, sum_1 = 0, sum_2 = 0, sum_3 = 0;
+#pragma omp simd reduction(+ : sum_gap, sum_c, sum_k, sum_n1, sum_n2, sum_0, sum_1, sum_2, sum_3)
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
     T hx = to.x[i], hy = to.y[i], hz = to.z[i];
     T gX = g.x[i], gY = g.y[i], gZ = g.z[i], gl = g.L[i], gm = g.M[i], gn = g.N[i];
-    T u = hx * hx + hy * hy;
 
     // The normal, its squared length and the cosine.
-    [[maybe_unused]] std::conditional_t<is_freeform(kind), SheetOf<T, kind, terms>, int> sheet{};
-    T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0;
-    if (kind == kSphere || kind == kConic) {
-      nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
-      if (kind == kConic) w = T(1) - k * c * c * u;
-    } else if (has_terms(kind)) {
-      sag<kind, true>(s, terms, u, S, dS, d2S);
-      nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
-    } else if constexpr (has_sag_terms(kind)) {
-      sag<kind, true>(s, terms, u, S, dS, d2S);
-      nx = T(-2) * dS * hx - notes.added.x[i], ny = T(-2) * dS * hy - notes.added.y[i], w = T(1) + nx * nx + ny * ny;
-    } else if constexpr (is_freeform(kind)) {
-      sheet = sheet_at<kind, terms, true>(s, hx, hy);
-      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
-    }
+    const auto F = face_at<kind, terms, kVaried, kAllRows>(s, notes.added, i, hx, hy, hz);
+    T nx = as<T>(BY(F, kX)), ny = as<T>(BY(F, kY)), nz = as<T>(BY(F, kZ)), w = 1;
+    if (!is_unit(kind)) w = nx * nx + ny * ny + nz * nz;
     T tilt = nx * L + ny * M, cosine = tilt + nz * N, over_cosine;
 
     // Behind the surface: Snell's law or that of reflection.
@@ -106,62 +103,21 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     }
 
     // The normal depends on the hit and on the shape.
-    T gdS = 0, over_w = 0, conic_sag = 0, gx = 0, gy = 0;  // gx, gy: of the slopes of a sag that is not round
-    if (kind == kSphere || kind == kConic) {
-      gX -= c * gnx, gY -= c * gny, gZ -= shape * c * gnz;
-      sum_c -= hx * gnx + hy * gny + shape * hz * gnz;
-      if (kind == kConic) {
-        T pull_w = T(-2) * k * c * gw;
-        gX += pull_w * c * hx, gY += pull_w * c * hy;
-        sum_c += pull_w * u;
-        sum_k -= c * hz * gnz + c * c * u * gw;
-      }
-    } else if (has_terms(kind)) {
-      gdS = T(-2) * (hx * gnx + hy * gny) + T(8) * dS * u * gw;
-      T radicand = T(1) - shape * c * c * u;
-      over_w = T(1) / root(radicand > 0 ? radicand : T(1));
-      T steep = c * over_w;
-      T gu = gdS * d2S + T(0.25) * shape * steep * gdS * steep * steep + T(4) * dS * dS * gw;
-      gX += T(2) * (hx * gu - dS * gnx), gY += T(2) * (hy * gu - dS * gny);
-      conic_sag = c * u * over_w / (over_w + T(1));
-      T third = over_w * over_w * over_w;
-      sum_c += T(0.5) * gdS * third;
-      sum_k += T(0.25) * gdS * c * c * c * u * third;
-    } else if constexpr (has_sag_terms(kind)) {
-      gx = T(-2) * nx * gw - gnx, gy = T(-2) * ny * gw - gny;
-      gdS = T(2) * (hx * gx + hy * gy);
-      T radicand = T(1) - shape * c * c * u;
-      over_w = T(1) / root(radicand > 0 ? radicand : T(1));
-      T steep = c * over_w, gu = gdS * d2S + T(0.25) * shape * steep * gdS * steep * steep;
-      gX += T(2) * (hx * gu + dS * gx) + notes.added.xx[i] * gx + notes.added.xy[i] * gy;
-      gY += T(2) * (hy * gu + dS * gy) + notes.added.xy[i] * gx + notes.added.yy[i] * gy;
-      conic_sag = c * u * over_w / (over_w + T(1));
-      T third = over_w * over_w * over_w;
-      sum_c += T(0.5) * gdS * third;
-      sum_k += T(0.25) * gdS * c * c * c * u * third;
-    } else if constexpr (is_freeform(kind)) {
-      gx = T(2) * sheet.x * gw - gnx, gy = T(2) * sheet.y * gw - gny;
-      gX += sheet.xx * gx + sheet.xy * gy, gY += sheet.xy * gx + sheet.yy * gy;
-    }
+    if (!is_unit(kind)) gnx += T(2) * gw * nx, gny += T(2) * gw * ny, gnz += T(2) * gw * nz;
+    gX += pulled<kX, T>(F, gnx, gny, gnz), gY += pulled<kY, T>(F, gnx, gny, gnz), gZ += pulled<kZ, T>(F, gnx, gny, gnz);
 
     // The hit: implicit function theorem.
     // Z̄ - s n_z is written out, so that a gap gets exactly 0 from rays along the axis: they do not see it.
     T across = gX * L + gY * M, s_bar = (across + gZ * N) * over_cosine;
     gZ = (gZ * tilt - across * nz) * over_cosine;
     gX -= s_bar * nx, gY -= s_bar * ny;
-    if (kind == kSphere || kind == kConic) {
-      sum_c += T(0.5) * s_bar * (u + shape * hz * hz);
-      if (kind == kConic) sum_k += T(0.5) * s_bar * c * hz * hz;
-    } else if (has_terms(kind) || has_sag_terms(kind)) {
-      sum_c += s_bar * u * over_w * over_w / (over_w + T(1));
-      sum_k += T(0.5) * s_bar * c * conic_sag * conic_sag * over_w;
-      notes.px[i] = s_bar, notes.py[i] = gdS;
-      if constexpr (has_sag_terms(kind)) notes.t[i] = gx, notes.active[i] = gy;
-    } else if constexpr (is_freeform(kind)) {
-      const Shares<T> shares = sheet.pulled(s_bar, gx, gy);
-      sum_c += shares.c, sum_k += shares.k, sum_first += shares.first, sum_second += shares.second;
-      notes.px[i] = shares.height, notes.py[i] = shares.slope;
+    sum_c += pulled<kC, T>(F, gnx, gny, gnz, s_bar), sum_k += pulled<kK, T>(F, gnx, gny, gnz, s_bar);
+    sum_0 += pulled<kA, T>(F, gnx, gny, gnz, s_bar), sum_1 += pulled<kA + 1, T>(F, gnx, gny, gnz, s_bar);
+    sum_2 += pulled<kA + 2, T>(F, gnx, gny, gnz, s_bar), sum_3 += pulled<kA + 3, T>(F, gnx, gny, gnz, s_bar);
+    if (is_searched(kind)) {
+      notes.px[i] = pulled<kHeight, T>(F, gnx, gny, gnz, s_bar), notes.py[i] = pulled<kSlope, T>(F, gnx, gny, gnz);
     }
+    if constexpr (has_sag_terms(kind)) notes.px[i] = s_bar, notes.t[i] = -gnx, notes.active[i] = -gny;
     T t = (hx - x) * L + (hy - y) * M + (hz - (z - gap)) * N;
     g.L[i] = gL + t * gX, g.M[i] = gM + t * gY, g.N[i] = gN + t * gZ;
     sum_gap += ggap - gZ;
@@ -169,10 +125,11 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   }
   Sums<T> sums;
   sums.gap = sum_gap, sums.c = sum_c, sums.k = sum_k, sums.n1 = sum_n1, sums.n2 = sum_n2;
-  if constexpr (has_terms(kind) || has_sag_terms(kind)) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
-  if constexpr (is_freeform(kind)) sums.a[0] = sum_first;
-  if constexpr (kind == kBiconic) sums.a[1] = sum_second;
-  if constexpr (kind == kToroidal && terms > 1) sum_series<1, false, true>(to, notes, n, s.at->terms - 1, sums.a + 1);
+  if constexpr (is_searched(kind)) {
+    const T heads[] = {sum_0, sum_1, sum_2, sum_3};
+    for (int j = 0; j < SagOf<kind>::heads; j++) sums.a[j] = heads[j];
+    if (s.at->terms > SagOf<kind>::heads) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
+  }
   return sums;
 }
 

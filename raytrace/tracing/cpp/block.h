@@ -55,6 +55,14 @@ Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
   return s;
 }
 
+// Changes of the numbers of a surface, and whether there are any.
+template <typename T>
+struct Change {
+  T gap, c, k, n1, n2, a[kTerms];
+  const T *phase, *sag_terms;
+  bool any;
+};
+
 // Rays in the frame of one surface; path is touched only where it is asked for.
 template <typename T>
 struct alignas(64) Rays {

@@ -23,9 +23,7 @@ struct Ray { double x, y, z, L, M, N, path; };
 
 // Path from the foot of the perpendicular; whether there is a crossing.
 inline bool crossing(const Surface<double>& s, double x, double y, double z, double L, double M, double N, double& t) {
-  if (has_terms(s.at->kind)) return AsphereSearch{s, x, y, z, L, M, N}(t);
-  if (has_sag_terms(s.at->kind)) return DepartedSearch{s, x, y, z, L, M, N}(t);
-  if (is_freeform(s.at->kind)) return FreeformSearch{s, x, y, z, L, M, N}(t);
+  if (is_searched(s.at->kind)) return Search{s, x, y, z, L, M, N}(t);
   double c = s.c, shape = 1 + s.k;
   double A = c * (L * L + M * M + shape * N * N);
   double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
@@ -49,18 +47,11 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (!(std::fabs(t) < farthest)) return false;
     hx = x - t * L, hy = y - t * M, hz = 0;
   } else {
-    const bool asphere = has_terms(s.at->kind), freeform = is_freeform(s.at->kind);
     double slide = -(x * L + y * M + ahead * N), t = 0, F, dF;
     double px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
     if (!crossing(s, px, py, pz, L, M, N, t)) return false;
     hx = px + t * L, hy = py + t * M, hz = pz + t * N;
-    if (asphere) {
-      Slope at = slope_at(s, hx * hx + hy * hy);
-      F = hz - at.S, dF = N - 2 * at.dS * (hx * L + hy * M);
-    } else if (has_sag_terms(s.at->kind)) {
-      Height at = departed_at(s, hx, hy);
-      F = hz - at.z, dF = N - (at.x * L + at.y * M);
-    } else if (freeform) {
+    if (is_searched(s.at->kind)) {
       Height at = height_at(s, hx, hy);
       F = hz - at.z, dF = N - (at.x * L + at.y * M);
     } else {
@@ -69,13 +60,7 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     }
     double step = F / dF;  // polished
     hx -= step * L, hy -= step * M, hz -= step * N;
-    if (asphere) {
-      double dS = slope_at(s, hx * hx + hy * hy).dS;
-      nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
-    } else if (has_sag_terms(s.at->kind)) {
-      Height at = departed_at(s, hx, hy);
-      nx = -at.x, ny = -at.y, w = 1 + nx * nx + ny * ny;
-    } else if (freeform) {
+    if (is_searched(s.at->kind)) {
       Height at = height_at(s, hx, hy);
       nx = -at.x, ny = -at.y, w = 1 + nx * nx + ny * ny;
     } else {

@@ -1,7 +1,6 @@
 // The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
 #include "sag_terms.h"
-#include "freeform.h"
 
 namespace raytrace {
 
@@ -134,11 +133,12 @@ constexpr T kBeyond = T(1.125);
 // more steeply than the surface stands anywhere there. NaN or 1 where there is no such angle.
 template <int kind, typename T>
 T single_crossing(const Surface<T>& s, T radius) {
+  constexpr bool odd = SagOf<kind>::odd;
   const T bent = s.c * radius;  // the slope of a conic rises outwards
-  T slope = magnitude(bent) / root(T(1) - (T(1) + s.k) * bent * bent), power = kind == kOdd ? T(1) : radius;
+  T slope = magnitude(bent) / root(T(1) - (T(1) + s.k) * bent * bent), power = odd ? T(1) : radius;
   for (int j = 0; j < s.at->terms; j++) {
-    slope += T(kind == kOdd ? j + 1 : 2 * j + 2) * magnitude(s.a[j]) * power;
-    power *= kind == kOdd ? radius : radius * radius;
+    slope += T(odd ? j + 1 : 2 * j + 2) * magnitude(s.a[j]) * power;
+    power *= odd ? radius : radius * radius;
   }
   if constexpr (has_sag_terms(kind)) slope += sag_terms_slope(s, radius);
   return T(1) - T(1) / (T(1) + slope * slope);
@@ -146,28 +146,15 @@ T single_crossing(const Surface<T>& s, T radius) {
 
 template <typename T, int kind, int terms>
 void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
-  const T gap = s.gap, c = s.c, shape = T(1) + s.k;
-  const T rim = T(s.rim) * (is_freeform(kind) ? T(1) : kBeyond<T>), rim_squared = rim * rim;
+  const T gap = s.gap, rim = T(s.rim) * (is_round<kind>() ? kBeyond<T> : T(1)), rim_squared = rim * rim;
+  const auto quadric = osculating<kind, terms>(s);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i] - gap, L = from.L[i], M = from.M[i], N = from.N[i];
     T slide = x * L + y * M + z * N;
     T px = x - slide * L, py = y - slide * M, pz = z - slide * N;
-    T A, G, F;
-    if (is_freeform(kind)) {  // the quadric that osculates at the vertex, as round as its larger curvature is
-      T c_x = s.a[0], c_y = curvature_along_y<kind>(s);
-      T c_z = magnitude(c_x * px * px) > magnitude(c_y * py * py) ? c_x : c_y;
-      A = c_x * L * L + c_y * M * M + c_z * N * N;
-      G = N - (c_x * px * L + c_y * py * M + c_z * pz * N);
-      F = c_x * px * px + c_y * py * py + c_z * pz * pz - T(2) * pz;
-    } else {
-      A = c * (L * L + M * M + shape * N * N);
-      G = N - c * (px * L + py * M + shape * pz * N);
-      F = c * (px * px + py * py + shape * pz * pz) - T(2) * pz;
-    }
-    T discriminant = G * G - A * F;
-    bool usable = (discriminant > 0) & (G * N > 0);
-    T t = F / (usable ? G + signed_as(root(usable ? discriminant : T(1)), N) : T(1));
+    T t;
+    bool usable = quadric.meets(px, py, pz, L, M, N, t);
     T hx = px + t * L, hy = py + t * M;
     bool within = hx * hx + hy * hy <= rim_squared;
     bool flat = magnitude(N) > T(1e-6);
@@ -183,21 +170,9 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
     for (int i = 0; i < n; i++) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
       T x = notes.px[i] + t * L, y = notes.py[i] + t * M, z = notes.pz[i] + t * N;
-      T u = x * x + y * y, S, dS, d2S, dF;
-      T change;
-      if constexpr (has_ring<T>(kind)) {
-        change = Ring<T, terms>(s, y).newton(s.a[0], x, z, L, M, N);
-      } else {
-        if constexpr (is_freeform(kind)) {
-          const auto sheet = sheet_at<kind, terms, false>(s, x, y);
-          S = sheet.z, dF = N - (sheet.x * L + sheet.y * M);
-        } else {
-          sag<kind, false>(s, terms, u, S, dS, d2S);
-          dF = N - T(2) * dS * (x * L + y * M);
-        }
-        if constexpr (has_sag_terms(kind)) S += notes.added.p[i], dF -= notes.added.x[i] * L + notes.added.y[i] * M;
-        change = (z - S) / dF;
-      }
+      T u = x * x + y * y;
+      const auto S = whole_sag_at<kind, terms, kStill, kNoRows>(s, notes.added, i, x, y);
+      T change = (z - S.v) / (N - (S.d[kX] * L + S.d[kY] * M));
       bool active = notes.active[i] > 0;
       notes.t[i] = active ? t - change : t;
       bool more = active & !(change * change <= kSmallStep<T> * kSmallStep<T> * (u + z * z));
@@ -217,48 +192,25 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
   const T beyond = kBeyond<T> * T(s.rim), beyond_squared = beyond * beyond;
   T single = 1;
-  if constexpr (!is_freeform(kind)) single = single_crossing<kind>(s, beyond);
+  if constexpr (is_round<kind>()) single = single_crossing<kind>(s, beyond);
   int flagged = 0;
 #pragma omp simd reduction(+ : flagged)
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
     T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
-    T u = hx * hx + hy * hy, nx, ny, nz = 1, cosine, w;
-    T off, size;
-    bool good;
-    if constexpr (has_ring<T>(kind)) {
-      const Ring<T, terms> ring(s, hy);
-      T c_x = s.a[0], over = T(1) / ring.scale, q = T(1) - c_x * ring.g * over;
-      nx = -c_x * hx, ny = -q * ring.dg * over, nz = T(1) - c_x * hz;
-      good = ring.open & (q > 0) & (nz > (T(1) - kEdge<T>) * q);
-      cosine = nx * L + ny * M + nz * N, w = nx * nx + ny * ny + nz * nz;
-      T g = ring.g * over, bent = T(0.5) * c_x * (hx * hx + hz * hz - g * g);
-      off = hz - g - bent, size = magnitude(hz) + magnitude(g) + magnitude(bent);
-    } else if constexpr (is_freeform(kind)) {
-      const auto sheet = sheet_at<kind, terms, false>(s, hx, hy);
-      off = hz - sheet.z, size = magnitude(hz) + magnitude(sheet.z);
-      good = sheet.inside, nx = -sheet.x, ny = -sheet.y;
-      cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
-    } else {
-      T S, dS, d2S;
-      good = sag<kind, false>(s, terms, u, S, dS, d2S);
-      T slope = T(2) * dS;
-      off = hz - S, size = magnitude(hz) + magnitude(S);
-      nx = -slope * hx, ny = -slope * hy, cosine = N - slope * (hx * L + hy * M);
-      w = T(1) + slope * slope * u;
-    }
-    if constexpr (has_sag_terms(kind)) {
-      off -= notes.added.p[i], size += magnitude(notes.added.p[i]);
-      nx -= notes.added.x[i], ny -= notes.added.y[i];
-      cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
-    }
+    T u = hx * hx + hy * hy;
+    const auto S = whole_sag_at<kind, terms, kStill, kNoRows>(s, notes.added, i, hx, hy);
+    T off = hz - S.v, size = magnitude(hz) + magnitude(S.v), nx = -S.d[kX], ny = -S.d[kY];
+    T cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
+    bool good = S.inside;
+    if constexpr (has_sag_terms(kind)) size += magnitude(notes.added.p[i]);
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
     good &= (notes.active[i] < T(0.5)) & (cosine * N > 0);
     good &= (u <= rim_squared) | ((u <= beyond_squared) & (N * N > single));
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
     good &= magnitude(off) <= kOff<T> * (size + root(u));
     T l = L, m = M, o = N;
-    if (bend != kNone) good &= law(l, m, o, nx, ny, nz, cosine, w);
+    if (bend != kNone) good &= law(l, m, o, nx, ny, T(1), cosine, w);
     if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
     flagged += leave(to, notes, i, hx, hy, hz, l, m, o, good);
   }
@@ -268,28 +220,13 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
 // The normals of a surface where rays stand on it, and their squared lengths, in notes.normal.
 template <typename T, int kind, int terms>
 void normals(const Rays<T>& at, Notes<T>& notes, int n, const Surface<T>& s) {
-  const T c = s.c, shape = T(1) + s.k;
   Normals<T>& to = notes.normal;
   if constexpr (has_sag_terms(kind)) sag_terms_on<false>(at, notes, n, s);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
-    T x = at.x[i], y = at.y[i], u = x * x + y * y, nx = 0, ny = 0, nz = 1, w = 1;
-    if (kind == kSphere || kind == kConic) {
-      nx = -c * x, ny = -c * y, nz = T(1) - shape * c * at.z[i];
-      if (kind == kConic) w = T(1) - s.k * c * c * u;
-    } else if (has_terms(kind)) {
-      T S, dS, d2S;
-      sag<kind, false>(s, terms, u, S, dS, d2S);
-      nx = T(-2) * dS * x, ny = T(-2) * dS * y, w = T(1) + T(4) * dS * dS * u;
-    } else if constexpr (has_sag_terms(kind)) {
-      T S, dS, d2S;
-      sag<kind, false>(s, terms, u, S, dS, d2S);
-      nx = T(-2) * dS * x - notes.added.x[i], ny = T(-2) * dS * y - notes.added.y[i], w = T(1) + nx * nx + ny * ny;
-    } else if constexpr (is_freeform(kind)) {
-      const auto sheet = sheet_at<kind, terms, false>(s, x, y);
-      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
-    }
-    to.x[i] = nx, to.y[i] = ny, to.z[i] = nz, to.w[i] = w;
+    const auto F = face_at<kind, terms, kStill, kNoRows>(s, notes.added, i, at.x[i], at.y[i], at.z[i]);
+    T nx = as<T>(BY(F, kX)), ny = as<T>(BY(F, kY)), nz = as<T>(BY(F, kZ));
+    to.x[i] = nx, to.y[i] = ny, to.z[i] = nz, to.w[i] = nx * nx + ny * ny + nz * nz;
   }
 }
 

@@ -5,7 +5,7 @@
 //
 // A new form is one more `Form`, in the order of FORMS in structure.py, and a case of `path_at`, `path_change` and `sum_path`.
 #pragma once
-#include "block.h"
+#include "sags.h"
 
 namespace raytrace {
 
@@ -131,51 +131,53 @@ void radial(const C* a, int count, const T* x, const T* y, int n, Added<T, size>
   }
 }
 
-// The way from one point of a hologram to P: its direction e, and how much longer it is than to the vertex.
-template <typename T>
-struct FromPoint {
-  T x, y, z, over, longer;  // over: 1/|P - Q|
-  FromPoint(T a, T b, T c, T far, T px, T py) {
-    T dx = px - a, dy = py - b, r = root(dx * dx + dy * dy + c * c);
-    over = T(1) / r, x = dx * over, y = dy * over, z = -c * over;
-    longer = (px * (px - T(2) * a) + py * (py - T(2) * b)) / (r + far);
+// Numbers of a path as jets; those that vary are variables behind x and y.
+template <typename T, Mask rows, How how, typename C>
+struct Entries {
+  const C *numbers, *change;
+  template <int j>
+  [[gnu::always_inline]] auto at() const {
+    if constexpr (how == kStill) return constant<rows>(T(numbers[j]));
+    else if constexpr (how == kVaried) return variable<rows, 2 + j>(T(numbers[j]));
+    else return variable<rows, 2>(T(numbers[j]), T(change[j]));
   }
 };
 
+// How much longer the way from point Q of a hologram to (x, y) is than to the vertex, |P - Q| - |Q|.
+template <int first, typename N, typename X, typename Y>
+[[gnu::always_inline]] inline auto from_point(const N& n, const X& x, const Y& y) {
+  const auto a = n.template at<first>();
+  const auto b = n.template at<first + 1>();
+  const auto squared = square(n.template at<first + 2>());
+  const auto far = root(square(a) + square(b) + squared), way = root(square(x - a) + square(y - b) + squared);
+  return (x * (x - 2 * a) + y * (y - 2 * b)) / (way + far);
+}
+
+template <Mask rows, How how, typename C, typename T>
+[[gnu::always_inline]] inline auto hologram_at(T x, T y, const C* numbers, const C* change = nullptr) {
+  const Entries<T, rows, how, C> n{numbers, change};
+  const auto at_x = variable<rows, kX>(x);
+  const auto at_y = variable<rows, kY>(y);
+  return n.template at<6>() * (from_point<0>(n, at_x, at_y) + from_point<3>(n, at_x, at_y));
+}
+
 template <bool second, typename C, typename T, int size>
 void hologram(const C* numbers, const T* x, const T* y, int n, Added<T, size>& to) {
-  clear(to, n);
-  const T s = T(numbers[6]);
-  for (int point = 0; point < 2; point++, numbers += 3) {
-    const T a = T(numbers[0]), b = T(numbers[1]), c = T(numbers[2]), far = root(a * a + b * b + c * c);
 #pragma omp simd
-    for (int i = 0; i < n; i++) {
-      const FromPoint<T> e(a, b, c, far, x[i], y[i]);
-      to.p[i] += s * e.longer, to.x[i] += s * e.x, to.y[i] += s * e.y;
-      if (second) {
-        to.xx[i] += s * (T(1) - e.x * e.x) * e.over, to.yy[i] += s * (T(1) - e.y * e.y) * e.over;
-        to.xy[i] -= s * e.x * e.y * e.over;
-      }
-    }
+  for (int i = 0; i < n; i++) {
+    const auto p = hologram_at<second ? kAllRows : kNoRows, kStill>(x[i], y[i], numbers);
+    to.p[i] = p.v, to.x[i] = BY(p, kX), to.y[i] = BY(p, kY);
+    if constexpr (second) to.xx[i] = BY(p, kX, kX), to.xy[i] = BY(p, kX, kY), to.yy[i] = BY(p, kY, kY);
   }
 }
 
 // How the path and its slopes change with the numbers.
 template <typename T>
 void hologram_change(const T* numbers, const T* change, const T* x, const T* y, int n, Added<T, kBlock>& to) {
-  clear(to, n);
-  const T s = numbers[6], ds = change[6];
-  for (int point = 0; point < 2; point++, numbers += 3, change += 3) {
-    const T a = numbers[0], b = numbers[1], c = numbers[2], da = change[0], db = change[1], dc = change[2];
-    const T far = root(a * a + b * b + c * c), further = (a * da + b * db + c * dc) / far;
 #pragma omp simd
-    for (int i = 0; i < n; i++) {
-      const FromPoint<T> e(a, b, c, far, x[i], y[i]);
-      const T along = e.x * da + e.y * db + e.z * dc;
-      to.p[i] += ds * e.longer - s * (along + further);
-      to.x[i] += ds * e.x + s * e.over * (e.x * along - da);
-      to.y[i] += ds * e.y + s * e.over * (e.y * along - db);
-    }
+  for (int i = 0; i < n; i++) {
+    const auto p = hologram_at<kAllRows, kMoved>(x[i], y[i], numbers, change);
+    to.p[i] = BY(p, 2), to.x[i] = BY(p, kX, 2), to.y[i] = BY(p, kY, 2);
   }
 }
 
@@ -250,25 +252,17 @@ void sum_radial(int count, const Rays<T>& at, const T* gp, const T* gx, const T*
   }
 }
 
-// And of a hologram.
-template <typename T>
+// And of a hologram, of number j and those behind it.
+template <int j = 0, typename T>
 void sum_hologram(const T* numbers, const Rays<T>& at, const T* gp, const T* gx, const T* gy, int n, double* sums) {
-  const T s = numbers[6];
-  T sum_s = 0;
-  for (int point = 0; point < 2; point++, numbers += 3, sums += 3) {
-    const T a = numbers[0], b = numbers[1], c = numbers[2], far = root(a * a + b * b + c * c);
-    T sum_a = 0, sum_b = 0, sum_c = 0, sum_p = 0;
-#pragma omp simd reduction(+ : sum_a, sum_b, sum_c, sum_p, sum_s)
-    for (int i = 0; i < n; i++) {
-      const FromPoint<T> e(a, b, c, far, at.x[i], at.y[i]);
-      const T turn = (gx[i] * e.x + gy[i] * e.y) * e.over, along = turn - gp[i];
-      sum_a += e.x * along - gx[i] * e.over, sum_b += e.y * along - gy[i] * e.over, sum_c += e.z * along;
-      sum_p += gp[i], sum_s += gp[i] * e.longer + gx[i] * e.x + gy[i] * e.y;
-    }
-    const T each = sum_p / far;
-    sums[0] += s * (sum_a - each * a), sums[1] += s * (sum_b - each * b), sums[2] += s * (sum_c - each * c);
+  T sum = 0;
+#pragma omp simd reduction(+ : sum)
+  for (int i = 0; i < n; i++) {
+    const auto p = hologram_at<kAllRows, kVaried>(at.x[i], at.y[i], numbers);
+    sum += BY(p, 2 + j) * gp[i] + BY(p, kX, 2 + j) * gx[i] + BY(p, kY, 2 + j) * gy[i];
   }
-  sums[0] += sum_s;
+  sums[j] += sum;
+  if constexpr (j < 6) sum_hologram<j + 1>(numbers, at, gp, gx, gy, n, sums);
 }
 
 template <typename T>

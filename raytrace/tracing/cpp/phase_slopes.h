@@ -4,8 +4,6 @@
 //
 //     n2 d' = q + α n,   q = n1 d + g,   α = (b - a)/w,   a = q·n,   b = ±√(a² + D w),   D = n2² - n1² - g·(2 n1 d + g)
 //     ∂α/∂a = -α/b,   ∂α/∂w = -α²/2b,   ∂α/∂D = 1/2b,   and b = n2 n·d'  (no square root)
-//
-// An ideal lens has d' = e/|e|, e = (n1 L - φx x |N|, n1 M - φy y |N|, n2 N), so that ē = (d̄' - d' (d'·d̄'))/|e|.
 #pragma once
 #include "adjoint.h"
 #include "phases.h"
@@ -48,52 +46,45 @@ void pull_diffract(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Not
   row[s.at->before] += sum_n1, row[s.at->behind] += sum_n2;
 }
 
-// From the cotangent e of what `Longer` is to those of its arguments.
-template <typename T>
-inline void pull_longer(const Longer<T>& of, T e, T x, T y, T N, T vergence, T sign, T& gx, T& gy, T& gL, T& gM,
-                        T& gN, T& gv) {
-  T over = T(1) / (of.reach + T(1)), top = e * over, reach = -e * of.length * over / of.reach;
-  T by_px = reach * of.px, by_py = reach * of.py, by_v = top * (x * x + y * y) + by_px * x + by_py * y;
-  gx += T(2) * top * of.px + of.v * by_px, gy += T(2) * top * of.py + of.v * by_py;
-  gL += sign * (T(2) * top * x + by_px), gM += sign * (T(2) * top * y + by_py);
-  gN += reach * N + signed_as(by_v * vergence, N), gv += by_v * magnitude(N);
+// The merit behind an ideal lens to first order, by the arguments of `bent`.
+template <typename T, typename... Of>
+[[gnu::always_inline]] inline auto merit_by(T gl, T gm, T gn, T gp, const Of&... of) {
+  return bent<T>(of..., [=](const auto& l, const auto& m, const auto& n, const auto& path) {
+    return gl * l + gm * m + gn * n + gp * path;
+  });
+}
+
+// How a ray behind it changes.
+template <typename T, typename... Of>
+[[gnu::always_inline]] inline Behind<T> change_by(const Of&... of) {
+  return bent<T>(of..., [](const auto& l, const auto& m, const auto& n, const auto& path) {
+    return Behind<T>{l.d[0], m.d[0], n.d[0], path.d[0]};
+  });
 }
 
 template <typename T>
-void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n,
-                 const Surface<T>& s, double* row) {
-  const IdealLens<T> lens(s.n1, s.n2, s.phase);
-  const T n1 = s.n1, n2 = s.n2;
+void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n, const Surface<T>& s, double* row) {
+  enum { x, y, L, M, N, n1, n2, power_x, power_y, vergence };
+  const auto before = variable<0, n1>(s.n1);
+  const auto behind = variable<0, n2>(s.n2);
+  const auto along_x = variable<0, power_x>(s.phase[0]);
+  const auto along_y = variable<0, power_y>(s.phase[1]);
+  const auto imaged = variable<0, vergence>(s.phase[2]);
   Normals<T>& turn = notes.turn;
-  T sum_n1 = 0, sum_n2 = 0, sum_x = 0, sum_y = 0, sum_v = 0, sum_onward = 0;
-#pragma omp simd reduction(+ : sum_n1, sum_n2, sum_x, sum_y, sum_v, sum_onward)
+  T sum_n1 = 0, sum_n2 = 0, sum_x = 0, sum_y = 0, sum_v = 0;
+#pragma omp simd reduction(+ : sum_n1, sum_n2, sum_x, sum_y, sum_v)
   for (int i = 0; i < n; i++) {
-    T x = to.x[i], y = to.y[i], L = from.L[i], M = from.M[i], N = from.N[i], l = to.L[i], m = to.M[i], o = to.N[i];
-    T gx = 0, gy = 0, gL = 0, gM = 0, gN = 0, gl = g.L[i], gm = g.M[i], gn = g.N[i], gv = 0, gonward = 0, R = g.path[i];
-
-    // The path.
-    Longer<T> before(x, y, L, M, N, lens.vergence, T(-1)), behind(x, y, l, m, o, lens.onward, T(1));
-    T quarter = T(0.25) * R * (x * x - y * y);
-    pull_longer(before, n1 * R, x, y, N, lens.vergence, T(-1), gx, gy, gL, gM, gN, gv);
-    pull_longer(behind, n2 * R, x, y, o, lens.onward, T(1), gx, gy, gl, gm, gn, gonward);
-    gx += T(2) * R * lens.cylinder * x, gy -= T(2) * R * lens.cylinder * y;
-
-    // The direction.
-    T steep = magnitude(N), eL = n1 * L - lens.power_x * x * steep, eM = n1 * M - lens.power_y * y * steep, eN = n2 * N;
-    T over = T(1) / root(eL * eL + eM * eM + eN * eN), both = l * gl + m * gm + o * gn;
-    T kL = (gl - both * l) * over, kM = (gm - both * m) * over, kN = (gn - both * o) * over;
-    T bent = -(lens.power_x * x * kL + lens.power_y * y * kM);
-    g.L[i] = gL + n1 * kL, g.M[i] = gM + n1 * kM, g.N[i] = gN + n2 * kN + signed_as(bent, N);
-    g.x[i] += gx - lens.power_x * steep * kL, g.y[i] += gy - lens.power_y * steep * kM;
-    sum_x += quarter - x * steep * kL, sum_y -= quarter + y * steep * kM;
-    sum_n1 += R * before.length + L * kL + M * kM, sum_n2 += R * behind.length + N * kN;
-    sum_v += gv, sum_onward += gonward;
+    const auto merit =
+        merit_by(g.L[i], g.M[i], g.N[i], g.path[i], variable<0, x>(to.x[i]), variable<0, y>(to.y[i]), variable<0, L>(from.L[i]),
+                 variable<0, M>(from.M[i]), variable<0, N>(from.N[i]), before, behind, along_x, along_y, imaged);
+    g.x[i] += merit.d[x], g.y[i] += merit.d[y], g.L[i] = merit.d[L], g.M[i] = merit.d[M], g.N[i] = merit.d[N];
+    sum_n1 += merit.d[n1], sum_n2 += merit.d[n2];
+    sum_x += merit.d[power_x], sum_y += merit.d[power_y], sum_v += merit.d[vergence];
     turn.x[i] = turn.y[i] = turn.z[i] = turn.w[i] = 0;
   }
-  const T each = sum_onward / n2;  // onward = ((φx + φy)/2 - n1 v)/n2
-  double* own = row + s.at->phase_numbers;
-  own[0] += sum_x + T(0.5) * each, own[1] += sum_y + T(0.5) * each, own[2] += sum_v - n1 * each;
-  row[s.at->before] += sum_n1 - lens.vergence * each, row[s.at->behind] += sum_n2 - lens.onward * each;
+  double* numbers = row + s.at->phase_numbers;
+  numbers[0] += sum_x, numbers[1] += sum_y, numbers[2] += sum_v;
+  row[s.at->before] += sum_n1, row[s.at->behind] += sum_n2;
 }
 
 template <typename T>
@@ -137,46 +128,21 @@ void push_diffract(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&
   }
 }
 
-// How the length of a `Longer` changes.
-template <typename T>
-inline T push_longer(const Longer<T>& of, T x, T y, T N, T vergence, T sign, T L, T M, T dx, T dy, T dL, T dM, T dN,
-                     T dvergence) {
-  T dv = magnitude(N) * dvergence + signed_as(dN * vergence, N);
-  T dpx = dv * x + of.v * dx + sign * dL, dpy = dv * y + of.v * dy + sign * dM;
-  T dreach = (of.px * dpx + of.py * dpy + N * dN) / of.reach;
-  T dtop = dv * (x * x + y * y) + T(2) * (of.v * (x * dx + y * dy) + sign * (L * dx + M * dy + x * dL + y * dM));
-  return (dtop - of.length * dreach) / (of.reach + T(1));
-}
-
 template <typename T>
 void push_slopes(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&, int n, const Surface<T>& s,
                  const Change<T>& change, bool path) {
-  const IdealLens<T> lens(s.n1, s.n2, s.phase);
-  const T n1 = s.n1, n2 = s.n2, dn1 = change.n1, dn2 = change.n2;
-  const T power_x = lens.power_x, power_y = lens.power_y;
-  const T dpower_x = change.phase[0], dpower_y = change.phase[1], dv = change.phase[2];
-  const T dcylinder = T(0.25) * (dpower_x - dpower_y);
-  const T donward = (T(0.5) * (dpower_x + dpower_y) - n1 * dv - dn1 * lens.vergence - lens.onward * dn2) / n2;
+  const auto before = variable<0, 0>(s.n1, change.n1);
+  const auto behind = variable<0, 0>(s.n2, change.n2);
+  const auto power_x = variable<0, 0>(s.phase[0], change.phase[0]);
+  const auto power_y = variable<0, 0>(s.phase[1], change.phase[1]);
+  const auto vergence = variable<0, 0>(s.phase[2], change.phase[2]);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
-    T x = to.x[i], y = to.y[i], L = from.L[i], M = from.M[i], N = from.N[i], l = to.L[i], m = to.M[i], o = to.N[i];
-    T dx = d.x[i], dy = d.y[i], dL = d.L[i], dM = d.M[i], dN = d.N[i];
-    T steep = magnitude(N), dsteep = signed_as(dN, N);
-    T eL = n1 * L - power_x * x * steep, eM = n1 * M - power_y * y * steep, eN = n2 * N;
-    T over = T(1) / root(eL * eL + eM * eM + eN * eN);
-    T kL = dn1 * L + n1 * dL - (dpower_x * x + power_x * dx) * steep - power_x * x * dsteep;
-    T kM = dn1 * M + n1 * dM - (dpower_y * y + power_y * dy) * steep - power_y * y * dsteep;
-    T kN = dn2 * N + n2 * dN, both = l * kL + m * kM + o * kN;
-    T dl = (kL - both * l) * over, dm = (kM - both * m) * over, dn = (kN - both * o) * over;
-    if (path) {
-      Longer<T> before(x, y, L, M, N, lens.vergence, T(-1)), behind(x, y, l, m, o, lens.onward, T(1));
-      T longer = dn1 * before.length + dn2 * behind.length;
-      longer += n1 * push_longer(before, x, y, N, lens.vergence, T(-1), L, M, dx, dy, dL, dM, dN, dv);
-      longer += n2 * push_longer(behind, x, y, o, lens.onward, T(1), l, m, dx, dy, dl, dm, dn, donward);
-      longer += dcylinder * (x * x - y * y) + T(2) * lens.cylinder * (x * dx - y * dy);
-      d.path[i] += longer;
-    }
-    d.L[i] = dl, d.M[i] = dm, d.N[i] = dn;
+    const auto of = change_by<T>(variable<0, 0>(to.x[i], d.x[i]), variable<0, 0>(to.y[i], d.y[i]), variable<0, 0>(from.L[i], d.L[i]),
+                         variable<0, 0>(from.M[i], d.M[i]), variable<0, 0>(from.N[i], d.N[i]), before, behind, power_x,
+                         power_y, vergence);
+    d.L[i] = of.l, d.M[i] = of.m, d.N[i] = of.n;
+    if (path) d.path[i] += of.path;
   }
 }
 

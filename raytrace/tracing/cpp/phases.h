@@ -58,52 +58,52 @@ inline bool diffract(const Surface<double>& s, const Added<double, 1>& added, do
 }
 
 // How much longer the way from the vertex to a point on the ray is than the ray's own; v: inverse distance, sign: -1 before
-// the lens, 1 behind it.
+// the lens, 1 behind it. Any number type, as below.
+template <typename T, typename X, typename Y, typename L, typename M, typename N, typename V>
+[[gnu::always_inline]] inline auto longer(const X& x, const Y& y, const L& l, const M& m, const N& n, const V& vergence, int sign) {
+  const auto v = magnitude(n) * vergence;
+  const auto px = v * x + T(sign) * l;
+  const auto py = v * y + T(sign) * m;
+  return (v * (x * x + y * y) + T(2 * sign) * (l * x + m * y)) * inverse(T(1) + root(px * px + py * py + n * n));
+}
+
+// Calls work(l, m, n, path) with the direction of a ray behind an ideal lens and the path that it adds; power: φx, φy;
+// vergence: of the point that it images.
+template <typename T, typename X, typename Y, typename L, typename M, typename N, typename A, typename B, typename U, typename W, typename V,
+          typename Work>
+[[gnu::always_inline]] inline auto bent(const X& x, const Y& y, const L& l, const M& m, const N& n, const A& n1, const B& n2,
+                                        const U& power_x, const W& power_y, const V& vergence, Work work) {
+  const auto steep = magnitude(n);
+  const auto e = n1 * l - power_x * x * steep;
+  const auto f = n1 * m - power_y * y * steep;
+  const auto g = n2 * n;
+  const auto factor = inverse(root(e * e + f * f + g * g));
+  const auto onward = (T(0.5) * (power_x + power_y) - n1 * vergence) * inverse(n2);
+  const auto behind_x = e * factor;
+  const auto behind_y = f * factor;
+  const auto behind_z = g * factor;
+  return work(behind_x, behind_y, behind_z,
+              n1 * longer<T>(x, y, l, m, n, vergence, -1) + n2 * longer<T>(x, y, behind_x, behind_y, behind_z, onward, 1) +
+                  T(0.25) * (power_x - power_y) * (x * x - y * y));
+}
+
 template <typename T>
-struct Longer {
-  T v, px, py, reach, top, length;  // length = top/(reach + 1)
-  Longer(T x, T y, T L, T M, T N, T vergence, T sign) {
-    v = magnitude(N) * vergence, px = v * x + sign * L, py = v * y + sign * M;
-    reach = root(px * px + py * py + N * N);
-    top = v * (x * x + y * y) + T(2) * sign * (L * x + M * y);
-    length = top / (reach + T(1));
-  }
-};
+struct Behind { T l, m, n, path; };
 
-// An ideal lens: its powers in x and y, the vergence of the point it images, and that behind it.
 template <typename T>
-struct IdealLens {
-  T n1, n2, power_x, power_y, vergence, onward, cylinder;
-  template <typename C>
-  IdealLens(T n1, T n2, const C* numbers)
-      : n1(n1), n2(n2), power_x(T(numbers[0])), power_y(T(numbers[1])), vergence(T(numbers[2])),
-        onward((T(0.5) * (power_x + power_y) - n1 * vergence) / n2), cylinder(T(0.25) * (power_x - power_y)) {}
-
-  // Turns (L, M, N).
-  inline void bend(T x, T y, T& L, T& M, T& N) const {
-    T steep = magnitude(N), l = n1 * L - power_x * x * steep, m = n1 * M - power_y * y * steep, o = n2 * N;
-    T factor = T(1) / root(l * l + m * m + o * o);
-    L = l * factor, M = m * factor, N = o * factor;
-  }
-
-  // The path that it adds to a ray of direction d before it and e behind it.
-  inline T path(T x, T y, T dL, T dM, T dN, T eL, T eM, T eN) const {
-    Longer<T> before(x, y, dL, dM, dN, vergence, T(-1)), behind(x, y, eL, eM, eN, onward, T(1));
-    return n1 * before.length + n2 * behind.length + cylinder * (x * x - y * y);
-  }
-};
+[[gnu::always_inline]] inline Behind<T> behind_ideal(T x, T y, T l, T m, T n, T n1, T n2, T power_x, T power_y, T vergence) {
+  return bent<T>(x, y, l, m, n, n1, n2, power_x, power_y, vergence, [](T l, T m, T n, T path) { return Behind<T>{l, m, n, path}; });
+}
 
 template <typename T>
 int bend_slopes(Rays<T>& rays, Notes<T>& notes, int n, const Surface<T>& s, bool path) {
-  const IdealLens<T> lens(s.n1, s.n2, s.phase);
+  const T power_x = s.phase[0], power_y = s.phase[1], vergence = s.phase[2];
   int flagged = 0;
 #pragma omp simd reduction(+ : flagged)
   for (int i = 0; i < n; i++) {
-    T x = rays.x[i], y = rays.y[i], L = rays.L[i], M = rays.M[i], N = rays.N[i];
-    T l = L, m = M, o = N;
-    lens.bend(x, y, l, m, o);
-    if (path) rays.path[i] += lens.path(x, y, L, M, N, l, m, o);
-    rays.L[i] = l, rays.M[i] = m, rays.N[i] = o;
+    const auto to = behind_ideal(rays.x[i], rays.y[i], rays.L[i], rays.M[i], rays.N[i], s.n1, s.n2, power_x, power_y, vergence);
+    if (path) rays.path[i] += to.path;
+    rays.L[i] = to.l, rays.M[i] = to.m, rays.N[i] = to.n;
     flagged += notes.flagged[i] == 0 ? 0 : 1;
   }
   return flagged;
@@ -120,19 +120,18 @@ template <typename C>
 bool through_phase(const Surface<double>& s, const C* numbers, double x, double y, double& L, double& M, double& N,
                    const double* normal, double norm_squared, double& path) {
   if (s.at->phase == kSlopes) {
-    const IdealLens<double> lens(s.n1, s.n2, numbers);
-    const double l = L, m = M, o = N;
-    lens.bend(x, y, L, M, N);
-    path = lens.path(x, y, l, m, o, L, M, N);
+    const double power_x = numbers[0], power_y = numbers[1], vergence = numbers[2];
+    const auto to = behind_ideal(x, y, L, M, N, s.n1, s.n2, power_x, power_y, vergence);
+    L = to.l, M = to.m, N = to.n, path = to.path;
     return true;
   }
   Added<double, 1> added;
   path_at<false>(*s.at, numbers, &x, &y, 1, added);
   if (s.at->phase == kFacets) {
     const double u = x * x + y * y;
-    const Facet<double> at(numbers, s.at->phase_terms - kShape, u);
-    if (!at.within) return false;
-    const double dS = at.dS;
+    const auto S = facet_at<kStill, kNoRows>(facets_of<Surface>(s, numbers), u);
+    if (!S.inside) return false;
+    const double dS = S.d[kX];
     const double facet[] = {-2 * dS * x, -2 * dS * y, 1};
     path = 0;
     return diffract(s, added, L, M, N, facet, 1 + 4 * dS * dS * u);

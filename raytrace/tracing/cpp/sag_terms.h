@@ -63,6 +63,40 @@ inline Added<double, 1> sag_terms_at(const Surface<double>& s, double x, double 
   return found;
 }
 
+// The sag of a kind at a point, with that of its sag terms, which stand in place i of `added`.
+template <int kind, int size, How how, Mask rows, typename T, int count>
+[[gnu::always_inline]] inline auto whole_sag_at(const Surface<T>& s, const Added<T, count>& added, int i, T x, T y,
+                                                const Change<T>* change = nullptr) {
+  const auto S = sag_at<kind, size, how, rows>(s, x, y, change);
+  if constexpr (!has_sag_terms(kind)) {
+    return S;
+  } else {
+    constexpr int xx = place_of_pair(kX, kX), xy = place_of_pair(kX, kY), yy = place_of_pair(kY, kY);
+    Jet<T, rows, 3, pairs_of(rows, 3, 3)> D;
+    D.v = added.p[i], D.d[kX] = added.x[i], D.d[kY] = added.y[i];
+    if constexpr (rows != 0) D.h[xx] = added.xx[i], D.h[xy] = added.xy[i], D.h[yy] = added.yy[i];
+    return S + D;
+  }
+}
+
+// F at a point of a surface, whose slopes are the normal: z less its sag, or half of its quadric, negative.
+template <int kind, int size, How how, Mask rows, typename T, int count>
+[[gnu::always_inline]] inline auto face_at(const Surface<T>& s, const Added<T, count>& added, int i, T x, T y, T z,
+                                           const Change<T>* change = nullptr) {
+  const auto height = variable<rows, kZ>(z);
+  if constexpr (kind == kPlane) {
+    return height;
+  } else if constexpr (is_searched(kind)) {
+    return height - whole_sag_at<kind, size, how, rows>(s, added, i, x, y, change);
+  } else {
+    const Numbers<T, rows, how, 0> numbers{s, change};
+    const auto across = square(variable<rows, kX>(x)) + square(variable<rows, kY>(y));
+    const auto half = 0.5 * numbers.c();
+    if constexpr (kind == kSphere) return height - half * (across + square(height));
+    else return height - half * (across + (1 + numbers.k()) * square(height));
+  }
+}
+
 // Bounds on |D| and on its slope up to a radius.
 template <typename T>
 T sag_terms_bound(const Surface<T>& s, T radius, bool slope) {

@@ -1,21 +1,21 @@
-// The kinds of sag, S = c u/(1 + w) + Σ a_j b_j(u) with u = r²: raytrace/system/shapes.py. A new kind is one more `Kind`, in
-// the order of the `code` of its row there, and a case of `add_terms`, `sum_terms` and `by_kind_of_terms`.
+// The kinds of sag: raytrace/system/shapes.py. A kind is a struct of `Sags`, whose sag is written once, on jets: the trace, its
+// adjoint and its tangents take values, slopes and the local Jacobian from there. The `code` of its row counts from kWithSagTerms.
+//
+//     sag(numbers, u) of a round kind, u = r², or sag(numbers, x, y), by the curvature c(), the conic constant k(), the
+//     coefficients a<j>(), and terms<j>(v), a_j v + a_(j+1) v² + …, or odd_terms<j>(v), a_j r + a_(j+1) r² + … with v = r²
 #pragma once
-#include <type_traits>
+#include <tuple>
+#include <utility>
 
-#include "block.h"
+#include "jet.h"
 
 namespace raytrace {
 
-enum Kind { kPlane, kSphere, kConic, kEven, kOdd, kToroidal, kBiconic, kWithSagTerms };
+enum Variable { kX, kY, kZ, kC, kK, kA, kHeight = kA + 4, kSlope };  // kA + j: a<j>; the last two: of the terms
+constexpr Mask kAllRows = 7, kNoRows = 0;
 
-constexpr bool has_terms(int kind) { return kind == kEven || kind == kOdd; }
-constexpr bool is_freeform(int kind) { return kind == kToroidal || kind == kBiconic; }  // see freeform.h
-constexpr bool has_sag_terms(int kind) { return kind == kWithSagTerms; }  // an even asphere and what sag_terms.h adds
-constexpr bool is_searched(int kind) { return kind >= kEven; }
-
-template <int number>
-using Constant = std::integral_constant<int, number>;
+// What the numbers are: constants, the variables of a Jacobian, or all of them functions of one variable, kC.
+enum How { kStill, kVaried, kMoved };
 
 // Adds Σ a_j u^(j+1) over every `stride`-th of the coefficients, and its derivatives by u.
 template <bool second, int stride = 1, typename T>
@@ -41,19 +41,236 @@ struct Radius {
   }
 };
 
-// Adds Σ a_j b_j(u) to a sag, and its derivatives.
-template <int kind, bool second, typename T>
-inline void add_terms(const T* a, int count, T u, T& S, T& dS, T& d2S) {
-  if constexpr (kind == kOdd) {  // those of even j, and r q with q = a_1 + a_3 u + …
+// Σ a_j u^j or Σ a_j r^j, j = 1, 2, …, and its derivatives by u.
+template <typename T>
+struct Terms { T S, dS, d2S; };
+
+template <bool odd, bool second, typename T>
+inline Terms<T> terms_of(const T* a, int count, T u) {
+  Terms<T> to{};
+  if constexpr (odd) {  // those of even j, and r q with q = a_1 + a_3 u + …
     const Radius<T> at(u);
     T q = a[0], dq = 0, d2q = 0;
-    series<second, 2>(a + 1, count / 2, u, S, dS, d2S);
+    series<second, 2>(a + 1, count / 2, u, to.S, to.dS, to.d2S);
     series<second, 2>(a + 2, (count - 1) / 2, u, q, dq, d2q);
-    S += at.r * q, dS += at.dr * q + at.r * dq;
-    if (second) d2S += at.r * d2q + 2 * at.dr * (dq - at.dr * at.dr * q);
+    to.S += at.r * q, to.dS += at.dr * q + at.r * dq;
+    if (second) to.d2S += at.r * d2q + 2 * at.dr * (dq - at.dr * at.dr * q);
   } else {
-    series<second>(a, count, u, S, dS, d2S);
+    series<second>(a, count, u, to.S, to.dS, to.d2S);
   }
+  return to;
+}
+
+// The numbers of a surface with up to `count` coefficients as jets.
+template <typename T, Mask rows, How how, int count>
+struct Numbers {
+  const Surface<T>& s;
+  const Change<T>* change;  // of kMoved
+
+  template <int i, typename Pick>
+  [[gnu::always_inline]] auto number(Pick pick) const {
+    if constexpr (how == kStill) return constant<rows>(pick(s));
+    else if constexpr (how == kVaried) return variable<rows, i>(pick(s));
+    else return variable<rows, kC>(pick(s), pick(*change));
+  }
+  auto c() const { return number<kC>([](const auto& of) { return of.c; }); }
+  auto k() const { return number<kK>([](const auto& of) { return of.k; }); }
+  template <int j>
+  auto a() const { return number<kA + j>([](const auto& of) { return of.a[j]; }); }
+
+  // Coefficients change the sum by a height and a slope along v.
+  template <int first, bool odd = false, Mask a1, Mask a2>
+  [[gnu::always_inline]] auto terms(const Jet<T, rows, a1, a2>& v) const {
+    if constexpr (first >= count) {
+      return Zero{};
+    } else {
+      const auto of = terms_of<odd, rows != 0>(s.a + first, count - first, v.v);
+      const auto sum = composed(v, of.S, of.dS, of.d2S);
+      if constexpr (how == kStill) return sum;
+      else if constexpr (how == kVaried) return sum + change_along<kHeight, kSlope>(v, T(1), T(1));
+      else {
+        const auto more = terms_of<odd, false>(change->a + first, count - first, v.v);
+        return sum + change_along<kC, kC>(v, more.S, more.dS);
+      }
+    }
+  }
+  template <int first, Mask a1, Mask a2>
+  auto odd_terms(const Jet<T, rows, a1, a2>& v) const { return terms<first, true>(v); }
+
+ private:
+  template <int height, int slope, Mask a1, Mask a2>
+  [[gnu::always_inline]] static auto change_along(const Jet<T, rows, a1, a2>& v, T by_height, T by_slope) {
+    Jet<T, rows, Mask(1) << height, pairs_of(rows, a1, Mask(1) << slope)> to;
+    to.v = 0;
+    derive(to, [=](auto) { return by_height; }, [&](auto r, auto) { return by_slope * BY(v, r()); });
+    return to;
+  }
+};
+
+// c u/(1 + w), w = √(1 - (1+k) c² u).
+template <typename C, typename K, typename U>
+[[gnu::always_inline]] inline auto conic(const C& c, const K& k, const U& u) {
+  return c * u * share(1 - (1 + k) * c * c * u);
+}
+// With its slope c/2w by hand, which saves 20 % of a trace through aspheres.
+template <typename T, Mask first>
+[[gnu::always_inline]] inline auto conic(const Jet<T, kNoRows>& c, const Jet<T, kNoRows>& k, const Jet<T, kNoRows, first>& u) {
+  const T radicand = T(1) - (T(1) + k.v) * c.v * c.v * u.v;
+  const T w = root(radicand > 0 ? radicand : std::numeric_limits<T>::min());
+  auto to = composed(u, c.v * u.v / (T(1) + w), T(0.5) * c.v / w, T(0));
+  to.inside = radicand > 0;
+  return to;
+}
+
+// heads: coefficients that are no terms, at most 4; along_y: the terms are in y², not in r²; sizes: loops are compiled for so
+// many coefficients.
+struct Sag {
+  static constexpr int heads = 0;
+  static constexpr bool is_round = false, odd = false, along_y = false;
+};
+
+struct Even : Sag {
+  static constexpr bool is_round = true;
+  using Sizes = std::integer_sequence<int, 4, 8, kTerms>;
+  template <typename N, typename U>
+  [[gnu::always_inline]] static auto sag(const N& n, const U& u) { return conic(n.c(), n.k(), u) + n.template terms<0>(u); }
+};
+
+// An even asphere and what sag_terms.h adds.
+struct EvenWithSagTerms : Even {
+  using Sizes = std::integer_sequence<int, 0, kTerms>;
+};
+
+struct Odd : Sag {
+  static constexpr bool is_round = true, odd = true;
+  using Sizes = std::integer_sequence<int, 8>;
+  template <typename N, typename U>
+  [[gnu::always_inline]] static auto sag(const N& n, const U& u) { return conic(n.c(), n.k(), u) + n.template odd_terms<0>(u); }
+};
+
+// z = g + c_x x²/(q + w), w = √(q² - c_x² x²), q = 1 - c_x g, g = g(y), as far as the circle about the axis gets out to x.
+struct Toroidal : Sag {
+  static constexpr int heads = 1;
+  static constexpr bool along_y = true;
+  using Sizes = std::integer_sequence<int, 1, 8>;
+  template <typename N, typename X, typename Y>
+  [[gnu::always_inline]] static auto sag(const N& n, const X& x, const Y& y) {
+    const auto c_x = n.template a<0>();
+    const auto u = square(y);
+    const auto g = conic(n.c(), n.k(), u) + n.template terms<1>(u);
+    const auto p = c_x * x;
+    const auto q = 1 - c_x * g;
+    return g + x * p / (q + root((q - p) * (q + p), q.v > 0));
+  }
+};
+
+// z (1 + w) = c_x x² + c y², w² = 1 - (1+k_x) c_x² x² - (1+k) c² y².
+struct Biconic : Sag {
+  static constexpr int heads = 2;
+  using Sizes = std::integer_sequence<int, 2>;
+  template <typename N, typename X, typename Y>
+  [[gnu::always_inline]] static auto sag(const N& n, const X& x, const Y& y) {
+    const auto p = n.template a<0>() * x;
+    const auto q = n.c() * y;
+    return (x * p + y * q) * share(1 - (1 + n.template a<1>()) * square(p) - (1 + n.k()) * square(q));
+  }
+};
+
+using Sags = std::tuple<EvenWithSagTerms, Even, Odd, Toroidal, Biconic>;
+enum Kind { kPlane, kSphere, kConic, kWithSagTerms, kEven, kOdd, kToroidal, kBiconic };
+constexpr int kKinds = kWithSagTerms + std::tuple_size_v<Sags>;
+
+constexpr bool is_searched(int kind) { return kind >= kWithSagTerms; }
+constexpr bool is_unit(int kind) { return kind == kPlane || kind == kSphere; }  // F has slopes of length 1
+constexpr bool has_sag_terms(int kind) { return kind == kWithSagTerms; }
+template <int kind>
+using SagOf = std::tuple_element_t<kind - kWithSagTerms, Sags>;
+
+template <int kind>
+constexpr bool is_round() {
+  if constexpr (is_searched(kind)) return SagOf<kind>::is_round;
+  else return true;
+}
+
+template <int kind = kWithSagTerms>
+constexpr bool has_axis(int at) {  // the same of a searched kind
+  if constexpr (kind < kKinds) return at == kind ? is_round<kind>() : has_axis<kind + 1>(at);
+  else return false;
+}
+
+// Calls work(kind, size) for a searched surface: with its kind, and the size of the loops compiled for it.
+template <int kind, typename Work, int... sizes>
+inline void by_size(const Layout& at, Work& work, std::integer_sequence<int, sizes...>) {
+  bool done = false;
+  ((done || at.terms > sizes ? void() : (done = true, work(Constant<kind>{}, Constant<sizes>{}))), ...);
+}
+template <int kind = kWithSagTerms, typename Work>
+void by_kind_of_terms(const Layout& at, Work work) {
+  if (at.kind == kind) by_size<kind>(at, work, typename SagOf<kind>::Sizes{});
+  else if constexpr (kind + 1 < kKinds) by_kind_of_terms<kind + 1>(at, work);
+}
+
+// A round sag S(u) as one of x and y.
+template <Mask rows, typename T, Mask along, Mask a1, Mask a2>
+[[gnu::always_inline]] inline auto round_about(const Jet<T, along, a1, a2>& S, T x, T y) {
+  constexpr Mask numbers = a1 & ~Mask(1), crossed = a2 & ~Mask(1);  // of the pairs, those of u are at the bits of numbers
+  constexpr Mask second = rows == 0 ? 0 : pairs_of(rows, 3, 3) | crossed | crossed << kVariables;
+  Jet<T, rows, 3 | numbers, second> to;
+  to.v = S.v, to.inside = S.inside;
+  const T rise = T(2) * S.d[0], bend = T(4) * as<T>(BY(S, kX, kX));
+  to.d[kX] = rise * x, to.d[kY] = rise * y;
+  each<numbers>([&](auto i) { to.d[i()] = S.d[i()]; });
+  if constexpr (rows != 0) {
+    to.h[place_of_pair(kX, kX)] = rise + bend * x * x, to.h[place_of_pair(kY, kY)] = rise + bend * y * y;
+    to.h[place_of_pair(kX, kY)] = bend * x * y;
+    each<crossed>([&](auto i) { to.h[i()] = T(2) * S.h[i()] * x, to.h[i() + kVariables] = T(2) * S.h[i()] * y; });
+  }
+  return to;
+}
+
+// The sag of a kind at a point, by x, y and the numbers.
+template <int kind, int size, How how, Mask rows, typename T>
+[[gnu::always_inline]] inline auto sag_at(const Surface<T>& s, T x, T y, const Change<T>* change = nullptr) {
+  if constexpr (is_round<kind>()) {
+    const Numbers<T, rows & 1, how, size> numbers{s, change};
+    return round_about<rows>(SagOf<kind>::sag(numbers, variable<rows & 1, kX>(x * x + y * y)), x, y);
+  } else {
+    const Numbers<T, rows, how, size> numbers{s, change};
+    return SagOf<kind>::sag(numbers, variable<rows, kX>(x), variable<rows, kY>(y));
+  }
+}
+
+// Σ |a_j| b_j: what the terms add up from.
+template <int kind>
+double size_of_terms(const Surface<double>& s, double x, double y) {
+  using Kind = SagOf<kind>;
+  double sizes[kTerms];
+  for (int j = 0; j < kTerms; j++) sizes[j] = std::fabs(s.a[j]);
+  if (s.at->terms <= Kind::heads) return 0;
+  return terms_of<Kind::odd, false>(sizes + Kind::heads, s.at->terms - Kind::heads, Kind::along_y ? y * y : x * x + y * y).S;
+}
+
+// The quadric that osculates at the vertex; of a sag that is not round, as round as its larger curvature is where a ray comes.
+template <typename T, bool round>
+struct Osculating {
+  T c_x, c_y, c_z;
+
+  // Whether a ray meets it, by its foot; t: the path from there.
+  bool meets(T x, T y, T z, T L, T M, T N, T& t) const {
+    T along = round ? c_z : magnitude(c_x * x * x) > magnitude(c_y * y * y) ? c_x : c_y;
+    T A = c_x * L * L + c_y * M * M + along * N * N, G = N - (c_x * x * L + c_y * y * M + along * z * N);
+    T F = c_x * x * x + c_y * y * y + along * z * z - T(2) * z, discriminant = G * G - A * F;
+    bool usable = (discriminant > 0) & (G * N > 0);
+    t = F / (usable ? G + signed_as(root(usable ? discriminant : T(1)), N) : T(1));
+    return usable;
+  }
+};
+
+template <int kind, int count, typename T>
+Osculating<T, is_round<kind>()> osculating(const Surface<T>& s) {
+  if constexpr (is_round<kind>()) return {s.c, s.c, (T(1) + s.k) * s.c};
+  const auto S = sag_at<kind, count, kStill, kAllRows>(s, T(0), T(0));
+  return {as<T>(BY(S, kX, kX)), as<T>(BY(S, kY, kY)), 0};
 }
 
 // What a_j of Σ a_j v u^j, v = u or r, gets from each ray, s b_j + S̄' b_j', summed; s and S̄' stand in notes.px and py.
@@ -78,57 +295,16 @@ void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
   }
 }
 
-// The same of all coefficients of a kind.
+// The same of all terms of a kind.
 template <int kind, typename T>
 void sum_terms(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
-  if constexpr (kind == kOdd) {
+  using Kind = SagOf<kind>;
+  if constexpr (Kind::odd) {
     sum_series<2, true>(to, notes, n, (count + 1) / 2, sums);
     sum_series<2>(to, notes, n, count / 2, sums + 1);
   } else {
-    sum_series(to, notes, n, count, sums);
+    sum_series<1, false, Kind::along_y>(to, notes, n, count - Kind::heads, sums + Kind::heads);
   }
-}
-
-// Calls work(kind, terms) for a surface with terms: loops are compiled for these kinds, and up to so many terms.
-template <typename Work>
-void by_kind_of_terms(const Layout& at, Work work) {
-  if (at.kind == kOdd) work(Constant<kOdd>{}, Constant<8>{});
-  else if (at.kind == kToroidal && at.terms == 1) work(Constant<kToroidal>{}, Constant<1>{});
-  else if (at.kind == kToroidal) work(Constant<kToroidal>{}, Constant<8>{});
-  else if (at.kind == kBiconic) work(Constant<kBiconic>{}, Constant<2>{});
-  else if (at.kind == kWithSagTerms && at.terms == 0) work(Constant<kWithSagTerms>{}, Constant<0>{});
-  else if (at.kind == kWithSagTerms) work(Constant<kWithSagTerms>{}, Constant<kTerms>{});
-  else if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
-  else if (at.terms <= 8) work(Constant<kEven>{}, Constant<8>{});
-  else work(Constant<kEven>{}, Constant<kTerms>{});
-}
-
-// S(u), its slope and, if asked for, what the terms add to its second derivative at u = r² (the conic's holds c³,
-// which may leave the range of numbers: see the adjoint); returns whether the radicand of the conic is above 0.
-template <int kind, bool second, typename T>
-inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
-  T shape = T(1) + s.k, radicand = T(1) - shape * s.c * s.c * u;
-  bool inside = radicand > 0;
-  T w = root(inside ? radicand : std::numeric_limits<T>::min()), over_w = T(1) / w;
-  S = s.c * u / (T(1) + w), dS = T(0.5) * s.c * over_w, d2S = 0;
-  add_terms<kind, second>(s.a, terms, u, S, dS, d2S);
-  return inside;
-}
-
-// S and its slope where the kind is not known before; size: what the terms add up from.
-struct Slope { double S, dS, size; bool inside; };
-
-inline Slope slope_at(const Surface<double>& s, double u) {
-  Slope found{};
-  double sizes[kTerms], d = 0, d2 = 0;
-  for (int j = 0; j < kTerms; j++) sizes[j] = std::fabs(s.a[j]);
-  by_kind_of_terms(*s.at, [&](auto kind, auto) {
-    if constexpr (has_terms(kind()) || has_sag_terms(kind())) {
-      found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2);
-      add_terms<kind(), false>(sizes, s.at->terms, u, found.size, d, d2);
-    }
-  });
-  return found;
 }
 
 }  // namespace raytrace

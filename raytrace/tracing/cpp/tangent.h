@@ -11,14 +11,6 @@
 
 namespace raytrace {
 
-// Changes of the numbers of a surface, and whether there are any.
-template <typename T>
-struct Change {
-  T gap, c, k, n1, n2, a[kTerms];
-  const T *phase, *sag_terms;
-  bool any;
-};
-
 template <typename T>
 Change<T> change_of(const Layout& at, const T* row) {
   auto number = [row](int32_t offset) { return offset < 0 ? T(0) : row[offset]; };
@@ -35,11 +27,16 @@ Change<T> change_of(const Layout& at, const T* row) {
   return change;
 }
 
+// How slope i of F changes where the hit does, and with the numbers.
+template <int i, typename T, typename Face>
+[[gnu::always_inline]] inline T pushed(const Face& F, T px, T py, T pz) {
+  return as<T>(BY(F, kX, i) * px + BY(F, kY, i) * py + BY(F, kZ, i) * pz + BY(F, i, kC));
+}
+
 template <typename T, int kind, int bend, bool path, int terms>
 void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, int n, const Surface<T>& s,
           const Change<T>& change) {
-  const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2, side = T(s.at->side);
-  const T dgap = change.gap, dc = change.c, dk = change.k, dn1 = change.n1, dn2 = change.n2;
+  const T gap = s.gap, n1 = s.n1, n2 = s.n2, side = T(s.at->side), dgap = change.gap, dn1 = change.n1, dn2 = change.n2;
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2;
   const T dmu = (dn1 - mu * dn2) * over_n2, dD = T(2) * (n2 * dn2 - n1 * dn1);
   const bool has_gap = s.at->gap >= 0;
@@ -49,35 +46,12 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
     T hx = to.x[i], hy = to.y[i], hz = to.z[i];
     T dx = d.x[i], dy = d.y[i], dz = d.z[i], dL = d.L[i], dM = d.M[i], dN = d.N[i];
-    T u = hx * hx + hy * hy;
 
-    // The normal, its squared length, and what the numbers of the surface do to F at the hit.
-    T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0, moved = 0, slope = 0, steep = 0;
-    [[maybe_unused]] std::conditional_t<is_freeform(kind), SheetOf<T, kind, terms>, int> sheet{};
-    [[maybe_unused]] Turned<T> turned{};
-    if (kind == kSphere || kind == kConic) {
-      nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
-      if (kind == kConic) w = T(1) - k * c * c * u;
-      moved = T(-0.5) * ((u + shape * hz * hz) * dc + c * hz * hz * dk);
-    } else if (has_terms(kind) || has_sag_terms(kind)) {
-      sag<kind, true>(s, terms, u, S, dS, d2S);
-      nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
-      T radicand = T(1) - shape * c * c * u, over_w = T(1) / root(radicand > 0 ? radicand : T(1));
-      steep = c * over_w;
-      T conic_sag = c * u * over_w / (over_w + T(1)), third = over_w * over_w * over_w, P = 0, dP = 0, d2P = 0;
-      add_terms<kind, false>(change.a, terms, u, P, dP, d2P);
-      moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + P);
-      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + dP;
-      if constexpr (has_sag_terms(kind)) {
-        nx -= notes.added.x[i], ny -= notes.added.y[i], w = T(1) + nx * nx + ny * ny;
-        moved -= notes.px[i];
-      }
-    } else if constexpr (is_freeform(kind)) {
-      sheet = sheet_at<kind, terms, true>(s, hx, hy);
-      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
-      turned = sheet.pushed(dc, dk, change.a);
-      moved = -turned.z;
-    }
+    // The normal, its squared length, and how the numbers of the surface change F at the hit.
+    const auto F = face_at<kind, terms, kMoved, kAllRows>(s, notes.added, i, hx, hy, hz, &change);
+    T nx = as<T>(BY(F, kX)), ny = as<T>(BY(F, kY)), nz = as<T>(BY(F, kZ)), w = 1, moved = as<T>(BY(F, kC));
+    if (!is_unit(kind)) w = nx * nx + ny * ny + nz * nz;
+    if constexpr (has_sag_terms(kind)) moved -= notes.px[i];
     T cosine = nx * L + ny * M + nz * N;
 
     // The hit.
@@ -101,25 +75,9 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
     }
 
     // The normal there.
-    T dnx = 0, dny = 0, dnz = 0, dw = 0;
-    if (kind == kSphere || kind == kConic) {
-      dnx = -c * px - dc * hx, dny = -c * py - dc * hy, dnz = -shape * (c * pz + dc * hz) - dk * c * hz;
-      if (kind == kConic) dw = -c * (c * u * dk + T(2) * k * (u * dc + hx * (c * px) + hy * (c * py)));
-    } else if (has_terms(kind) || has_sag_terms(kind)) {
-      // No product of two lengths, as hx px, stands alone: it leaves the range of numbers before its factors do.
-      slope += T(2) * (d2S * hx * px + d2S * hy * py);
-      slope += T(0.5) * shape * steep * (steep * hx * (steep * px) + steep * hy * (steep * py));
-      dnx = T(-2) * (slope * hx + dS * px), dny = T(-2) * (slope * hy + dS * py);
-      dw = T(8) * (dS * u * slope + dS * hx * (dS * px) + dS * hy * (dS * py));
-      if constexpr (has_sag_terms(kind)) {
-        const Added<T, kBlock>& D = notes.added;
-        dnx -= notes.py[i] + D.xx[i] * px + D.xy[i] * py, dny -= notes.pz[i] + D.xy[i] * px + D.yy[i] * py;
-        dw = T(2) * (nx * dnx + ny * dny);
-      }
-    } else if constexpr (is_freeform(kind)) {
-      dnx = -(turned.x + sheet.xx * px + sheet.xy * py), dny = -(turned.y + sheet.xy * px + sheet.yy * py);
-      dw = T(2) * (nx * dnx + ny * dny);
-    }
+    T dnx = pushed<kX>(F, px, py, pz), dny = pushed<kY>(F, px, py, pz), dnz = pushed<kZ>(F, px, py, pz), dw = 0;
+    if constexpr (has_sag_terms(kind)) dnx -= notes.py[i], dny -= notes.pz[i];
+    if (!is_unit(kind)) dw = T(2) * (nx * dnx + ny * dny + nz * dnz);
 
     // Behind the surface.
     if (bend == kPhase) {  // see phase_slopes.h
