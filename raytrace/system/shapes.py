@@ -8,8 +8,8 @@ A toroid is the curve g turned about a line along y through z = 1/c_x. Of toroid
 are those of the section along y; the other numbers are coefficients. Beyond its edge a surface keeps the height there.
 
 KINDS has a row for each `Surface.kind`, `sag_terms.SAG_TERMS` one for each class of `Surface.sag_terms`, D(x, y). A new
-kind is a function and a new row, which tracing, derivatives, first order, variables, tolerances, figures and files read,
-and a function in tracing/cpp/sags.h, from which the compiled engine derives its trace, adjoint and tangents.
+kind is a function and a row, read by tracing, derivatives, first order, variables, tolerances, figures and files, and a
+function in tracing/cpp/sags.h, from which the compiled engine derives its trace, adjoint and tangents.
 """
 
 import dataclasses
@@ -219,8 +219,7 @@ class Kind:
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: entries of the column "type" of a table; an empty one is resolved by the powers of the terms.
-    code: the place among `Kind` of tracing/cpp/sags.h, which traces up to `compiled` coefficients; None: traced by torch
-    alone.
+    code: its place in `Kind` of tracing/cpp/sags.h, which traces up to `compiled` coefficients; None: torch alone does.
     """
 
     name: str

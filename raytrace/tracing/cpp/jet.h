@@ -1,8 +1,9 @@
-// Numbers with their derivatives: a function written once for them, as a sag, has its value, its slopes and its local Jacobian.
+// Numbers with derivatives: a function written for them, as a sag, has its value, its slopes and its local Jacobian.
 //
-// A Jet has a first derivative by each variable in `first`, a bit each, and a second one by each pair of a row and a variable
-// in `second`, at bit kVariables · row + variable; rows, the first variables, are those in `rows`. Other derivatives are 0 and
-// take no time. Loops over rays are vectorised where the jets of a ray are made in a function of their own.
+// A Jet has a first derivative by each variable in `first`, a bit each, and a second one by each pair of a row and a
+// variable in `second`, at bit kVariables · row + variable. Rows are variables, too: those in `rows`. Other derivatives
+// are 0 and take no time. A loop over rays is vectorised where a function of its own makes the jets of a ray, no struct
+// of jets among them, and selects between numbers, not between jets.
 #pragma once
 #include <cstdint>
 #include <limits>
@@ -165,7 +166,13 @@ ONE_JET auto share(JET_A) {
   to.inside = a.inside & inside;
   return to;
 }
-ONE_JET auto sine(JET_A) { const T s = std::sin(a.v), c = std::cos(a.v); return composed(a, s, c, -s); }
-ONE_JET auto cosine(JET_A) { const T s = std::sin(a.v), c = std::cos(a.v); return composed(a, c, -s, -c); }
+ONE_JET auto sine(JET_A) {
+  const T s = std::sin(a.v);
+  return composed(a, s, std::cos(a.v), -s);
+}
+ONE_JET auto cosine(JET_A) {
+  const T c = std::cos(a.v);
+  return composed(a, c, -std::sin(a.v), -c);
+}
 
 }  // namespace raytrace

@@ -235,21 +235,12 @@ void sum_with_constant(int count, const T* x, const T* y, const T* gp, const T* 
   sum_polynomial(count - 1, x, y, gp, gx, gy, n, to, sums + 1);
 }
 
-// The same of Σ a_j u^j.
+// The same of Σ a_j u^j, whose slope by u has the cotangent 2 (x x̄ + y ȳ).
 template <typename T>
-void sum_radial(int count, const Rays<T>& at, const T* gp, const T* gx, const T* gy, int n, Added<T, kBlock>& to,
-                double* sums) {
-  for (int i = 0; i < n; i++) to.q[i] = 1;
-  for (int j = 0; j < count; j++) {
-    T sum = 0;
-#pragma omp simd reduction(+ : sum)
-    for (int i = 0; i < n; i++) {
-      const T u = at.x[i] * at.x[i] + at.y[i] * at.y[i];
-      sum += to.q[i] * (gp[i] * u + T(2 * (j + 1)) * (gx[i] * at.x[i] + gy[i] * at.y[i]));
-      to.q[i] *= u;
-    }
-    sums[j] += sum;
-  }
+void sum_radial(int count, const Rays<T>& at, const T* gp, const T* gx, const T* gy, int n, Notes<T>& notes, double* sums) {
+#pragma omp simd
+  for (int i = 0; i < n; i++) notes.px[i] = gp[i], notes.py[i] = T(2) * (gx[i] * at.x[i] + gy[i] * at.y[i]);
+  sum_series(at, notes, n, count, sums);
 }
 
 // And of a hologram, of number j and those behind it.
@@ -267,11 +258,11 @@ void sum_hologram(const T* numbers, const Rays<T>& at, const T* gp, const T* gx,
 
 template <typename T>
 void sum_path(const Layout& at, const T* numbers, const Rays<T>& hit, const T* gp, const T* gx, const T* gy, int n,
-              Added<T, kBlock>& to, double* sums) {
+              Notes<T>& notes, double* sums) {
   if (at.phase == kFacets) return;
   if (at.phase == kHologram) sum_hologram(numbers, hit, gp, gx, gy, n, sums);
-  else if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
-  else sum_with_constant(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);
+  else if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, notes, sums);
+  else sum_with_constant(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, notes.added, sums);
 }
 
 }  // namespace raytrace

@@ -42,7 +42,7 @@ void pull_diffract(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Not
     g.y[i] += bx * added.xy[i] + by * added.yy[i] + R * gy;
     added.x[i] = bx, added.y[i] = by;
   }
-  sum_path(*s.at, s.phase, to, g.path, added.x, added.y, n, added, row + s.at->phase_numbers);
+  sum_path(*s.at, s.phase, to, g.path, added.x, added.y, n, notes, row + s.at->phase_numbers);
   row[s.at->before] += sum_n1, row[s.at->behind] += sum_n2;
 }
 
@@ -63,7 +63,8 @@ template <typename T, typename... Of>
 }
 
 template <typename T>
-void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n, const Surface<T>& s, double* row) {
+void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n, const Surface<T>& s,
+                 double* row) {
   enum { x, y, L, M, N, n1, n2, power_x, power_y, vergence };
   const auto before = variable<0, n1>(s.n1);
   const auto behind = variable<0, n2>(s.n2);
@@ -74,9 +75,9 @@ void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes
   T sum_n1 = 0, sum_n2 = 0, sum_x = 0, sum_y = 0, sum_v = 0;
 #pragma omp simd reduction(+ : sum_n1, sum_n2, sum_x, sum_y, sum_v)
   for (int i = 0; i < n; i++) {
-    const auto merit =
-        merit_by(g.L[i], g.M[i], g.N[i], g.path[i], variable<0, x>(to.x[i]), variable<0, y>(to.y[i]), variable<0, L>(from.L[i]),
-                 variable<0, M>(from.M[i]), variable<0, N>(from.N[i]), before, behind, along_x, along_y, imaged);
+    const auto merit = merit_by(g.L[i], g.M[i], g.N[i], g.path[i], variable<0, x>(to.x[i]), variable<0, y>(to.y[i]),
+                                variable<0, L>(from.L[i]), variable<0, M>(from.M[i]), variable<0, N>(from.N[i]), before,
+                                behind, along_x, along_y, imaged);
     g.x[i] += merit.d[x], g.y[i] += merit.d[y], g.L[i] = merit.d[L], g.M[i] = merit.d[M], g.N[i] = merit.d[N];
     sum_n1 += merit.d[n1], sum_n2 += merit.d[n2];
     sum_x += merit.d[power_x], sum_y += merit.d[power_y], sum_v += merit.d[vergence];
@@ -138,9 +139,9 @@ void push_slopes(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&, 
   const auto vergence = variable<0, 0>(s.phase[2], change.phase[2]);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
-    const auto of = change_by<T>(variable<0, 0>(to.x[i], d.x[i]), variable<0, 0>(to.y[i], d.y[i]), variable<0, 0>(from.L[i], d.L[i]),
-                         variable<0, 0>(from.M[i], d.M[i]), variable<0, 0>(from.N[i], d.N[i]), before, behind, power_x,
-                         power_y, vergence);
+    const auto of = change_by<T>(variable<0, 0>(to.x[i], d.x[i]), variable<0, 0>(to.y[i], d.y[i]),
+                                 variable<0, 0>(from.L[i], d.L[i]), variable<0, 0>(from.M[i], d.M[i]),
+                                 variable<0, 0>(from.N[i], d.N[i]), before, behind, power_x, power_y, vergence);
     d.L[i] = of.l, d.M[i] = of.m, d.N[i] = of.n;
     if (path) d.path[i] += of.path;
   }

@@ -60,7 +60,8 @@ inline bool diffract(const Surface<double>& s, const Added<double, 1>& added, do
 // How much longer the way from the vertex to a point on the ray is than the ray's own; v: inverse distance, sign: -1 before
 // the lens, 1 behind it. Any number type, as below.
 template <typename T, typename X, typename Y, typename L, typename M, typename N, typename V>
-[[gnu::always_inline]] inline auto longer(const X& x, const Y& y, const L& l, const M& m, const N& n, const V& vergence, int sign) {
+[[gnu::always_inline]] inline auto longer(const X& x, const Y& y, const L& l, const M& m, const N& n, const V& vergence,
+                                          int sign) {
   const auto v = magnitude(n) * vergence;
   const auto px = v * x + T(sign) * l;
   const auto py = v * y + T(sign) * m;
@@ -69,8 +70,8 @@ template <typename T, typename X, typename Y, typename L, typename M, typename N
 
 // Calls work(l, m, n, path) with the direction of a ray behind an ideal lens and the path that it adds; power: φx, φy;
 // vergence: of the point that it images.
-template <typename T, typename X, typename Y, typename L, typename M, typename N, typename A, typename B, typename U, typename W, typename V,
-          typename Work>
+template <typename T, typename X, typename Y, typename L, typename M, typename N, typename A, typename B, typename U,
+          typename W, typename V, typename Work>
 [[gnu::always_inline]] inline auto bent(const X& x, const Y& y, const L& l, const M& m, const N& n, const A& n1, const B& n2,
                                         const U& power_x, const W& power_y, const V& vergence, Work work) {
   const auto steep = magnitude(n);
@@ -92,7 +93,8 @@ struct Behind { T l, m, n, path; };
 
 template <typename T>
 [[gnu::always_inline]] inline Behind<T> behind_ideal(T x, T y, T l, T m, T n, T n1, T n2, T power_x, T power_y, T vergence) {
-  return bent<T>(x, y, l, m, n, n1, n2, power_x, power_y, vergence, [](T l, T m, T n, T path) { return Behind<T>{l, m, n, path}; });
+  return bent<T>(x, y, l, m, n, n1, n2, power_x, power_y, vergence,
+                 [](T l, T m, T n, T path) { return Behind<T>{l, m, n, path}; });
 }
 
 template <typename T>
@@ -101,7 +103,8 @@ int bend_slopes(Rays<T>& rays, Notes<T>& notes, int n, const Surface<T>& s, bool
   int flagged = 0;
 #pragma omp simd reduction(+ : flagged)
   for (int i = 0; i < n; i++) {
-    const auto to = behind_ideal(rays.x[i], rays.y[i], rays.L[i], rays.M[i], rays.N[i], s.n1, s.n2, power_x, power_y, vergence);
+    const auto to = behind_ideal(rays.x[i], rays.y[i], rays.L[i], rays.M[i], rays.N[i], s.n1, s.n2, power_x, power_y,
+                                 vergence);
     if (path) rays.path[i] += to.path;
     rays.L[i] = to.l, rays.M[i] = to.m, rays.N[i] = to.n;
     flagged += notes.flagged[i] == 0 ? 0 : 1;

@@ -16,7 +16,8 @@ inline Height base_at(const Surface<double>& s, double x, double y) {
   Height to{};
   by_kind_of_terms(*s.at, [&](auto kind, auto count) {
     const auto S = sag_at<kind(), count(), kStill, kNoRows>(s, x, y);
-    to = {S.v, S.d[kX], S.d[kY], std::fabs(S.v) + std::fabs(s.c) * (x * x + y * y) + size_of_terms<kind()>(s, x, y), S.inside};
+    const double size = std::fabs(S.v) + std::fabs(s.c) * (x * x + y * y) + size_of_terms<kind()>(s, x, y);
+    to = {S.v, S.d[kX], S.d[kY], size, S.inside};
   });
   return to;
 }
@@ -187,7 +188,8 @@ struct Search {
     const double added = has_sag_terms(s.at->kind) ? sag_terms_size(s, radius) : 0;
     double A = L * L + M * M, B = x * L + y * M, C = x * x + y * y - radius * radius;
     double discriminant = B * B - A * C, width = std::sqrt(std::fmax(discriminant, 0.0));
-    const Stretch of{A > 0 ? (-B - width) / A : -big(), A > 0 ? (-B + width) / A : big(), A > 0 ? discriminant >= 0 : C <= 0};
+    Stretch of{-big(), big(), C <= 0};
+    if (A > 0) of = {(-B - width) / A, (-B + width) / A, discriminant >= 0};
     return between(low - added, high + added, 0.05, of);
   }
 
@@ -208,8 +210,8 @@ struct Search {
     };
     cut(x, L, side.x), cut(y, M, side.y);
     double low = infinity, high = -infinity;
-    for (int i = -8; i <= 8; i++)
-      for (int j = -8; j <= 8; j++) {
+    for (int i = 0; i <= 8; i++)
+      for (int j = 0; j <= 8; j++) {
         double S = height_at(s, i / 8.0 * (1 - 1e-8) * side.x, j / 8.0 * (1 - 1e-8) * side.y).z;
         low = std::fmin(low, S), high = std::fmax(high, S);
       }
