@@ -13,7 +13,7 @@ from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS
 from raytrace.io.source import Place, decode
-from raytrace.tracing import aiming
+from raytrace.tracing import aiming, trace
 from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
 from raytrace.tracing.trace import aiming_of, at_stop, trace_lens
 
@@ -218,3 +218,10 @@ def test_few_rays_of_many_are_differentiated_in_aiming(monkeypatch):
     monkeypatch.setattr(aiming, "_error_and_jacobian", lambda r, p, f: counts.append(p.shape[-1]) or plain(r, p, f))
     launch(rt.read_lens("retrofocus"), rt.gauss_rings(20, 64)[0])
     assert max(counts) < 300
+
+
+def test_a_search_prepares_the_media_once(monkeypatch):
+    counts, plain = [], trace.media
+    monkeypatch.setattr(trace, "media", lambda lens, wavelength: counts.append(1) or plain(lens, wavelength))
+    launch(rt.read_lens("double_gauss").at(ray_aiming="real"), rt.hexapolar(2)[0])
+    assert len(counts) == 2  # for the radius of the stop, and for the search

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -405,3 +407,8 @@ def test_residual_is_the_distance_from_many_rays(field, distance, stop):
     shape = result.kernel.flatten() * 65_536 / hits.shape[1]
     true = (h - shape).abs().sum() / h.sum()
     assert result.residual.item() == pytest.approx(true.item(), abs=0.02)
+
+
+def test_a_kernel_loads_no_computer_algebra():
+    code = "import sys, raytrace as rt; rt.psf('singlet', 'gaussian', size=9); sys.exit('sympy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
