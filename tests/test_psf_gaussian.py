@@ -8,6 +8,7 @@ import pytest
 import torch
 from problems import MICROMETRE, double_gauss, scalar, vector
 
+import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.maths.sampling import Grid, gauss_rings, grid, sobol
 from raytrace.psf_models import gaussian
@@ -405,3 +406,8 @@ def test_residual_is_the_distance_from_many_rays(field, distance, stop):
     shape = result.kernel.flatten() * 65_536 / hits.shape[1]
     true = (h - shape).abs().sum() / h.sum()
     assert result.residual.item() == pytest.approx(true.item(), abs=0.02)
+
+
+def test_a_kernel_loads_no_computer_algebra(monkeypatch):
+    monkeypatch.setattr(torch, "broadcast_shapes", None)  # its first call imports sympy
+    assert rt.psf(rt.read_lens("singlet"), "gaussian", size=9).kernel.shape[-2:] == (9, 9)
