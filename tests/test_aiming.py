@@ -13,14 +13,9 @@ from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS
 from raytrace.io.source import Place, decode
-<<<<<<< HEAD
 from raytrace.system.lens import aligned
-from raytrace.tracing import aiming
-from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, rays_of_field, warn_of_filling
-=======
 from raytrace.tracing import aiming, trace
-from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, warn_of_filling
->>>>>>> suite
+from raytrace.tracing.launch import TOLERANCE, UnfilledStop, filling, launch, rays_of_field, warn_of_filling
 from raytrace.tracing.trace import aiming_of, at_stop, trace_lens
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
@@ -226,7 +221,6 @@ def test_few_rays_of_many_are_differentiated_in_aiming(monkeypatch):
     assert max(counts) < 300
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("kind", ["paraxial", "real"])
 def test_points_of_the_pupil_may_have_fewer_axes_than_the_lens(kind):
     """Those of a field each, and a lens with an axis of object distances before that."""
@@ -240,10 +234,10 @@ def test_points_of_the_pupil_may_have_fewer_axes_than_the_lens(kind):
         alone = lens.replace(0, thickness=torch.tensor(distance, dtype=torch.float64))
         rays = rays_of_field(alone, field[:, :, None, None], each, wavelength=lens.wavelengths[:, None])
         torch.testing.assert_close(found.position[:, k].expand_as(rays.position), rays.position, atol=1e-9, rtol=0)
-=======
+
+
 def test_a_search_prepares_the_media_once(monkeypatch):
     counts, plain = [], trace.media
     monkeypatch.setattr(trace, "media", lambda lens, wavelength: counts.append(1) or plain(lens, wavelength))
     launch(rt.read_lens("double_gauss").at(ray_aiming="real"), rt.hexapolar(2)[0])
     assert len(counts) == 2  # for the radius of the stop, and for the search
->>>>>>> suite
