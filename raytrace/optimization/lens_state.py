@@ -1,6 +1,8 @@
-"""LensState: a lens in one configuration at given variables: its numbers, first-order data and rays, with derivatives.
+"""Design variables: a lens as a function of its variables, and the fast path of an optimisation through it.
 
-Numbers are plain, or dual (`maths.numerics`) where derivatives are computed, or the tensors of
+`DesignVariables` are a lens with its variables and solves, `lens_at` the lens at any of their values; a `View` is one
+configuration of it, a `LensState` the view at given variables: its numbers, first-order data and rays, with
+derivatives. Numbers are plain, or dual (`maths.numerics`) where derivatives are computed, or the tensors of
 `DesignVariables.lens_at`; the formulas are the same. SOLVES computes the numbers of a lens that follow from others, at
 the primary wavelength; n is signed, ω = n u.
 
@@ -15,7 +17,8 @@ of the stop: by Newton's method from the last solution, and ∂a/∂x = (∂s/�
 """
 
 import copy
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,12 +28,30 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.system.lens import Lens, index_behind, media
-from raytrace.system.optimization_data import Solve
-from raytrace.system.parameter_paths import with_numbers_of
+from raytrace.system.configurations import Operand, ScaledPath, with_entry
+from raytrace.system.lens import Lens, index_behind, is_round_about_axis, media, per_lens
+from raytrace.system.optimization_data import Solve, Vary
+from raytrace.system.parameter_paths import (
+    GLASS,
+    GLASS_NUMBER,
+    OF_LENS,
+    PRESSURE,
+    TEMPERATURE,
+    Address,
+    UnknownNumber,
+    modelled,
+    names_at,
+    parameter_paths,
+    path_of,
+    sensor,
+    stored_number,
+    with_numbers_of,
+)
+from raytrace.system.phases import power_of
 from raytrace.system.rays import Rays
-from raytrace.system.surface import is_flat, power, sag_at, signed, vertex_curvature
-from raytrace.tracing.compiled import Task, is_expressible, rows_of
+from raytrace.system.shapes import EVEN
+from raytrace.system.surface import is_flat, medium_surfaces, power, sag_at, signed, vertex_curvature
+from raytrace.tracing.compiled import Task, is_expressible, rows_of, structure_of
 from raytrace.tracing.geometry import edge_thickness, semi_diameter
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
@@ -45,6 +66,339 @@ from raytrace.tracing.trace import (
     trace_surfaces,
     without_apertures,
 )
+
+# -- the lens as a function of its variables ---------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class DesignVariables:
+    """The numbers of a lens that move, in all its configurations, and the lens at any of their values.
+
+    lens: at the start, where all these numbers are modelled, also those that are 0; variables, solves: of
+    `OptimizationData`; opening: the fraction of pupil and field that the rays of a merit function fill. Raises
+    UnknownNumber for numbers that the lens does not have.
+    """
+
+    lens: Lens
+    variables: tuple[Vary, ...] = ()
+    solves: tuple[Solve, ...] = ()
+    opening: float = 1.0
+
+    def __post_init__(self):
+        for one in (*self.variables, *self.solves):
+            if not 0 <= one.surface < len(self.lens.surfaces):
+                last = len(self.lens.surfaces) - 1
+                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
+        named = {
+            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
+            for one in self.variables
+        }
+        if len(named) < len(self.variables):
+            raise UnknownNumber("a variable is named twice")
+        object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
+
+    @cached_property
+    def views(self) -> tuple["View", ...]:
+        """The lens in each of its configurations."""
+        return tuple(View(self, number) for number in range(1, len(self.lens.configurations) + 1))
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The current variables (n,)."""
+        return np.array(
+            [
+                stored_or_0(self.lens, (one.surface, one.quantity))
+                if one.operand is None
+                else float(self.lens.operands[one.operand].numbers[one.configuration - 1])
+                for one in self.variables
+            ]
+        )
+
+    def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
+        """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+
+        lens: this one in another dtype or on another device, those of the variables.
+
+        Differentiable to first and second order by tensors: by their graph, by transforms of torch.func, and by
+        tensors that carry derivatives (`maths.tangents`). Numbers of L lenses are (L, 1, 1, 1), as of `perturbed`.
+        """
+        lens = lens or self.lens
+        if not isinstance(variables, Tensor):
+            variables = lens.wavelengths.new_tensor(variables, dtype=torch.float64)
+        each, operands = tuple(map(per_lens, variables.unbind(-1))), list(lens.operands)
+        for configuration in range(1, len(lens.configurations) + 1) if operands else ():
+            for k, (variable, scale, offset) in followed(self, configuration).items():
+                numbers = with_entry(operands[k].numbers, (configuration - 1,), scale * each[variable] + offset)
+                operands[k] = dataclasses.replace(operands[k], numbers=numbers)
+        view = self.views[lens.current_configuration - 1]
+        lens = dataclasses.replace(lens, operands=tuple(operands))
+        numbers = LensState(view, each, lens).tensors() if view.solves else view.numbers(each)
+        return with_numbers_of(lens, numbers, view.places)
+
+
+def _with_picked_glasses(lens: Lens, variables: Sequence[Vary], solves: Sequence[Solve]) -> Lens:
+    """The lens whose pickups of glasses that vary have the glass that they pick up."""
+    moved, surfaces = {one.surface for one in variables if one.quantity in GLASS}, list(lens.surfaces)
+    pickups = [one for one in solves if (one.quantity, one.kind) == ("glass", "pickup")]
+    for one in sorted(pickups, key=lambda one: one.surface):
+        if one.source in moved:
+            glass = surfaces[one.source].glass
+            surfaces[one.surface] = dataclasses.replace(surfaces[one.surface], glass=glass)
+            moved.add(one.surface)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces)) if pickups else lens
+
+
+# -- a lens in one configuration ---------------------------------------------------------------------------------------
+
+#: Power of length of what a pickup between configurations adds.
+_POWERS = {"thickness": 1, "curvature": -1}
+
+
+class View:
+    """A lens in one configuration: what of it moves, and what stays."""
+
+    def __init__(self, model: DesignVariables, configuration: int, *, clips: bool = False):
+        """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
+        self.model, self.configuration = model, configuration
+        lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
+        if not clips:
+            surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
+            lens = dataclasses.replace(lens, surfaces=surfaces)
+        #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
+        operands = (operand for operand in lens.operands if operand.numbers is not None)
+        overridden = {at for operand in operands for at, _ in addresses_of(lens, operand)}
+        #: By address which variable a number is, by what factor, and what is added.
+        self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
+        for number, one in enumerate(model.variables):
+            if one.operand is None and (one.surface, one.quantity) not in overridden:
+                self.variables[one.surface, one.quantity] = number, 1.0, 0.0
+        own = [one for one in model.solves if one.operand is None and (one.surface, one.quantity) not in overridden]
+        own = [one for one in own if one.quantity == "glass" or not self._is_idle(one, lens)]
+        own = _with_glasses(own, self.variables)
+        self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
+        moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
+        self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
+        surfaces = list(lens.surfaces)
+        for surface, quantity in self.moved:
+            surfaces[surface] = modelled(surfaces[surface], quantity)
+        self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
+        self.stored = {at: self.number(at) for at in self.moved}
+        surfaces = self.lens.surfaces
+        #: Where the lens holds the numbers that move.
+        self.places = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
+
+    def _is_idle(self, one: Solve, lens: Lens) -> bool:
+        """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
+        at = [(one.source, one.quantity_of_source or one.quantity), (one.surface, one.quantity)]
+        known = all(quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in at)
+        return one.kind == "pickup" and not known and at[0] not in self.variables
+
+    @cached_property
+    def clipping(self) -> "View":
+        """The same with its apertures."""
+        return View(self.model, self.configuration, clips=True)
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether a solve waits for others that come later, or for the entrance pupil that it moves itself."""
+        solved = {(one.surface, one.quantity): position for position, one in enumerate(self.solves)}
+
+        def is_late(position: int, one: Solve) -> bool:
+            if one.kind == "pickup":
+                return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
+            if one.kind in ("power", "position"):
+                return one.source > one.surface
+            last = sensor(self.lens), "thickness"  # which changes no power
+            if one.kind == "focal_length":
+                return any((later.surface, later.quantity) != last for later in self.solves[position + 1 :])
+            if (one.surface, one.quantity) == last:
+                return False
+            if one.kind == "edge_thickness":
+                shape = [
+                    at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
+                ]
+                return bool(shape) or not any(one.numbers[1:])
+            return one.surface < self.lens.stop or self.lens.aperture.kind in (
+                "image_f_number",
+                "paraxial_working_f_number",
+            )
+
+        return any(is_late(*found) for found in enumerate(self.solves))
+
+    def numbers(self, variables) -> dict[Address, object]:
+        """The numbers that variables move, without those that are solved."""
+        return {
+            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
+            for at, (number, scale, offset) in self.variables.items()
+        }
+
+    def number(self, at: Address) -> float:
+        """A number of the lens as it is stored."""
+        return stored_or_0(self.lens, at)
+
+    @cached_property
+    def wavelengths(self) -> list[float]:
+        return self.lens.wavelengths.tolist()
+
+    @cached_property
+    def indices(self) -> np.ndarray:
+        """Signed index (W, S) behind every surface, the object first."""
+        n = signed(self.lens.surfaces[1:], media(self.lens, self.lens.wavelengths))
+        return np.stack([x.detach().numpy() for x in n], -1)
+
+    @cached_property
+    def media(self) -> list[int]:
+        """The surface whose glass fills the space behind each surface."""
+        return medium_surfaces(self.lens.surfaces)
+
+    @cached_property
+    def glasses(self) -> dict[int, list[Address]]:
+        """What moves of the media, by the surface in front of them: all of them with the air."""
+        air = [at for at in (TEMPERATURE, PRESSURE) if at in self.moved]
+        found: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
+        for surface, quantity in self.moved:
+            if quantity in GLASS or quantity.startswith(GLASS_NUMBER):
+                found.setdefault(surface, []).append((surface, quantity))
+        return found
+
+    @cached_property
+    def thickness(self) -> list[float]:
+        return [float(surface.thickness.detach()) for surface in self.lens.surfaces]
+
+    @cached_property
+    def curvature(self) -> list[float]:
+        return [
+            0.0 if surface.curvature is None else float(surface.curvature.detach()) for surface in self.lens.surfaces
+        ]
+
+    @cached_property
+    def of_surfaces(self) -> dict[str, np.ndarray]:
+        """Thickness, curvature, conic and even terms a2, a4 … (S,) of all surfaces, 0 where a surface has none."""
+        surfaces = self.lens.surfaces
+        conics = [0.0 if surface.conic is None else float(surface.conic.detach()) for surface in surfaces]
+        numbers = {name: np.array(n) for name, n in (("thickness", self.thickness), ("curvature", self.curvature))}
+        terms = [s.coefficients.tolist() if s.coefficients is not None and s.kind == EVEN else [] for s in surfaces]
+        for j in range(max(map(len, terms))):
+            numbers[f"a{2 * j + 2}"] = np.array([even[j] if j < len(even) else 0.0 for even in terms])
+        return numbers | {"conic": np.array(conics)}
+
+    @cached_property
+    def further_power(self) -> tuple[np.ndarray, np.ndarray]:
+        """Power in addition to the curvature: the vertex by terms of r² (S,) in 1/mm, phases (W, S) in 1/mm."""
+        bend, phase = np.zeros(len(self.lens.surfaces)), np.zeros_like(self.indices)
+        for k, surface in enumerate(self.lens.surfaces):
+            if k == 0 or surface.is_break:
+                continue
+            bend[k] = float(vertex_curvature(surface).detach()) - self.curvature[k]
+            if surface.phase is not None:
+                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
+        return bend, phase
+
+    @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether all of it is round about one axis."""
+        return is_round_about_axis(self.lens)
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether all first-order data follow from thicknesses and curvatures alone."""
+        plain = "curvature", "thickness", *GLASS
+        others = [at for at in self.stored if at[1] not in plain and not at[1].startswith(GLASS_NUMBER)]
+        units = torch.eye(len(others), dtype=torch.float64)
+        numbers = {at: torch.tensor(float(self.stored[at]), dtype=torch.float64) for at in others}
+        with torch.enable_grad():
+            lens = self.held({at: with_tangents(numbers[at], units[k]) for k, at in enumerate(others)})
+            powers = [vertex_curvature(s) for s in lens.surfaces if s.curvature is not None or s.is_plane]
+            powers += [power_of(s.phase, lens.wavelengths)[1] for s in lens.surfaces if s.phase is not None]
+        return not any(bool(tangents_of(power, len(others)).any()) for power in powers)
+
+    def held(self, numbers: dict[Address, Tensor]) -> Lens:
+        """The lens with other numbers."""
+        return with_numbers_of(self.lens, numbers, self.places)
+
+    def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
+        """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
+
+        indices: (W,) of media by the surface in front of each, instead of the indices of the lens.
+        """
+        wavelength = lens.wavelengths[:, None]
+        surfaces = sequence_of(lens)[:last]
+        given = indices or {}
+        indices = [
+            given[surface][:, None] if surface in given else n
+            for surface, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
+        ]
+        structure, table = structure_of(surfaces, indices, 1, None, wavelength)
+        rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
+        return surfaces, structure, torch.stack(rows, -1)
+
+    def state(self, variables) -> "LensState":
+        return LensState(self, variables)
+
+
+def stored_or_0(lens: Lens, at: Address) -> float:
+    """A number of a lens as it is stored, 0 where it is not modelled."""
+    number = stored_number(lens, at)
+    return 0.0 if number is None else float(number)
+
+
+def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
+    """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
+    operands that pick up the number of another configuration."""
+    return {
+        at: (number, place.factor * scale, place.factor * offset + place.offset)
+        for operand, (number, scale, offset) in followed(model, configuration).items()
+        for at, place in addresses_of(model.lens, model.lens.operands[operand])
+    }
+
+
+def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int, float, float]]:
+    """By operand that moves in a configuration: which variable moves it, by what factor, and what is added to it.
+
+    A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
+    """
+    moved = {
+        (one.operand, one.configuration): (number, 1.0, 0.0)
+        for number, one in enumerate(model.variables)
+        if one.operand is not None
+    }
+    pickups = [one for one in model.solves if one.operand is not None and one.kind == "pickup" and one.numbers]
+    for _ in pickups:
+        for one in pickups:
+            source, at = (int(one.numbers[0]), one.source), (one.operand, one.configuration)
+            if source in moved and at not in moved:
+                number, scale, offset = moved[source]
+                added = (
+                    one.offset * model.lens.optimization_data.unit ** _POWERS.get(one.quantity, 0)
+                    if model.lens.optimization_data
+                    else 0.0
+                )
+                moved[at] = number, one.scale * scale, one.scale * offset + added
+    return {operand: linear for (operand, at), linear in moved.items() if at == configuration}
+
+
+def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
+    """Pickups of glasses as those of the numbers that vary of the glass that is picked up."""
+    moved, found = set(variables), []
+    for one in sorted(solves, key=lambda one: one.surface):
+        if one.quantity != "glass":
+            found.append(one)
+            continue
+        names = [name for name in GLASS if (one.source, name) in moved]
+        moved |= {(one.surface, name) for name in names}
+        found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
+    return found
+
+
+def addresses_of(lens: Lens, operand: Operand) -> Iterator[tuple[Address, ScaledPath]]:
+    """The numbers of surfaces that an operand of the configurations sets, each with its place."""
+    for place in operand.paths:
+        if place.path[0] == "surfaces":
+            surface = place.path[1]
+            yield from (((surface, name), place) for name in names_at(lens.surfaces[surface], place.path[2:]))
+
+
+# -- solves and pickups ------------------------------------------------------------------------------------------------
 
 
 def _marginal_ray_before(state, surface: int):
@@ -158,7 +512,7 @@ _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 
 
 class LensState:
-    """view: `variables.View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
+    """view: `View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
 
     lens: of tensors, that of the view in their dtype and on their device.
     """

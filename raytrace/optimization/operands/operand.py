@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from raytrace.maths.numerics import Dual, value_of
-from raytrace.optimization.lens_state import Bundle, Hits, LensState, listed
-from raytrace.optimization.variables import View
+from raytrace.optimization.lens_state import Bundle, Hits, LensState, View, listed
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import joined
