@@ -23,7 +23,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -148,6 +149,7 @@ FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno
 #: threads are those of the OpenMP that torch has loaded: two OpenMP libraries would wait for each other at full power.
 _THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
 _TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
+_REALS = "float", "double"  # each an object of its own
 _COMPILERS = ("c++", "g++", "clang++")
 _TAKES = "a minute or two"
 _BUILDING = "building-"
@@ -327,12 +329,19 @@ def _build(folder: Path) -> Path:
     note = threading.Timer(2.0, _say, [f"compiling the trace for this machine (once, {_TAKES}) …"])
     note.daemon = True
     note.start()
-    made, compiled = folder / _file_name(), folder / "trace.o"
+    made, objects = folder / _file_name(), {real: str(folder / f"{real}.o") for real in _REALS}
+
+    def compiled(flags: Sequence[str], real: str) -> subprocess.CompletedProcess:
+        words = (*FLAGS, *flags, f"-DRAYTRACE_REAL={real}", "-c", str(source), "-o", objects[real])
+        return run_compiler(*program, *words, folder=folder)
+
     try:
         for flags in _TRIED:
-            done = run_compiler(*program, *FLAGS, *flags, "-c", str(source), "-o", str(compiled), folder=folder)
+            with ThreadPoolExecutor(len(_REALS)) as side_by_side:
+                each = side_by_side.map(functools.partial(compiled, flags), _REALS)
+                done = max(each, key=lambda one: one.returncode != 0)
             if done.returncode == 0:
-                done = run_compiler(*program, "-shared", str(compiled), "-o", str(made), folder=folder)
+                done = run_compiler(*program, "-shared", *objects.values(), "-o", str(made), folder=folder)
             if done.returncode == 0:
                 with suppress(OSError):  # its threads are torch's: the code needs those that torch has loaded
                     ctypes.CDLL(str(made))

@@ -345,11 +345,13 @@ void backward(const Call& call, int threads) {
 
 }  // namespace raytrace
 
+// One number type, RAYTRACE_REAL: the objects of float and of double are compiled side by side.
+#define RAYTRACE_NAME(work, real) raytrace_##work##_##real
+#define RAYTRACE_ENTRY(work, real) \
+  void RAYTRACE_NAME(work, real)(const raytrace::Call* call, int threads) { raytrace::work<real>(*call, threads); }
+
 extern "C" {
-void raytrace_forward_float(const raytrace::Call* call, int threads) { raytrace::forward<float>(*call, threads); }
-void raytrace_forward_double(const raytrace::Call* call, int threads) { raytrace::forward<double>(*call, threads); }
-void raytrace_tangents_float(const raytrace::Call* call, int threads) { raytrace::tangents<float>(*call, threads); }
-void raytrace_tangents_double(const raytrace::Call* call, int threads) { raytrace::tangents<double>(*call, threads); }
-void raytrace_backward_float(const raytrace::Call* call, int threads) { raytrace::backward<float>(*call, threads); }
-void raytrace_backward_double(const raytrace::Call* call, int threads) { raytrace::backward<double>(*call, threads); }
+RAYTRACE_ENTRY(forward, RAYTRACE_REAL)
+RAYTRACE_ENTRY(tangents, RAYTRACE_REAL)
+RAYTRACE_ENTRY(backward, RAYTRACE_REAL)
 }
