@@ -96,11 +96,12 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)
     scaled = centred / scale
+    mean_square = (share * dot_2(centred, centred)).sum(-1)  # and has derivatives where those of the radii are 0
     square, scale = dot_2(scaled, scaled), scale[..., 0]
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
     rms, geometric = (scale * safe_sqrt(t) for t in (scaled_mean, largest))
-    return total[..., 0] != 0, (reference + mean)[..., 0], scale * (scale * scaled_mean), rms, geometric
+    return total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric
 
 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:

@@ -3,6 +3,7 @@
 // Every loop over a block runs over whole vectors (a block is filled up with axial rays), so a ray's result does not
 // depend on its neighbours; `careful.h` takes the flagged rays one by one, as raytrace/system/surface.py would.
 #pragma once
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -36,7 +37,20 @@ struct Surface {
   const T* phase;  // numbers of the phase
   const T* sag_terms;  // and of the sag terms
   double rim;
+  T span, over_span;  // the square of a length of the surface, a power of 2, in which its derivatives stay in range
 };
+
+// By the curvature 1/length and coefficients of u^(j+1), length^-(2j+1).
+template <typename T>
+void set_span(Surface<T>& s) {
+  constexpr int most = std::numeric_limits<T>::max_exponent / 2 - 2;
+  int length = s.c != 0 ? -std::ilogb(s.c) : most;
+  for (int j = 0; j < s.at->terms; j++) {
+    if (s.a[j] != 0) length = std::min(length, -std::ilogb(s.a[j]) / (2 * j + 1));
+  }
+  length = std::max(-most, std::min(most, length));
+  s.span = std::ldexp(T(1), 2 * length), s.over_span = std::ldexp(T(1), -2 * length);
+}
 
 template <typename T>
 Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
@@ -52,6 +66,7 @@ Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
   s.phase = row + at.phase_numbers;
   s.sag_terms = row + at.sag_term_numbers;
   s.rim = constants[at.rim];
+  set_span(s);
   return s;
 }
 

@@ -108,7 +108,7 @@ ONE_JET auto composed(JET_A, T f, T f1, T f2) {
   Jet<T, rows, a1, a2 | pairs_of(rows, a1, a1)> to;
   to.v = f, to.inside = a.inside;
   derive(to, [&](auto i) { return f1 * BY(a, i()); },
-         [&](auto r, auto i) { return f1 * BY(a, r(), i()) + f2 * (BY(a, r()) * BY(a, i())); });
+         [&](auto r, auto i) { return f1 * BY(a, r(), i()) + f2 * BY(a, r()) * BY(a, i()); });
   return to;
 }
 

@@ -217,20 +217,22 @@ void by_kind_of_terms(const Layout& at, Work work) {
   else if constexpr (kind + 1 < kKinds) by_kind_of_terms<kind + 1>(at, work);
 }
 
-// A round sag S(u) as one of x and y.
+// A round sag S(u) as one of x and y; over: 1/span, of derivatives by u/span.
 template <Mask rows, typename T, Mask along, Mask a1, Mask a2>
-[[gnu::always_inline]] inline auto round_about(const Jet<T, along, a1, a2>& S, T x, T y) {
+[[gnu::always_inline]] inline auto round_about(const Jet<T, along, a1, a2>& S, T x, T y, T over) {
   constexpr Mask numbers = a1 & ~Mask(1), crossed = a2 & ~Mask(1);  // pairs of u and a number are at the number's bit
   constexpr Mask second = rows == 0 ? 0 : pairs_of(rows, 3, 3) | crossed | crossed << kVariables;
   Jet<T, rows, 3 | numbers, second> to;
   to.v = S.v, to.inside = S.inside;
-  const T rise = T(2) * S.d[0], bend = T(4) * as<T>(BY(S, kX, kX));
+  const T rise = T(2) * S.d[0] * over, bend = T(4) * as<T>(BY(S, kX, kX)), across = over * x, up = over * y;
   to.d[kX] = rise * x, to.d[kY] = rise * y;
   each<numbers>([&](auto i) { to.d[i()] = S.d[i()]; });
   if constexpr (rows != 0) {
-    to.h[place_of_pair(kX, kX)] = rise + bend * x * x, to.h[place_of_pair(kY, kY)] = rise + bend * y * y;
-    to.h[place_of_pair(kX, kY)] = bend * x * y;
-    each<crossed>([&](auto i) { to.h[i()] = T(2) * S.h[i()] * x, to.h[i() + kVariables] = T(2) * S.h[i()] * y; });
+    to.h[place_of_pair(kX, kX)] = rise + bend * across * across, to.h[place_of_pair(kY, kY)] = rise + bend * up * up;
+    to.h[place_of_pair(kX, kY)] = bend * across * up;
+    each<crossed>([&](auto i) {
+      to.h[i()] = T(2) * S.h[i()] * across, to.h[i() + kVariables] = T(2) * S.h[i()] * up;
+    });
   }
   return to;
 }
@@ -240,7 +242,9 @@ template <int kind, int size, How how, Mask rows, typename T>
 [[gnu::always_inline]] inline auto sag_at(const Surface<T>& s, T x, T y, const Change<T>* change = nullptr) {
   if constexpr (is_round<kind>()) {
     const Numbers<T, rows & 1, how, size> numbers{s, change};
-    return round_about<rows>(SagOf<kind>::sag(numbers, variable<rows & 1, kX>(x * x + y * y)), x, y);
+    const auto u = rows == kNoRows ? variable<rows & 1, kX>(x * x + y * y)
+                                   : variable<rows & 1, kX>(x * x + y * y, s.span);
+    return round_about<rows>(SagOf<kind>::sag(numbers, u), x, y, rows == kNoRows ? T(1) : s.over_span);
   } else {
     const Numbers<T, rows, how, size> numbers{s, change};
     return SagOf<kind>::sag(numbers, variable<rows, kX>(x), variable<rows, kY>(y));
