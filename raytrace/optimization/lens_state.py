@@ -9,8 +9,8 @@ the primary wavelength; n is signed, ω = n u.
 A `Bundle` launches and traces all rays of a merit function's rows in one pass. Rays start as in `tracing.launch`. Rays
 that depend on the lens only through its first-order data are launched and aimed in numpy: 126 rays and 21 variables
 take 1.4 ms with derivatives, compared with 9 ms of `rt.jacobian` by `tracing.launch` and tensors that carry them; 4 ms
-compared with 25 ms with real ray aiming. `tracing.launch` launches all others (real image heights, telecentric objects, curved
-objects, bent axes).
+compared with 25 ms with real ray aiming. `tracing.launch` launches all others (real image heights, telecentric objects,
+curved objects, bent axes).
 
 Ray aiming solves s(a, x) = p r(x) for the pupil points a, s the hit on the stop, p the point of the pupil, r the radius
 of the stop: by Newton's method from the last solution, and ∂a/∂x = (∂s/∂a)⁻¹ (p ∂r/∂x - ∂s/∂x).

@@ -442,7 +442,8 @@ def _between(listed: Tensor, maps: Tensor, is_first: Tensor, field: Tensor) -> T
         (on_line & ~one_sided, lambda: _at_least(maps, along)[:, 0] + _rise(along, maps, dot_2(line, field))),
         (~on_line, lambda: _by_distance(listed, maps, is_first, field)),
     )
-    (_, result), *others = [(applies, rule()) for applies, rule in rules if is_any(applies)]
+    applied = [(applies, rule()) for applies, rule in rules if is_any(applies)]
+    (_, result), *others = applied or [(on_line, rules[0][1]())]  # of no fields
     for applies, other in others:  # of fields that `torch.func.vmap` batches
         result = torch.where(applies, other, result)
     return result
