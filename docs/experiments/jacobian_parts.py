@@ -31,7 +31,7 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
 
 
 def parts(lens: rt.Lens, repeats: int) -> dict[str, float]:
-    """ms by what is computed."""
+    """ms of each step."""
     pupil = rt.gauss_rings(2, 7)
     model = design_variables(lens, VARY)
     bundle = Bundle(model.views[0], len(lens.surfaces) - 1)
@@ -45,8 +45,8 @@ def parts(lens: rt.Lens, repeats: int) -> dict[str, float]:
     fields = [height * float(lens.fields.extent) for height in FIELDS]
 
     def first_order():
-        there = model.views[0].state(x)
-        return there.gaussian(there.primary), there.entrance_pupil_diameter, there.field_scale
+        moved = model.views[0].state(x)
+        return moved.gaussian(moved.primary), moved.entrance_pupil_diameter, moved.field_scale
 
     def jacobian():
         return rt.jacobian(lens, VARY, fields=fields, pupil=pupil)

@@ -6,7 +6,7 @@
     variables.project()                                 # after a step: onto bounds and constraints, rays brought back
     violation(changed, limits)                          # Σ (excess over a limit)², mm²; 0 can be fabricated
 
-`Variables` are a module around `DesignVariables`: variable and bound syntax, solves and pickups are those of `optimize`
+`Variables` are a module around `DesignVariables`, with the variable and bound syntax, solves and pickups of `optimize`
 (`optimization.variables`). The parameters are offsets from the lens. A state carries the identity of its lens, which is
 compared when it is loaded (`Owned`). A focal length that is held is one more solve, of a number with power.
 
@@ -253,8 +253,8 @@ class Variable:
     """One number of a lens as a parameter.
 
     name: as of `optimization.variables.name_of`, or "sensor" of the last thickness; start: its value in the lens; unit:
-    of the parameter, in that of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in the
-    change that moves the surface by 1 mm of sag at its semi-diameter, so that a step means the same for all of them.
+    of the parameter, in the unit of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in
+    the change that moves the surface by 1 mm of sag at its semi-diameter, so that a step has one meaning for all.
     The system aperture is in tenths of its number at the start, the temperature in 10 °C, the pressure in 0.1 atm.
     `Variables(step="blur")` takes other units.
     """
@@ -282,7 +282,7 @@ class Variables(Owned):
 
     vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 a4:3 temperature
         curvature:6=-curvature:1". Solves and pickups are those named here alone: the sensor stays where it is put even
-        if the file solves for it. Glasses are not exchanged, and the distance of the object is that of a camera.
+        if the file solves for it. Glasses are not exchanged, and the camera sets the distance of the object.
     bounds: smallest and largest number by name ("sensor", "curvature_3"), or bound syntax; `project` clamps.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
@@ -570,7 +570,8 @@ class Variables(Owned):
         excess = np.array([float(one.detach()) for one in each])
         if not derivatives:
             return excess, None
-        return excess, np.array([tangents_of(one, len(x)).numpy() for one in each]).reshape(-1, len(x))
+        slopes = [tangents_of(one, len(x)).detach().numpy() for one in each]
+        return excess, np.array(slopes).reshape(-1, len(x))
 
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
@@ -584,7 +585,7 @@ class Variables(Owned):
 
 
 def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
-    """The variables, solves and pickups of variable syntax, without those of the file, in double precision on the
+    """The variables, solves and pickups of variable syntax, without solves of the file, in double precision on the
     processor. Raises BadVariables for what a camera does not vary."""
     if not split_words(vary):
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")

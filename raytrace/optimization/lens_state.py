@@ -117,7 +117,7 @@ class DesignVariables:
     def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
         """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
 
-        lens: this one in another dtype or on another device, those of the variables.
+        lens: the same lens in the dtype and on the device of the variables, if they differ.
 
         Differentiable to first and second order by tensors: by their graph, by transforms of torch.func, and by
         tensors that carry derivatives (`maths.tangents`). Numbers of L lenses are (L, 1, 1, 1), as of `perturbed`.
@@ -167,7 +167,7 @@ class View:
         #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
         operands = (operand for operand in lens.operands if operand.numbers is not None)
         overridden = {at for operand in operands for at, _ in addresses_of(lens, operand)}
-        #: By address which variable a number is, by what factor, and what is added.
+        #: By address: the variable that a number follows, its factor and its offset.
         self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
         for number, one in enumerate(model.variables):
             if one.operand is None and (one.surface, one.quantity) not in overridden:
@@ -353,7 +353,7 @@ def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tu
 
 
 def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int, float, float]]:
-    """By operand that moves in a configuration: which variable moves it, by what factor, and what is added to it.
+    """By operand that moves in a configuration: the variable that moves it, its factor and its offset.
 
     A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
     """
@@ -378,7 +378,7 @@ def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int,
 
 
 def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
-    """Pickups of glasses as those of the numbers that vary of the glass that is picked up."""
+    """Pickups of glasses as pickups of each number that varies of the glass that is picked up."""
     moved, found = set(variables), []
     for one in sorted(solves, key=lambda one: one.surface):
         if one.quantity != "glass":
@@ -514,7 +514,7 @@ _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 class LensState:
     """view: `View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
 
-    lens: of tensors, that of the view in their dtype and on their device.
+    lens: of tensors, the lens of the view in their dtype and on their device.
     """
 
     def __init__(self, view, variables, lens: Lens | None = None):
@@ -681,8 +681,8 @@ class LensState:
         if kind not in CONES:
             return None
         number = number / self.index(self.primary)[0] if kind == "object_na" else number
-        of = torch if isinstance(number, Tensor) else np
-        return of.tan(of.arcsin(number) if kind == "object_na" else of.deg2rad(number))
+        library = torch if isinstance(number, Tensor) else np
+        return library.tan(library.arcsin(number) if kind == "object_na" else library.deg2rad(number))
 
     @cached_property
     def marginal_height(self):
@@ -765,7 +765,7 @@ class LensState:
     def through_torch(self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False) -> list:
         """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
-        clips: whether the lens has its apertures; that of tensors has none.
+        clips: whether the lens has its apertures; a lens of tensors has none.
         """
         if self.is_of_tensors:
             return [*function(self.moving_lens())]

@@ -253,5 +253,5 @@ def with_entry(numbers: Tensor, entry: tuple[int, ...], number: Tensor) -> Tenso
 
 
 def spread_for(numbers: Tensor, number: Tensor, axes: int = 1) -> Tensor:
-    """Numbers with so many axes by themselves, and trailing ones for those of a number of L lenses."""
+    """Numbers with so many axes of their own, and trailing axes of length 1 for a number of L lenses."""
     return numbers.reshape(*numbers.shape, *(1,) * (number.dim() + axes - numbers.dim()))

@@ -93,7 +93,7 @@ class Form:
 
     sag: with its derivatives up to the highest; covers: where there is a surface, on the sheet of the vertex;
     extent: of c, k, a and a limit (...) mm, how far that sheet goes along x and y, at most to the limit;
-    size: of c, a and points, what the sag adds up from beside its height, by which its rounding is judged.
+    size: of c, a and points, the magnitudes of the terms of a sag without its height, by which its rounding is judged.
     By default a sag covers the plane.
     """
 

@@ -37,7 +37,7 @@ Bundle = tuple[Lens, Tensor, Tensor, Tensor]
 class _Front:
     """Rays behind the first `count` surfaces after the object, in the frame of the last of them (of surface 1 if 0).
 
-    points: (2, ...) mm where they meet those of these surfaces that are asked for; indices: of all media, None if one
+    points: (2, ...) mm where they meet the surfaces that are asked for among these; indices: of all media, None if one
     depends on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
     """
 

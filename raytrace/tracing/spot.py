@@ -96,7 +96,7 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)
     scaled = centred / scale
-    mean_square = (share * dot_2(centred, centred)).sum(-1)  # and has derivatives where those of the radii are 0
+    mean_square = (share * dot_2(centred, centred)).sum(-1)  # differentiable where a radius is 0
     square, scale = dot_2(scaled, scaled), scale[..., 0]
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
@@ -200,7 +200,7 @@ def arrivals(
     count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
     helps = "ask for fewer, or by `rays`, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
-    size = piece(RAY_BYTES * F * W * P)  # lenses at once; fields, where those of one lens are more than a chunk
+    size = piece(RAY_BYTES * F * W * P)  # lenses at once; a lens whose fields exceed a chunk is split by fields
     lenses = [lens] if size >= L else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]
     some_fields = fields.split(piece(min(L, size) * RAY_BYTES * W * P), 1)
     each = []  # of every chunk, rays (3, F, W, P) on the sensor, whether they reach it, and their status if one fails

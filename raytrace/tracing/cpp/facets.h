@@ -11,7 +11,7 @@ namespace raytrace {
 
 constexpr int kShape = 2;  // numbers before the terms
 
-// The asphere above the plane, or how it changes: its numbers are those of the phase.
+// The asphere above the plane, or how it changes, by the numbers of the phase.
 template <template <typename> class Of, typename T, typename C>
 Of<T> facets_of(const Surface<T>& s, const C* numbers) {
   Of<T> to{};

@@ -61,7 +61,7 @@ inline T as(Zero) { return 0; }
 template <typename T, Mask rows, Mask first = 0, Mask second = 0>
 struct Jet {
   T v, d[kVariables], h[kVariables * kRows];
-  bool inside = true;  // whether every root on the way was that of a positive number
+  bool inside = true;  // whether every root on the way was of a positive number
 
   template <int i>
   inline auto by() const {

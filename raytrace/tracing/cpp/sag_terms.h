@@ -63,7 +63,7 @@ inline Added<double, 1> sag_terms_at(const Surface<double>& s, double x, double 
   return found;
 }
 
-// The sag of a kind at a point, with that of its sag terms, which stand in place i of `added`.
+// The sag of a kind at a point with its sag terms, which `added` holds in place i.
 template <int kind, int size, How how, Mask rows, typename T, int count>
 [[gnu::always_inline]] inline auto whole_sag_at(const Surface<T>& s, const Added<T, count>& added, int i, T x, T y,
                                                 const Change<T>* change = nullptr) {

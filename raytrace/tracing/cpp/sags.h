@@ -50,7 +50,7 @@ struct Terms { T S, dS, d2S; };
 template <bool odd, bool second, typename T>
 inline Terms<T> terms_of(const T* a, int count, T u) {
   Terms<T> to{};
-  if constexpr (odd) {  // those of even j, and r q with q = a_1 + a_3 u + …
+  if constexpr (odd) {  // terms of even j, and r q with q = a_1 + a_3 u + …
     const Radius<T> at(u);
     T q = a[0], dq = 0, d2q = 0;
     series<second, 2>(a + 1, count / 2, u, to.S, to.dS, to.d2S);
