@@ -64,7 +64,7 @@ from raytrace.system.parameter_paths import (
     with_number,
 )
 from raytrace.system.surface import medium_surfaces, sag_at
-from raytrace.tracing.geometry import edge_thickness, rims
+from raytrace.tracing.geometry import edge_thickness, gaps, rims
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
@@ -105,9 +105,9 @@ def limits_of(
 def violation(lens: Lens, limits: Limits | None = None) -> Tensor:
     """Σ (thickness beyond its limits)² in mm², over all elements and air spaces; 0 can be fabricated.
 
-    limits: `limits_of(lens)` by default. An air space extends from element to element, across the stop and other
-    surfaces with air on both sides: elements touch neither on the axis nor at the rim. The stop may lie inside the
-    sagitta of an element. The space before the image has no maximum.
+    limits: `limits_of(lens)` by default. An air space extends from element to element (`gaps`), across the stop and
+    other surfaces with air on both sides: elements touch neither on the axis nor at the rim. The stop may lie inside
+    the sagitta of an element. The space before the image has no maximum; spaces about a coordinate break have no limit.
     """
     limits = limits_of(lens) if limits is None else limits
     total = torch.zeros_like(lens.surfaces[-2].thickness)
@@ -118,45 +118,23 @@ def violation(lens: Lens, limits: Limits | None = None) -> Tensor:
 
 def _shortfalls(lens: Lens, limits: Limits) -> Iterator[Tensor]:
     """Shortfall of each thickness, on the axis and at the edge; negative where its limit is met."""
-    surfaces, last, side = lens.surfaces, len(lens.surfaces) - 1, 1
+    surfaces, last = lens.surfaces, len(lens.surfaces) - 1
+    spaces, ends = gaps(lens, to_image=True), np.arange(last + 1)
     in_air = np.array([is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)])
-    elements = [k for k in range(1, last) if surfaces[k].is_mirror or not (in_air[k - 1] and in_air[k])]
+    for start, end, _ in spaces:
+        ends[start] = end
     sizes = np.array([surface.semi_diameter or math.nan for surface in surfaces])
-    start = None  # the element before the current air space
-    for k in range(1, last):
-        side = -side if surfaces[k].is_mirror else side
-        if k in elements:
-            start = k
-        if not in_air[k]:
-            yield from _outside(side * surfaces[k].thickness, *limits.glass)
-            yield from _edge(surfaces, (k, k + 1), side, sizes, in_air, limits.edge)
-            continue
-        yield from _edge(surfaces, (k, k + 1), side, sizes, in_air, 0.0)
-        if start is None or k + 1 not in (*elements, last):
-            continue
-        gap = torch.stack([surface.thickness for surface in surfaces[start : k + 1]]).sum()
-        yield from _outside(side * gap, limits.air[0], limits.air[1] if k + 1 < last else math.inf)
-        if start < k:
-            yield from _edge(surfaces, (start, k + 1), side, sizes, in_air, 0.0)
-
-
-def _outside(thickness: Tensor, least: float, most: float) -> Iterator[Tensor]:
-    yield least - thickness
-    if math.isfinite(most):
-        yield thickness - most
-
-
-def _edge(surfaces, pair: tuple[int, int], side: int, sizes, in_air, least: float) -> Iterator[Tensor]:
-    """The shortfall at the edge between two surfaces of known clear heights (S,)."""
-    k, end = pair
-    ends = np.append(np.arange(1, len(surfaces)), len(surfaces) - 1)
-    ends[k] = end
-    rim = float(rims(sizes, ends, ~in_air & (ends > np.arange(len(ends))))[k])
-    if math.isfinite(rim):
-        y = surfaces[k].thickness.new_tensor(rim)
-        front, back = (sag_at(surfaces[j], torch.zeros_like(y), y) for j in pair)
-        thickness = torch.stack([surface.thickness for surface in surfaces[k:end]]).sum()
-        yield least - side * edge_thickness(thickness, front, back)
+    edges = rims(sizes, ends, ~in_air & (ends > np.arange(last + 1)))
+    for start, end, side in spaces:
+        least, most = limits.air if in_air[start] else limits.glass
+        thickness = torch.stack([surface.thickness for surface in surfaces[start:end]]).sum()
+        yield least - side * thickness
+        if math.isfinite(most) and not (in_air[start] and end == last):
+            yield side * thickness - most
+        if math.isfinite(edges[start]):
+            y = thickness.new_tensor(edges[start])
+            front, back = (sag_at(surfaces[k], torch.zeros_like(y), y) for k in (start, end))
+            yield (0.0 if in_air[start] else limits.edge) - side * edge_thickness(thickness, front, back)
 
 
 # -- states that carry their identity ----------------------------------------------------------------------------------

@@ -183,8 +183,11 @@ def _edge_radius(surface: Surface) -> float:
     return min(float(end) if end < far else math.inf for end in ends)
 
 
-def gaps(lens: Lens) -> list[tuple[int, int, float]]:
-    """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
+def gaps(lens: Lens, *, to_image: bool = False) -> list[tuple[int, int, float]]:
+    """Powered surfaces that follow one another on one axis, and the direction of the light along z between them.
+
+    to_image: also the last of them and the image, if they are on one axis.
+    """
     indices = media(lens, lens.primary)
     pairs, before, side = [], None, 1.0
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
@@ -197,6 +200,8 @@ def gaps(lens: Lens) -> list[tuple[int, int, float]]:
         side = -side if surface.is_mirror else side
         if surface.after is not None:
             before = None
+    if to_image and before is not None:
+        pairs.append((before, len(lens.surfaces) - 1, side))
     return pairs
 
 
