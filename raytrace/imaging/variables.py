@@ -307,7 +307,6 @@ class Variables(Owned):
         ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
-        self._ends = lower, upper
         self._held_to = self._conditions()
         if "catalog" in self.conditions:
             self._glasses  # noqa: B018 - refuses lenses whose glasses do not vary
@@ -469,18 +468,19 @@ class Variables(Owned):
             if variable.name in self.bounds:
                 low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
                 self.get_parameter(variable.name).clamp_(min(low, high), max(low, high))
-        fixed = {variable.name for variable, is_frozen in zip(self.variables, frozen, strict=True) if is_frozen}
-        fixed = np.array([variable.name in fixed for variable in self._all])
         x = self._values()
         with torch.device("cpu"):  # whatever the default device
-            nearest = x if self._constraints is None else self._constraints.nearest(x, self._before, fixed=fixed)
-        for variable, before, after in zip(self._all, x, nearest, strict=True):
-            if variable in self.variables and after != before:
+            held = self._constraints
+            nearest = x if held is None else held.nearest(x, self._before, fixed=np.array(frozen))
+        for variable, before, after in zip(self.variables, x, nearest, strict=True):
+            if after != before:
                 self.get_parameter(variable.name).fill_((after - variable.start) / variable.unit)
         self._before = self._values()
 
+    @torch.no_grad()
     def _values(self) -> np.ndarray:
-        return np.array([*self.numbers().values()])
+        """The numbers (n,) of the variables that are parameters."""
+        return np.array(self._numbers().tolist())
 
     def _load_from_state_dict(self, *arguments) -> None:
         super()._load_from_state_dict(*arguments)
@@ -493,7 +493,6 @@ class Variables(Owned):
     def _conditions(self) -> tuple[Condition, ...]:
         """The conditions of `hold` on the lens. Raises BadVariables."""
         words = [word for word in self.conditions if word not in ("buildable", "catalog")]
-        words += [] if self.held is None else [f"efl={self.held.focal_length!r}"]
         try:
             return conditions_in_unit(self.design.lens, words, 1.0)
         except BadHold as error:
@@ -505,23 +504,24 @@ class Variables(Owned):
         if not self.conditions and all(name in ("sensor", "aperture") for name in self.names):
             return None
         limits = []
-        if "buildable" in self.conditions:
+        if "buildable" in self.conditions or self.held is not None:
             limits.append(self._excess)
         if "catalog" in self.conditions:
             limits.append(self._glasses)
+        lower, upper = np.array([self.bounds.get(one.name, (-math.inf, math.inf)) for one in self.variables]).T
         return Constraints(
-            self.design,
+            self._free,
             self._held_to,
-            unit=np.array([abs(variable.unit) for variable in self._all]),
-            lower=self._ends[0],
-            upper=self._ends[1],
+            unit=np.array([abs(variable.unit) for variable in self.variables]),
+            lower=lower,
+            upper=upper,
             limits=joined_limits(limits),
         )
 
     @functools.cached_property
     def _glasses(self) -> GlassLimits:
         """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
-        numbers = self.design.variables
+        numbers = self._free.variables
         columns = [(one.surface, GLASS[one.quantity]) if one.quantity in GLASS else None for one in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
@@ -540,11 +540,14 @@ class Variables(Owned):
         return with_glasses(self(), self._glasses.nearest(self._values()))
 
     def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        """By how much thicknesses are beyond their limits, mm (K,), at numbers x (n,), and the derivatives (K, n)."""
+        """By how much thicknesses, mm, and the solved number, in its unit, are beyond their limits (K,), at numbers
+        x (n,), and the derivatives (K, n)."""
         numbers = torch.tensor(x)
         with torch.set_grad_enabled(derivatives):
             numbers = with_tangents(numbers, torch.eye(len(x), dtype=numbers.dtype)) if derivatives else numbers
-            each = [*_shortfalls(self.design.lens_at(numbers), self.limits)]
+            lens = self._free.lens_at(numbers)
+            each = [*_shortfalls(lens, self.limits)] if "buildable" in self.conditions else []
+            each += self._solved_beyond(lens)
         excess = np.array([float(one.detach()) for one in each])
         if not derivatives:
             return excess, None
@@ -554,12 +557,15 @@ class Variables(Owned):
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
         lens = self()
-        total = violation(lens, self.limits)
+        return sum((one.clamp_min(0).square() for one in self._solved_beyond(lens)), violation(lens, self.limits))
+
+    def _solved_beyond(self, lens: Lens) -> list[Tensor]:
+        """By how much the solved number of a lens is beyond each of its bounds, in its unit."""
         if self.held is None:
-            return total
-        value, unit = stored_number(lens, self.held.by.address), self.held.by.unit
+            return []
+        number, unit = stored_number(lens, self.held.by.address), abs(self.held.by.unit)
         low, high = self._range()
-        return total + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
+        return [excess / unit for end, excess in ((low, low - number), (high, number - high)) if math.isfinite(end)]
 
 
 def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
