@@ -52,6 +52,7 @@ PUBLIC = {
     "internal_transmittance": "materials.glass",
     "refractive_index": "materials.glass",
     # rays
+    "RaytraceError": "words",
     "RaytraceWarning": "words",
     "BaseRay": "tracing.base_ray",
     "FirstOrder": "tracing.paraxial",

@@ -156,6 +156,7 @@ from raytrace.wave_optics.fabrication import as_rings as as_rings
 from raytrace.wave_optics.fabrication import fabricated as fabricated
 from raytrace.wave_optics.hybrid import element_lens as element_lens
 from raytrace.wave_optics.hybrid import hybrid_psf as hybrid_psf
+from raytrace.words import RaytraceError as RaytraceError
 from raytrace.words import RaytraceWarning as RaytraceWarning
 
 PUBLIC: dict[str, str]

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -27,7 +27,7 @@ RAY_BYTES = 400
 _limit: contextvars.ContextVar[float | None] = contextvars.ContextVar("limit", default=None)
 
 
-class OverBudget(ValueError):
+class OverBudget(RaytraceError, ValueError):
     """More memory is needed than available; the message has the cause and a remedy."""
 
 

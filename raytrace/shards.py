@@ -18,16 +18,18 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor, distributed
 
+from raytrace.words import RaytraceError
+
 _NUMBERS = 8  # agreed on at once, at most
 _PATIENCE = 600.0  # s that processes wait for each other to start
 _COURTESY = 10.0  # s that a process with an error waits for the first process to report it
 
 
-class ProcessLost(ConnectionError):
+class ProcessLost(RaytraceError, ConnectionError):
     """Another process of the job has ended; this one ends as well."""
 
 
-class FailedElsewhere(ValueError):
+class FailedElsewhere(RaytraceError, ValueError):
     """Another process of the job refused its share; the message is that of its error."""
 
 

@@ -26,7 +26,7 @@ from types import MappingProxyType
 
 from raytrace.files import NotWritten, append_text, read_bytes, write_json, write_text
 from raytrace.shards import share
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
 Check = Callable[[object], object]
@@ -35,7 +35,7 @@ _MOST = 1 << 30  # bytes of a file
 _REPORTED = 5  # damaged lines of a file
 
 
-class Unfit(ValueError):
+class Unfit(RaytraceError, ValueError):
     """A value that a store cannot hold: what was found and what was expected; line: of the file, 0 if unknown."""
 
     def __init__(self, message: str, line: int = 0):

@@ -13,6 +13,13 @@ from pathlib import Path
 _PACKAGE = str(Path(__file__).parent)
 
 
+class RaytraceError(Exception):
+    """An error of this package: input that it refuses, or an answer that does not exist.
+
+    Each is also an error of Python: ValueError, LookupError, OSError, ImportError or RuntimeError.
+    """
+
+
 class RaytraceWarning(UserWarning):
     """A warning of this package, given once in a process; a filter of Python's, as "always", gives it at every line."""
 

@@ -53,14 +53,14 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.tracing.ray_failures import LostRays, warn_of_failures
 from raytrace.tracing.spot import image_rays
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 _SAMPLES = 401  # of a curve through focus
 _MOST_SPOTS = 5  # columns of spots that stay legible
 _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial focus": (0, (1, 1.6))}
 
 
-class NoFocus(ValueError):
+class NoFocus(RaytraceError, ValueError):
     """The light of an object has no focus; the message says why and what helps."""
 
 

@@ -18,7 +18,7 @@ from raytrace.tracing.ray_failures import check_reach, ray_failures
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
-from raytrace.words import RaytraceWarning
+from raytrace.words import RaytraceError, RaytraceWarning
 
 #: Fields, y or pairs (x, y), and other numbers as analyses take them; None: those of the lens.
 Points = Tensor | Sequence | float | None
@@ -28,7 +28,7 @@ _DENSE = 65  # fields of a curve over the field that is drawn
 _HEADS = ("field_x", "field_y", "wavelength")
 
 
-class NothingToShow(ValueError):
+class NothingToShow(RaytraceError, ValueError):
     """An analysis of a lens, or of fields, that would show nothing."""
 
 

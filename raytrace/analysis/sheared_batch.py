@@ -19,6 +19,7 @@ from raytrace.system.lens import Lens, name_of_field
 from raytrace.tracing.scene import Scene, scene
 from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
+from raytrace.words import RaytraceError
 
 _DEGREES = (8, 10, 12, 14, 18, 22)
 _MISSED = (
@@ -28,7 +29,7 @@ _RIM = 1 - 1e-9  # rays of the rim, which rounding must not put outside
 _SPREAD = 2.0  # by which blurs may exceed that of the nominal lens
 
 
-class ClippedBeam(ValueError):
+class ClippedBeam(RaytraceError, ValueError):
     """A beam that apertures clip, or of which rays fail."""
 
 

@@ -22,7 +22,7 @@ from raytrace.maths.result import Result
 from raytrace.psf_models import Execution, model_of
 from raytrace.shards import processes, share
 from raytrace.system.lens import Lens, check_media
-from raytrace.words import did_you_mean
+from raytrace.words import RaytraceError, did_you_mean
 
 #: Options that set the lens, by the keywords of `Lens.at`.
 CONDITIONS = (
@@ -41,7 +41,7 @@ _FIGURE = "plot_"  # prefix of options of the figure: --log, dest="plot_log"
 _REPLACES = {("checkpoint", "resume")}
 
 
-class CommandError(ValueError):
+class CommandError(RaytraceError, ValueError):
     """Well-formed arguments that cannot be carried out together."""
 
 

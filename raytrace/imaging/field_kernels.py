@@ -39,7 +39,7 @@ from raytrace.wave_optics.element import Element, is_radial
 from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
 #: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
@@ -53,7 +53,7 @@ _TOGETHER = 48  # fields of a call of `psf`
 _DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
 
 
-class WindowTooLarge(ValueError):
+class WindowTooLarge(RaytraceError, ValueError):
     """A blur of more pixels than a window has."""
 
 

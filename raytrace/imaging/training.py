@@ -24,7 +24,7 @@ from raytrace.files import write_atomically
 from raytrace.shards import Share, share, total
 from raytrace.stores import DamagedLine, Folder, Kind, Table, Unfit, anything, mapped, read_document, read_file
 from raytrace.tracing.compiled import prepare
-from raytrace.words import calling_level
+from raytrace.words import RaytraceError, calling_level
 
 _MOST = 1 << 34  # bytes of a checkpoint
 _ANEW = "remove it to begin anew"
@@ -33,15 +33,15 @@ _ANEW = "remove it to begin anew"
 Record = dict[str, float]
 
 
-class NotFinite(ArithmeticError, ValueError):
+class NotFinite(RaytraceError, ArithmeticError, ValueError):
     """A loss or a gradient is not finite; the run stops, its last checkpoint remains."""
 
 
-class OtherSettings(ValueError):
+class OtherSettings(RaytraceError, ValueError):
     """A run is resumed with settings other than its own."""
 
 
-class DamagedRun(ValueError):
+class DamagedRun(RaytraceError, ValueError):
     """A file of a run cannot be read."""
 
 

@@ -68,6 +68,7 @@ from raytrace.tracing.geometry import edge_thickness, gaps, rims
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
+from raytrace.words import RaytraceError
 
 # -- thickness limits --------------------------------------------------------------------------------------------------
 
@@ -142,7 +143,7 @@ def _shortfalls(lens: Lens, limits: Limits) -> Iterator[Tensor]:
 KEY = "_extra_state"  # torch's key of module state other than parameters
 
 
-class OtherLens(ValueError):
+class OtherLens(RaytraceError, ValueError):
     """A state of another lens or element, or one without an identity; the message names both."""
 
 

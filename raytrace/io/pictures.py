@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
 from raytrace.files import read_bytes, write_atomically
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
@@ -29,7 +29,7 @@ _MOST_ARRAY = 2**30  # bytes
 _EXCHANGED = {"16B": "16L", "16L": "16B", "16N": "16B" if sys.byteorder == "little" else "16L"}
 
 
-class PictureError(ValueError):
+class PictureError(RaytraceError, ValueError):
     """A file that is not an image, damaged, or too large; one line."""
 
 

@@ -13,12 +13,13 @@ import torch
 from raytrace.files import read_bytes
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.rays import COLUMNS, TRACED, Rays, start
+from raytrace.words import RaytraceError
 
 #: Limit of bytes, some two million rays.
 LARGEST = 256 * 2**20
 
 
-class RayTableError(ValueError):
+class RayTableError(RaytraceError, ValueError):
     """A file that is not a table of rays; the message has file, line and column."""
 
 

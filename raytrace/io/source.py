@@ -32,7 +32,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Surface, is_freeform, is_posed
-from raytrace.words import RaytraceWarning, named
+from raytrace.words import RaytraceError, RaytraceWarning, named
 
 #: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
 MAX_BYTES = 16 * 2**20
@@ -66,7 +66,7 @@ class Place(NamedTuple):
         return place if self.surface is None else f"{place}, surface {self.surface}"
 
 
-class LensFileError(ValueError):
+class LensFileError(RaytraceError, ValueError):
     """A lens file that cannot be read or written. The message is one line: place, finding, expectation, remedy.
 
     file, line, surface: the position in the file; None where that does not apply.
@@ -409,7 +409,7 @@ def warn_of_repeats(blocks: list[Block], once, report) -> None:
 NEAREST, FORMULA = "nearest", "formula"
 
 
-class BadSubstitute(ValueError):
+class BadSubstitute(RaytraceError, ValueError):
     """A malformed substitute; the message has the value found and the value expected."""
 
 

@@ -12,7 +12,7 @@ import torch
 
 from raytrace.files import encoding, read_bytes, write_text
 from raytrace.materials.glass import BY_NUMBER, FORMULAS, Glass
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
@@ -31,7 +31,7 @@ _BINARY = bytes({*range(32)} - {*b"\t\n\v\f\r"})
 _NAME = re.compile(r"NM[ \t]+(\S+)")
 
 
-class CatalogError(ValueError):
+class CatalogError(RaytraceError, ValueError):
     """A malformed glass catalog; the message has file and line, the text found, the text expected and a likely fix."""
 
 

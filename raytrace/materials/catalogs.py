@@ -36,7 +36,7 @@ from raytrace.materials.agf import read_agf as read_agf
 from raytrace.materials.agf import read_text
 from raytrace.materials.agf import write_agf as write_agf
 from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, abbe_number, constant, model_glass, nd, refractive_index
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 #: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
 #: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
@@ -72,7 +72,7 @@ def _at(where: str) -> str:
     return f"{where}: " if where else ""
 
 
-class UnknownGlass(LookupError):
+class UnknownGlass(RaytraceError, LookupError):
     """No catalog has the name; `suggestions`: (glass, catalog) of similar names, `searched`: names of the catalogs."""
 
     def __init__(

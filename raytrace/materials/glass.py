@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import is_wrapped, safe_divide, safe_sqrt, value
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 # -- dispersion formulas -----------------------------------------------------------------------------------------------
 
@@ -234,11 +234,11 @@ _SHORTEST, _LONGEST = 3e-5, 100.0
 _UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and likely wavelengths
 
 
-class ImplausibleWavelength(ValueError):
+class ImplausibleWavelength(RaytraceError, ValueError):
     """A wavelength that no lens is for: most likely it is in another unit than µm."""
 
 
-class InvalidIndex(ValueError):
+class InvalidIndex(RaytraceError, ValueError):
     """A glass has no real, positive refractive index at a wavelength asked of it."""
 
 
@@ -613,7 +613,7 @@ MELT_ERROR = 1e-7
 _MARGIN = 0.1  # of the wavelengths of a lens, by which the fit of a melt reaches further
 
 
-class NoMelt(ValueError):
+class NoMelt(RaytraceError, ValueError):
     """No formula of a catalog comes near the dispersion of a glass with index errors."""
 
 

@@ -7,6 +7,8 @@ import zipfile
 
 import numpy as np
 
+from raytrace.words import RaytraceError
+
 #: Bytes of memory that the arrays of one file may take.
 LARGEST = 2**32
 
@@ -14,7 +16,7 @@ _KINDS = "biufSU"  # truth, whole and real numbers, texts
 _FORMAT = np.lib.format
 
 
-class ArrayError(ValueError):
+class ArrayError(RaytraceError, ValueError):
     """Bytes that hold no array of numbers or texts, in one line."""
 
 

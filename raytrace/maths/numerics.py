@@ -21,6 +21,8 @@ import functools
 import types
 import typing
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass as value
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -427,40 +429,42 @@ def _listed(entry: object, form: Callable[[object], str]) -> str:
     return f"[{', '.join(_listed(part, form) for part in entry)}]" if isinstance(entry, list) else form(entry)
 
 
-def value(cls: type) -> type:
-    """Make a class a frozen, slotted dataclass and register it as a pytree.
+if not TYPE_CHECKING:  # checkers of types see a dataclass, whose fields they know
 
-    Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
-    that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
-    `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would raise
-    on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
-    A class with a `__repr__` keeps it; others print large tensors by shape and range. `torch.load` accepts it:
-    restoring its fields executes nothing.
-    """
-    if cls.__repr__ is object.__repr__:
-        cls.__repr__ = summary
-    cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=False)(cls)
-    fields = dataclasses.fields(cls)
-    numeric = {field.name for field in fields if holds_numbers(field.type)}
-    mixed = [field.name for field in fields if _may_hold_tensors(field.type)]
+    def value(cls: type) -> type:
+        """Make a class a frozen, slotted dataclass and register it as a pytree.
 
-    def flatten(instance):
-        items = [(field.name, getattr(instance, field.name)) for field in fields]
-        children = {name: item for name, item in items if name in numeric and item is not None}
-        for name in mixed:
-            if any(isinstance(number, torch.Tensor) for number in getattr(instance, name)):
-                children[name] = getattr(instance, name)
-        structure = tuple((name, item) for name, item in items if name not in children)
-        return list(children.values()), (tuple(children), structure)
+        Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
+        that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
+        `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would
+        raise on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
+        A class with a `__repr__` keeps it; others print large tensors by shape and range. `torch.load` accepts it:
+        restoring its fields executes nothing.
+        """
+        if cls.__repr__ is object.__repr__:
+            cls.__repr__ = summary
+        cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=False)(cls)
+        fields = dataclasses.fields(cls)
+        numeric = {field.name for field in fields if holds_numbers(field.type)}
+        mixed = [field.name for field in fields if _may_hold_tensors(field.type)]
 
-    def unflatten(children, context):
-        child_names, structure = context
-        return cls(**dict(zip(child_names, children, strict=True)), **dict(structure))
+        def flatten(instance):
+            items = [(field.name, getattr(instance, field.name)) for field in fields]
+            children = {name: item for name, item in items if name in numeric and item is not None}
+            for name in mixed:
+                if any(isinstance(number, torch.Tensor) for number in getattr(instance, name)):
+                    children[name] = getattr(instance, name)
+            structure = tuple((name, item) for name, item in items if name not in children)
+            return list(children.values()), (tuple(children), structure)
 
-    pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
-    _VALUE_TYPES.add(cls)
-    torch.serialization.add_safe_globals([cls])
-    return cls
+        def unflatten(children, context):
+            child_names, structure = context
+            return cls(**dict(zip(child_names, children, strict=True)), **dict(structure))
+
+        pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
+        _VALUE_TYPES.add(cls)
+        torch.serialization.add_safe_globals([cls])
+        return cls
 
 
 def holds_numbers(annotation: object) -> bool:

@@ -27,6 +27,7 @@ from raytrace.stores import (
     whole,
 )
 from raytrace.system.identity import unlike
+from raytrace.words import RaytraceError
 
 EVERY = 2.0  # s between two checkpoints
 #: Why a descent ends.
@@ -41,7 +42,7 @@ STOPPED = {
 _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "seconds", "limits")
 
 
-class BadCheckpoint(ValueError):
+class BadCheckpoint(RaytraceError, ValueError):
     """Not a checkpoint, or of another optimisation; the message says what was found and what was expected."""
 
 

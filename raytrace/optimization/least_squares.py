@@ -27,14 +27,14 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from raytrace.words import RaytraceWarning
+from raytrace.words import RaytraceError, RaytraceWarning
 
 _SHARED = 1e-5  # weight of the single sides of a row relative to their sum, which alone does not distinguish them
 _ROUNDS = 12  # in which inequalities that a step violates are added
 _SLACK = 1e-11  # of the scaled step: violation of a condition that is tolerated
 
 
-class NoStep(ValueError):
+class NoStep(RaytraceError, ValueError):
     """No step meets the conditions."""
 
 

@@ -48,7 +48,7 @@ from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
-from raytrace.words import did_you_mean
+from raytrace.words import RaytraceError, did_you_mean
 
 # -- default merit functions -------------------------------------------------------------------------------------------
 
@@ -58,7 +58,7 @@ MOST_ROWS = 100_000
 REFERENCES = ("centroid", "chief")
 
 
-class BadMerit(ValueError):
+class BadMerit(RaytraceError, ValueError):
     """A merit function that cannot be made; the message names the row, the value and the values expected."""
 
 
@@ -441,7 +441,7 @@ def _moved(row: Row, by: int) -> Row:
 LOST = 10.0
 
 
-class UnknownOperand(ValueError):
+class UnknownOperand(RaytraceError, ValueError):
     """A row with weight whose operand is not known."""
 
 
@@ -472,7 +472,7 @@ class Evaluated:
         return squares / max(squares.sum(), 1e-300)
 
 
-class Circle(ValueError):
+class Circle(RaytraceError, ValueError):
     """Rows that take values of one another in a circle."""
 
 

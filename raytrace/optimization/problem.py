@@ -47,7 +47,7 @@ from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 from raytrace.tracing.paraxial import largest_field
-from raytrace.words import did_you_mean
+from raytrace.words import RaytraceError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -335,11 +335,11 @@ class ExpectationSettings(Protocol):
     def words(self) -> str: ...
 
 
-class NoLight(ValueError):
+class NoLight(RaytraceError, ValueError):
     """An expectation of lenses of which no ray of a field arrives."""
 
 
-class NoProblem(ValueError):
+class NoProblem(RaytraceError, ValueError):
     """An optimisation without variables, rows or light; the message says what is missing."""
 
 

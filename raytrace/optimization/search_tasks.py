@@ -31,7 +31,7 @@ from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, 
 from raytrace.system.identity import identity, unlike
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import sensor
-from raytrace.words import calling_level
+from raytrace.words import RaytraceError, calling_level
 
 # -- the journal -------------------------------------------------------------------------------------------------------
 
@@ -42,7 +42,7 @@ _TASK = record(
 )
 
 
-class BadSearch(ValueError):
+class BadSearch(RaytraceError, ValueError):
     """A folder of another search, or of none; the message says what was found and what was expected."""
 
 

@@ -51,7 +51,7 @@ from raytrace.system.parameter_paths import (
     sensor,
 )
 from raytrace.system.surface import medium_surfaces
-from raytrace.words import RaytraceWarning, calling_level, did_you_mean
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_you_mean
 
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
@@ -422,7 +422,7 @@ def _arguments(word: str, solve: str, quantity: str, text: str) -> tuple[float, 
 _RELATIONS = {"=": "=", "==": "=", "<=": "<=", "<": "<=", "≤": "<=", ">=": ">=", ">": ">=", "≥": ">="}
 
 
-class BadHold(ValueError):
+class BadHold(RaytraceError, ValueError):
     """Constraints that cannot be read, or of a quantity that the lens does not have."""
 
 

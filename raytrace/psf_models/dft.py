@@ -18,14 +18,14 @@ from raytrace.maths.sampling import Grid, centres, gauss_rings
 from raytrace.maths.tangents import applied
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 
-class TooManyPoints(ValueError):
+class TooManyPoints(RaytraceError, ValueError):
     """A wave whose phase varies too much over the pupil to be summed."""
 
 
-class EmptyPupil(ValueError):
+class EmptyPupil(RaytraceError, ValueError):
     """No light passes the pupil: a point spread function normalised by its light is undefined."""
 
 

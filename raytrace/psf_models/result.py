@@ -13,13 +13,14 @@ from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
 from raytrace.maths.sampling import Grid
 from raytrace.system.lens import Lens
+from raytrace.words import RaytraceError
 
 #: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
 _BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
 _BEFORE |= {"centroid": 1, "covariance": 1, "ray_centroid": 1, "ray_covariance": 1}
 
 
-class EmptyPsf(ValueError):
+class EmptyPsf(RaytraceError, ValueError):
     """No ray of a field reaches the sensor: there is no PSF to compute."""
 
 

@@ -22,6 +22,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
+from raytrace.words import RaytraceError
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -125,7 +126,7 @@ def with_number(part, place: ParameterPath, number: Tensor):
     return dataclasses.replace(part, **{name: number})
 
 
-class UnknownNumber(ValueError):
+class UnknownNumber(RaytraceError, ValueError):
     """A variable, solve or pickup of a number that the lens does not have."""
 
 
@@ -200,11 +201,11 @@ def modelled(surface: Surface, name: str) -> Surface:
 MOST = 10_000
 
 
-class BadVariables(ValueError):
+class BadVariables(RaytraceError, ValueError):
     """Malformed variables, or variables that the lens does not have."""
 
 
-class BadLimits(ValueError):
+class BadLimits(RaytraceError, ValueError):
     """Malformed or contradictory limits."""
 
 

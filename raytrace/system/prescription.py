@@ -13,10 +13,10 @@ from raytrace.materials.catalogs import ENVIRONMENT, SHIPPED, medium, missing_ca
 from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
-from raytrace.words import named_value
+from raytrace.words import RaytraceError, named_value
 
 
-class BadPrescription(ValueError):
+class BadPrescription(RaytraceError, ValueError):
     """Numbers that make no lens; the message has the surface, the value found and the value expected."""
 
 

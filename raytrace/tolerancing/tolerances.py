@@ -10,9 +10,10 @@ from torch import Tensor
 
 from raytrace.maths.result import Column, Result, Table, number
 from raytrace.system.tolerance_data import DISTRIBUTIONS, TEST_WAVELENGTH, Compensator, Tolerance
+from raytrace.words import RaytraceError
 
 
-class BadTolerance(ValueError):
+class BadTolerance(RaytraceError, ValueError):
     """A tolerance that the lens does not have, or limits that no error meets."""
 
 

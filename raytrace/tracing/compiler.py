@@ -30,12 +30,14 @@ from pathlib import Path
 
 import torch
 
+from raytrace.words import RaytraceError
+
 _MOST_LINKS = 40
 #: Passing through a folder needs no right to list it. Systems that are not POSIX lack these, and the compiled trace.
 _FOLDER = getattr(os, "O_PATH", 0) | sum(getattr(os, name, 0) for name in ("O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC"))
 
 
-class Untrusted(OSError):
+class Untrusted(RaytraceError, OSError):
     """Another user could write here; the message says where, and who."""
 
 
@@ -157,7 +159,7 @@ _DAY = 24 * 3600.0  # s
 _LONG = 90 * _DAY
 
 
-class NoCompiler(RuntimeError):
+class NoCompiler(RaytraceError, RuntimeError):
     """The compiled trace is unavailable on this machine; the message says why."""
 
 

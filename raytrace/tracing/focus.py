@@ -27,11 +27,12 @@ from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
 from raytrace.tracing.trace import is_bent, side_behind
+from raytrace.words import RaytraceError
 
 _RINGS = 12  # of the pupil, where focus on the axis is found
 
 
-class NoImage(ValueError):
+class NoImage(RaytraceError, ValueError):
     """An object without a real image."""
 
 

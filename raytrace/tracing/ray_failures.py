@@ -15,7 +15,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.trace import Crossing, lens_steps, trace_lens
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 #: Status of a ray, and its wording at a surface.
 FATES = {
@@ -36,7 +36,7 @@ class LostRays(RaytraceWarning):
     """Rays do not reach the sensor; the message says which, where they end and what helps."""
 
 
-class OutOfReach(ValueError):
+class OutOfReach(RaytraceError, ValueError):
     """No ray of a field reaches the sensor; the message says where they end and what helps."""
 
 

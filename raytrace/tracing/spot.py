@@ -18,6 +18,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
 from raytrace.tracing.trace import is_bent, trace_lens, without_apertures
+from raytrace.words import RaytraceError
 
 _PIECE = 2**16  # points whose statistics are formed at once: they stay in the cache
 
@@ -44,7 +45,7 @@ class Spot:
     rays: Tensor
 
 
-class EmptySpot(ValueError):
+class EmptySpot(RaytraceError, ValueError):
     """No ray of a spot arrives: it has no centroid and no radius."""
 
 

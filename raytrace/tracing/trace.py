@@ -39,7 +39,7 @@ from raytrace.tracing.compiled import (
 )
 from raytrace.tracing.paraxial import power, signed, ynu
 from raytrace.tracing.refraction import deflect
-from raytrace.words import named
+from raytrace.words import RaytraceError, named
 
 _STRAIGHT = 1e-9  # mm and direction cosines: smaller deviations of an axial ray are ignored
 
@@ -390,7 +390,7 @@ def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
         return bool((torch.stack(off).abs() > _STRAIGHT).any())
 
 
-class Bent(ValueError):
+class Bent(RaytraceError, ValueError):
     """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
 
 

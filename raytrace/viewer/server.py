@@ -19,13 +19,14 @@ import torch
 
 from raytrace.system.lens import Lens
 from raytrace.viewer.session import Session
+from raytrace.words import RaytraceError
 
 STATIC = Path(__file__).parent / "static"
 _TYPES = {"viewer.js": "text/javascript", "viewer.css": "text/css"}
 _MOST_SESSIONS, _MOST_BYTES, _LONGEST_NAME = 32, 1_000_000, 64
 
 
-class MissingExtra(ImportError):
+class MissingExtra(RaytraceError, ImportError):
     """The libraries of the viewer are not installed."""
 
 

@@ -29,6 +29,7 @@ from raytrace.files import read_bytes, write_atomically
 from raytrace.io.pictures import PictureError, decoded
 from raytrace.maths.arrays import LARGEST, ArrayError, read_npy
 from raytrace.wave_optics.element import Pixels, Rings
+from raytrace.words import RaytraceError
 
 Map = Pixels | Rings
 
@@ -43,7 +44,7 @@ _NO_PITCH = "has no pitch; give pitch in mm"
 _UNITS = {0: 1.0, 1: 10.0, 2: 25.4, 3: 1000.0}
 
 
-class HeightMapError(ValueError):
+class HeightMapError(RaytraceError, ValueError):
     """A height map that cannot be read or written; the message has file, line, defect and remedy."""
 
     def __init__(self, message: str, file: str, line: int | None = None):

@@ -45,6 +45,7 @@ from raytrace.wave_optics.element import (
     path,
     slopes_of,
 )
+from raytrace.words import RaytraceError
 
 _MOST_RAYS = 400_000  # of one kernel
 
@@ -54,7 +55,7 @@ _PER_ZONE = 4.0  # times the phase of a wrapped height: twelve rays across a zon
 _WIDER = 1.05  # beam over element
 
 
-class TooCoarse(ValueError):
+class TooCoarse(RaytraceError, ValueError):
     """An element needs more rays than there can be."""
 
 

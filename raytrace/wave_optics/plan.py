@@ -44,7 +44,7 @@ from raytrace.wave_optics.element import (
 from raytrace.wave_optics.mixed import deflection, extent_of, is_mixed, radii_of_band, round_part
 from raytrace.wave_optics.pupil import cells_across
 from raytrace.wave_optics.scene import WaveScene, aperture, check, is_round, millimetres, residual, spheres
-from raytrace.words import calling_level
+from raytrace.words import RaytraceError, calling_level
 
 _RAYS = 4096
 _AIRY = 2.4  # λz/D: √(1/∫I²) of a kernel in focus, behind pixels as large as its core
@@ -383,7 +383,7 @@ def only_pixels(scene: WaveScene) -> bool:
 _FINEST = 4096  # cells across the aperture
 
 
-class AliasedSampling(ValueError):
+class AliasedSampling(RaytraceError, ValueError):
     """Copies of the image lie inside the window at this sampling: the result would be wrong altogether."""
 
 

@@ -20,7 +20,7 @@ from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import joined
 from raytrace.system.surface import is_flat
 from raytrace.tracing.launch import is_at_infinity
-from raytrace.words import did_you_mean
+from raytrace.words import RaytraceError, did_you_mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Line(NamedTuple):
         return self.row.numbers[2], self.row.numbers[3]
 
 
-class BadRow(ValueError):
+class BadRow(RaytraceError, ValueError):
     """A row with an argument that the lens does not have."""
 
     def __init__(self, line: Line, words: str):
