@@ -48,8 +48,8 @@ _OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=â€¦, aperture=â€
 
 
 @functools.cache
-def public(function: Callable, name: str) -> Callable:
-    """A public function as `raytrace` exports it under a name, with the signature and the text of the function.
+def public(function: Callable, name: str, home: str = "raytrace") -> Callable:
+    """A public function as a package, `home`, exports it under a name, with the signature and the text of the function.
 
     It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
     and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for
@@ -77,7 +77,7 @@ def public(function: Callable, name: str) -> Callable:
                 raise
             raise clear from error
 
-    verb.__module__, verb.__qualname__ = "raytrace", name  # where pickle finds it
+    verb.__module__, verb.__qualname__ = home, name  # where pickle finds it
     return verb
 
 
