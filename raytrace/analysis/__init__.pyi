@@ -1,0 +1,20 @@
+# ruff: noqa: I001
+from raytrace.analysis.chief import distortion as distortion
+from raytrace.analysis.chief import field_curvature as field_curvature
+from raytrace.analysis.chief import lateral_colour as lateral_colour
+from raytrace.analysis.chromatic import chromatic_focal_shift as chromatic_focal_shift
+from raytrace.analysis.compare import compare as compare
+from raytrace.analysis.encircled import encircled_energy as encircled_energy
+from raytrace.analysis.fans import opd_fan as opd_fan
+from raytrace.analysis.fans import ray_fan as ray_fan
+from raytrace.analysis.focus_report import focus as focus
+from raytrace.analysis.grid import distortion_grid as distortion_grid
+from raytrace.analysis.illumination import relative_illumination as relative_illumination
+from raytrace.analysis.incidence import incidence as incidence
+from raytrace.analysis.layout import layout as layout
+from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
+from raytrace.analysis.mtf import mtf as mtf
+from raytrace.analysis.rms import rms_over_field as rms_over_field
+from raytrace.analysis.seidel import seidel as seidel
+from raytrace.analysis.spot_diagram import spot as spot
+from raytrace.analysis.wavefronts import wavefront as wavefront

@@ -1,0 +1,23 @@
+# ruff: noqa: I001
+from raytrace.system.apertures import Aperture as Aperture
+from raytrace.system.lens import Fields as Fields
+from raytrace.system.lens import Lens as Lens
+from raytrace.system.lens import SystemAperture as SystemAperture
+from raytrace.system.lens import batch as batch
+from raytrace.system.lens import with_object_distance as with_object_distance
+from raytrace.system.lens import with_sensor_distance as with_sensor_distance
+from raytrace.system.optimization_data import Row as Row
+from raytrace.system.optimization_data import Vary as Vary
+from raytrace.system.phases import Facets as Facets
+from raytrace.system.phases import FringePhase as FringePhase
+from raytrace.system.phases import Grating as Grating
+from raytrace.system.phases import Hologram as Hologram
+from raytrace.system.phases import IdealLens as IdealLens
+from raytrace.system.phases import PolynomialPhase as PolynomialPhase
+from raytrace.system.phases import RadialPhase as RadialPhase
+from raytrace.system.poses import Pose as Pose
+from raytrace.system.prescription import lens as lens
+from raytrace.system.rays import Rays as Rays
+from raytrace.system.surface import Surface as Surface
+from raytrace.system.tolerance_data import Compensator as Compensator
+from raytrace.system.tolerance_data import Tolerance as Tolerance
