@@ -134,9 +134,9 @@ PUBLIC = {
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
-    "phase_element": "wave_optics.element:element",
+    "phase_element": "wave_optics.element",
     "element_lens": "wave_optics.hybrid",
-    "phase_elements": "wave_optics.compute:elements",
+    "phase_elements": "wave_optics.compute",
     "fabricated": "wave_optics.fabrication",
     "hybrid_psf": "wave_optics.hybrid",
     "read_element": "wave_optics.element_files",

@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 """Signatures of the public API for editors; written by `python tests/test_stub.py`."""
 
 from collections.abc import Callable

@@ -176,7 +176,7 @@ def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
         return value
     words = {_KINDS.get(kind) or _MADE.get(kind.__name__) or with_article(kind.__name__) for kind in kinds}
     expected = " or ".join(sorted(words))
-    hint = _OF_HEIGHTS if verb in ("elements", "read_element") and hasattr(value, "__len__") else ""
+    hint = _OF_HEIGHTS if verb in ("phase_elements", "read_element") and hasattr(value, "__len__") else ""
     raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}{hint}")
 
 

@@ -14,7 +14,6 @@ STUB = PACKAGE / "__init__.pyi"
 def stub() -> str:
     """Of the package: the names that are typed, errors, and the packages whose names are typed with theirs."""
     lines = [
-        "# ruff: noqa: I001",
         '"""Signatures of the public API for editors; written by `python tests/test_stub.py`."""',
         "",
         "from collections.abc import Callable",
@@ -49,7 +48,7 @@ def stub_of(package: str) -> str:
     own = [line for line in source.splitlines() if line.startswith("from raytrace.")]
     names = {name: place for name, place in rt.PUBLIC.items() if rt.package_of(name) == package}
     lines = [line for line in imported(names) if f"from raytrace.{package} import" not in line]
-    return "\n".join(["# ruff: noqa: I001", *sorted({*own, *lines}), ""])
+    return "\n".join([*sorted({*own, *lines}), ""])
 
 
 def stubs() -> dict[Path, str]:

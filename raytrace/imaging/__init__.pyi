@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.imaging.camera import Camera as Camera
 from raytrace.imaging.image import add_noise as add_noise
 from raytrace.imaging.image import add_shot_noise as add_shot_noise

@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.materials.catalogs import find_glass as find_glass
 from raytrace.materials.catalogs import nearest_glasses as nearest_glasses
 from raytrace.materials.glass import AIR as AIR

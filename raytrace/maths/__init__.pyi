@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.maths.numerics import to as to
 from raytrace.maths.sampling import gauss_rings as gauss_rings
 from raytrace.maths.sampling import grid as grid

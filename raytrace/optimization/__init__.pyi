@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.merit import DefaultMerit as DefaultMerit

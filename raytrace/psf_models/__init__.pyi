@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.psf_models.figures import CloseUp as CloseUp
 from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import DRT as DRT

@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.system.apertures import Aperture as Aperture
 from raytrace.system.lens import Fields as Fields
 from raytrace.system.lens import Lens as Lens

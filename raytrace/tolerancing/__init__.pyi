@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements

@@ -1,4 +1,3 @@
-# ruff: noqa: I001
 from raytrace.tracing.base_ray import BaseRay as BaseRay
 from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiled import prepare as prepare
