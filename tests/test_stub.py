@@ -36,10 +36,16 @@ def stub() -> str:
 def imported(names: dict[str, str]) -> list[str]:
     """The imports of names by their places."""
     lines = []
-    for name, place in sorted(names.items(), key=lambda entry: (entry[1].partition(":")[0], entry[0])):
+    for name, place in names.items():
         module, _, defined = place.partition(":")
         lines.append(f"from raytrace.{module} import {defined or name} as {name}")
-    return lines
+    return sorted(lines, key=order)
+
+
+def order(line: str) -> tuple:
+    """As ruff sorts imports: by module, then constants, classes and functions by their names."""
+    _, module, _, name, *_ = line.split()
+    return module, 0 if name.isupper() else 1 if name[0].isupper() else 2, name
 
 
 def stub_of(package: str) -> str:
@@ -48,7 +54,7 @@ def stub_of(package: str) -> str:
     own = [line for line in source.splitlines() if line.startswith("from raytrace.")]
     names = {name: place for name, place in rt.PUBLIC.items() if rt.package_of(name) == package}
     lines = [line for line in imported(names) if f"from raytrace.{package} import" not in line]
-    return "\n".join([*sorted({*own, *lines}), ""])
+    return "\n".join([*sorted({*own, *lines}, key=order), ""])
 
 
 def stubs() -> dict[Path, str]:
