@@ -150,7 +150,7 @@ def test_page_of_errors_lists_every_class():
 
 def test_every_error_of_the_package_is_one_of_the_table_and_one_of_python():
     for module in pkgutil.walk_packages(rt.__path__, "raytrace."):
-        if not module.name.startswith("raytrace.__main__"):
+        if not module.name.startswith(("raytrace.__main__", "raytrace.bench")):
             importlib.import_module(module.name)
     kinds, left = set(), [rt.RaytraceError, rt.RaytraceWarning]
     while left:
