@@ -183,7 +183,7 @@ def write_json(path: str | os.PathLike, document: object) -> None:
     write_text(path, json.dumps(document, indent=1))
 
 
-def write_table(path: str | os.PathLike, rows: Iterable, columns: Sequence[str] = (), **spelling) -> None:
+def write_table(path: str | os.PathLike, rows: Iterable, columns: Sequence[str] = (), **spelling: Callable) -> None:
     """Write `table` of rows, as a whole or not at all."""
     write_text(path, table(rows, columns, **spelling))
 

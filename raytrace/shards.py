@@ -14,6 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 import torch
 from torch import Tensor, distributed
@@ -190,7 +191,7 @@ def _ended_by_signals() -> Iterator[None]:
         yield
         return
 
-    def end(number, frame):
+    def end(number: int, frame: object) -> NoReturn:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise ProcessLost("ended by torchrun, because another process of this job has failed")
 

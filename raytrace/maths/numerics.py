@@ -12,8 +12,8 @@ numpy's functions work on dual numbers as on arrays. Source: Clifford 1873; Grie
 
 Values: frozen dataclasses of tensors that `torch.func` and `torch.utils._pytree` can walk.
 
-What surrounds a computation: a graph, a forward derivative, a transform of torch.func. Names that are private to torch
-stand in this file alone. Nested transforms wrap a tensor once for each; the innermost one shows.
+State of torch: whether a graph, a forward derivative or a transform of torch.func is active. Names that are private to
+torch occur in this file alone. Nested transforms wrap a tensor once for each; the innermost one shows.
 """
 
 import dataclasses
@@ -77,9 +77,9 @@ def varies(number: object) -> bool:
 
 
 def differentiating() -> bool:
-    """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
+    """Whether derivatives may be requested: a graph is recorded, or a forward derivative (`jvp`) is under way.
 
-    False only under `torch.no_grad()` with no forward derivative; then what serves derivatives alone is left out.
+    False only under `torch.no_grad()` with no forward derivative; then operations for derivatives alone are left out.
     """
     return torch.is_grad_enabled() or in_forward_mode()
 
@@ -422,7 +422,7 @@ def summary(instance: Dataclass) -> str:
 
 
 def _summary(item: object) -> str:
-    """A tensor of at most nine numbers as these, a larger one as shape, type and range; other items as they are."""
+    """The numbers of a tensor of at most nine, shape, type and range of a larger one; the repr of other items."""
     if type(item) is tuple:
         return f"({', '.join(map(_summary, item))}{',' if len(item) == 1 else ''})"
     if not isinstance(item, Tensor) or item.is_meta or is_wrapped(item):

@@ -169,7 +169,7 @@ class Result:
         return text_table(self._printed(columns))
 
     def _printed(self, columns: Columns) -> dict[Column, Sequence]:
-        """Columns as they are printed: of fields with x = 0 without field_x."""
+        """Columns as they are printed, without field_x where it is 0."""
         listed: dict[Any, Any] = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}
         words, printed = self.words(), {}
         if "field_x" in listed and not np.any(listed["field_x"]):

@@ -16,7 +16,7 @@ from raytrace.budget import afford
 from raytrace.maths.numerics import value
 
 _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
-_POINT_BYTES = 64  # of a point and its weight, with what it takes to make them
+_POINT_BYTES = 64  # of a point and its weight, with the memory to compute them
 
 
 def _at_least_one(rule: str, **sizes: float) -> None:
@@ -51,10 +51,10 @@ def gauss_rings(
 
 @functools.lru_cache(maxsize=64)
 def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of the Gaussian rule of so many points on [-1, 1], those of many points too.
+    """Nodes and weights of the Gaussian rule of `count` points on [-1, 1].
 
-    Beyond a few hundred they are found by Newton's method from Tricomi's estimate, in time count² where the eigenvalues
-    of a matrix take count³: 5000 nodes in 0.1 s, not in a minute (Hale, Townsend, SIAM J. Sci. Comput. 35, 2013, §2).
+    Many points are computed by Newton's method from Tricomi's estimate, in time count² where the eigenvalues of a
+    matrix take count³: 5000 nodes in 0.1 s, not in a minute (Hale, Townsend, SIAM J. Sci. Comput. 35, 2013, §2).
     """
     if count <= _BY_EIGENVALUES:
         return np.polynomial.legendre.leggauss(count)

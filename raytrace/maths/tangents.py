@@ -35,7 +35,7 @@ class MovingTensor(Tensor):
 
     tangents: Tensor
 
-    # As of the tangents, which torch reads without asking this class.
+    # Those of the tangents; torch reads them without `__torch_function__`.
     shape = property(lambda self: self.tangents.shape[1:])
     dtype = property(lambda self: self.tangents.dtype)
     device = property(lambda self: self.tangents.device)
@@ -58,7 +58,7 @@ class MovingTensor(Tensor):
             rule = RULES.get(function)
             return _by_torch(function, arguments, options) if rule is None else rule(*arguments, **options)
 
-    def __repr__(self, *, tensor_contents: object = None) -> str:
+    def __repr__(self, *, tensor_contents: object = None) -> str:  # type: ignore[override]  # untyped in torch
         with plain_functions():
             return f"{self.as_subclass(Tensor)!r} with derivatives by {len(self.tangents)} variables"
 
@@ -88,7 +88,7 @@ def value_of(number: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def values_alone() -> Iterator[None]:
-    """Within the block, results carry no derivatives by variables: for searches whose steps nobody differentiates."""
+    """Within the block, results carry no derivatives by variables: for searches whose steps are not differentiated."""
     token = _stopped.set(True)
     try:
         yield
@@ -109,7 +109,7 @@ def _values(result: Any) -> Any:
 
 
 def _under(tangents: Tensor, dim: int) -> Tensor:
-    """Tangents (n, ...) with so many axes behind the first, for values of `dim` axes."""
+    """Tangents (n, ...) with `dim` axes behind the first, for values of `dim` axes."""
     missing = dim + 1 - tangents.dim()
     return tangents.reshape(len(tangents), *(1,) * missing, *tangents.shape[1:]) if missing > 0 else tangents
 
@@ -176,7 +176,7 @@ def _angle(y: Tensor, x: Tensor) -> MovingTensor:
 
 
 def _signed(x: Tensor, sign: Number) -> Tensor:
-    """The rule of |x| with the sign of another, of which it is no function between its jumps."""
+    """The rule of |x| with the sign of another number, which changes the result in jumps alone."""
     value = torch.copysign(x, sign)
     return _sum(value, ((x, torch.sign(x) * torch.sign(value)),)) if isinstance(x, MovingTensor) else value
 
@@ -556,9 +556,10 @@ def _forward_derivative(number: Tensor) -> Tensor:
 
 
 def applied(function: type[torch.autograd.Function], *arguments: Any, slopes: Callable | None = None) -> Any:
-    """A function with derivatives of its own, which torch's functions do not see.
+    """The result of a torch.autograd.Function, with tangents where its arguments have them.
 
-    slopes(*arguments): of one that acts entry by entry, its derivatives by the first arguments; else it has a `jvp`.
+    slopes(*arguments): the derivatives by the first arguments of a function that acts entry by entry; without them, the
+    function needs a `jvp`.
     """
     if not any(isinstance(argument, MovingTensor) for argument in arguments):
         return function.apply(*arguments)

@@ -20,18 +20,11 @@ Jacobi = dict[int, list[tuple[Tensor, ...]]]
 
 def noll(j: int) -> Order:
     """(n, m) of Noll's j = 1, 2, …: piston, tilt x, tilt y, focus, astigmatism sin, cos, coma y, x, …"""
-    _at_least(j, 1, "Noll")
+    _refuse_zero(j, "Noll")
     n = math.isqrt(8 * j - 7) - 1 >> 1
     k = j - n * (n + 1) // 2
     m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k - 1) // 2) + 1
     return n, m if j % 2 == 0 else -m
-
-
-def ansi(j: int) -> Order:
-    """(n, m) of the ANSI Z80.28 index j = (n (n + 2) + m)/2 = 0, 1, …"""
-    _at_least(j, 0, "ANSI")
-    n = (math.isqrt(8 * j + 1) - 1) // 2
-    return n, 2 * j - n * (n + 2)
 
 
 def fringe(j: int) -> Order:
@@ -40,7 +33,7 @@ def fringe(j: int) -> Order:
     But j = 37 is (12, 0), the last of the set of 37 that interferometers and lens programs use: the terms that the rule
     puts at 37 to 48 follow it, (6, 6) at 38, and from 50 on the rule holds again.
     """
-    _at_least(j, 1, "fringe")
+    _refuse_zero(j, "fringe")
     if 37 <= j <= 49:
         j = 49 if j == 37 else j - 1
     d = math.isqrt(j - 1) + 1
@@ -186,6 +179,6 @@ def jacobi(known: Jacobi, n: int, m: int, t: Tensor, highest: int = 0) -> tuple[
     return rows[k]
 
 
-def _at_least(j: int, first: int, name: str) -> None:
-    if j < first:
-        raise ValueError(f"{name} index {j}: the first is {first}")
+def _refuse_zero(j: int, name: str) -> None:
+    if j < 1:
+        raise ValueError(f"{name} index {j}: the first is 1")

@@ -163,7 +163,7 @@ def kept(lens: Whole) -> Whole:
 
 
 def freed(lens: Whole, **conditions: object) -> Whole:
-    """The lens without operands for what conditions of `Lens.at` set: a condition holds in every configuration."""
+    """The lens without operands of the numbers that conditions of `Lens.at` set, which hold in every configuration."""
     paths: dict[str, tuple[Path, ...]] = {
         "object_distance": (("surfaces", 0, "thickness"),),
         "sensor_distance": (("surfaces", len(lens.surfaces) - 2, "thickness"),),

@@ -44,7 +44,7 @@ RAY_AIMING = {
     "real": "to points of the stop, whose radius is that of the real marginal ray",
 }
 
-#: What the number of a system aperture means.
+#: The unit and meaning of the number of a system aperture.
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
     "image_f_number": "EFL / entrance pupil diameter",
@@ -122,10 +122,10 @@ def _key(argument: object) -> object:
 
 
 # -- batches of lenses -------------------------------------------------------------------------------------------------
-# Behind the axes that a number has by itself (the terms of an asphere, say) the axis of the lenses follows. `aligned`
+# The axis of the lenses follows the axes that a number has in one lens, as the terms of an asphere. `aligned`
 # puts axes of 1 behind it, against which fields, wavelengths and pupil points broadcast: rays (3, L, F, W, P).
 
-#: The values whose numbers may differ between lenses, and the axes that some of these have by themselves.
+#: The values whose numbers may differ between lenses, and the axes that some of these have in one lens.
 _OWN_AXES: dict[str, dict[str, int]] = {
     **{name: {"coefficients": 1} for name in ("Surface", "Glass", "ZernikeSag", "FringeSag", "PolynomialSag")},
     **{name: {"coefficients": 1} for name in ("PowerSag", "RadialPhase", "PolynomialPhase", "FringePhase")},
@@ -143,7 +143,7 @@ _PARTS = ("surfaces", "aperture", "environment")
 
 
 def lens_count(lens: "Lens") -> int | None:
-    """L, how many lenses the numbers of a lens describe; None for a single lens.
+    """L, the number of lenses that a batch describes; None for a single lens.
 
     Raises ValueError for numbers of different counts.
     """
@@ -234,7 +234,7 @@ def batch(lenses: Sequence["Lens"]) -> "Lens":
 
 @functools.cache
 def _fields_of(kind: type) -> tuple[tuple[str, int], ...]:
-    """The fields of a value that hold numbers of a batch, and the axes that these have by themselves."""
+    """The fields of a value that hold numbers of a batch, and the axes that these have in one lens."""
     axes = _OWN_AXES.get(kind.__name__)
     if axes is None:
         return ()
@@ -244,7 +244,7 @@ def _fields_of(kind: type) -> tuple[tuple[str, int], ...]:
 
 
 def _numbers(lens: "Lens") -> Iterator[tuple[Tensor, int, str, int | None]]:
-    """Every number that may differ between lenses: its own axes, its name and its surface, None of the whole lens."""
+    """Every number that may differ between lenses: its axes in one lens, name, and surface, None of the whole lens."""
 
     def walk(part: object, surface: int | None) -> Iterator[tuple[Tensor, int, str, int | None]]:
         kind: type = type(part)
@@ -262,7 +262,7 @@ def _numbers(lens: "Lens") -> Iterator[tuple[Tensor, int, str, int | None]]:
 
 
 def _mapped(lens: "Lens", change: Callable[[Tensor, int], Tensor]) -> "Lens":
-    """The lens with changed numbers; change: number, how many axes it has by itself -> number.
+    """The lens with changed numbers; change: number, its axes in one lens -> number.
 
     A number that occurs in several places (the coefficients of air, say) stays one.
     """
@@ -553,7 +553,7 @@ def changed(surface: Surface, numbers: Mapping[str, Any], where: str, *, like: T
 
 
 def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tensor") -> Tensor:
-    """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) as it is; None: the lens's own.
+    """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) itself; None: the lens's.
 
     like: the lens whose kind of field it is, or a tensor of their dtype and device. Raises ValueError, also where the
     lens is in float16.
@@ -791,7 +791,7 @@ def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:
 
 
 def check(lens: Lens) -> None:
-    """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
+    """Raise ValueError for a lens that cannot be traced as a whole."""
     check_precision(lens.wavelengths.dtype)
     last = len(lens.surfaces) - 1
     if lens.ray_aiming not in RAY_AIMING:

@@ -153,6 +153,11 @@ class OptimizationData:
     kept: tuple[Solve, ...] = ()
     distributions: tuple[tuple[str, tuple[tuple[float, float], ...]], ...] = ()
 
+    @property
+    def rules(self) -> tuple[Vary | Solve, ...]:
+        """Variables, solves and kept rules."""
+        return (*self.variables, *self.solves, *self.kept)
+
     def __str__(self) -> str:
         counts = Counter(row.name for row in self.merit)
         operands = ", ".join(f"{name} x{count}" for name, count in counts.items())

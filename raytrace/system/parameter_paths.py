@@ -202,7 +202,7 @@ def modelled(surface: Surface, name: str) -> Surface:
     return surface
 
 
-#: Surfaces and configurations are counted up to this number, and so many are named at a time.
+#: Largest number of a surface or configuration, and of their count in a list.
 MOST = 10_000
 
 

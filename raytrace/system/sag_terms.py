@@ -79,7 +79,7 @@ class FringeSag:
 
 
 def spline(grid: GridSag) -> SplineSag:
-    """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
+    """The spline of a grid, in float64, differentiable in the heights: a lens traced many times computes it once.
 
     Raises ValueError for a grid of fewer than 4 × 4 heights.
     """

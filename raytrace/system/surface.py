@@ -69,6 +69,11 @@ class Surface:
         return torch.full_like(self.thickness, torch.inf) if self.curvature is None else 1 / self.curvature
 
     @property
+    def pose(self) -> Pose | None:
+        """The pose before the surface, None without one; in the compiled trace a passage is in its place."""
+        return self.before if isinstance(self.before, Pose) else None
+
+    @property
     def is_mirror(self) -> bool:
         return self.glass.formula == "mirror"
 
@@ -163,29 +168,16 @@ def vertex_curvature(surface: Surface) -> Tensor:
     Of a toroid or a biconic it is that of the section along y, as in other programs. The curvatures of sag terms along
     x and y are averaged. Slopes at the vertex, of sag terms or of an odd asphere, are ignored.
     """
-    along_y, added = _vertex(surface)[1:]
-    return along_y if added is None else along_y + 0.5 * (added.xx + added.yy)
-
-
-def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The curvatures in 1/mm of the sections along x and along y at the vertex, sag terms included."""
-    along_x, along_y, added = _vertex(surface)
-    return (along_x, along_y) if added is None else (along_x + added.xx, along_y + added.yy)
-
-
-def _vertex(surface: Surface) -> tuple[Tensor, Tensor, Sag | None]:
-    """The curvatures at the vertex along x and y without sag terms, and the sag terms there."""
-    if surface.curvature is not None and surface.coefficients is None and surface.sag_terms is None:
-        return surface.curvature, surface.curvature, None
     centre = torch.zeros_like(surface.thickness)
-    added = None if surface.sag_terms is None else relief(surface.sag_terms).sag(centre, centre)
-    if is_freeform(surface):
-        base = freeform_sag(surface, centre, centre, 2)
-        return base.xx, base.yy, added
     total = centre if surface.curvature is None else surface.curvature
-    if surface.coefficients is not None:
+    if is_freeform(surface):
+        total = freeform_sag(surface, centre, centre, 2).yy
+    elif surface.coefficients is not None:
         total = total + 2 * sag_and_derivatives(centre, None, None, surface.coefficients, 1, kind=surface.kind)[1]
-    return total, total, added
+    if surface.sag_terms is None:
+        return total
+    added = relief(surface.sag_terms).sag(centre, centre)
+    return total + 0.5 * (added.xx + added.yy)
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:

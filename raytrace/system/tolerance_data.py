@@ -1,4 +1,4 @@
-"""Tolerances: errors of manufacture as rows, each a kind of KINDS, and what an error of each kind changes.
+"""Tolerances: errors of manufacture as rows, each of a kind of KINDS, and their effect on a lens.
 
 A row is a number that differs from its nominal value within limits: a radius, a thickness, the tilt of an element. Its
 value, the error, is in the row's own unit. Rows hold plain numbers, so that two sets compare by their parts.

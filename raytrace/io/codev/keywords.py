@@ -212,7 +212,8 @@ class Stream:
             self.report.met(f"{COMMENT.lower()} {word.lower()[:40]}", status, record.place)
             self.comments.append(record._replace(keyword=word, place=self._place(record)))
         elif self.in_catalog and record.keyword not in ("PWL", "END"):
-            name, waves = unquoted(_WORD.match(record.text.strip())[0]), self.system.last("PWL")
+            first, waves = _WORD.match(record.text.strip()), self.system.last("PWL")
+            name = unquoted(first[0]) if first else ""
             self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves.words if waves else ()))
             self.report.met("PRV", READ, record.place)
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
@@ -325,12 +326,12 @@ class Stream:
             self.system.records.setdefault("ZOO", []).append(record)
             return
         keyword = _keyword(record.words[0])
-        of = [word for word in record.words[1:] if _OF.fullmatch(word)]
+        places = [word for word in record.words[1:] if _OF.fullmatch(word)]
         values = [word for word in record.words[1:] if not _OF.fullmatch(word)]
         if keyword in (SYSTEM_READ | SURFACE_READ) - _HANDLED.keys() and values:
-            self._take_command(record._replace(keyword=keyword, words=(*of, values[0])))
+            self._take_command(record._replace(keyword=keyword, words=(*places, values[0])))
         elif keyword in REFUSED:
-            self._take_command(record._replace(keyword=keyword, words=(*of, *values[:1])))
+            self._take_command(record._replace(keyword=keyword, words=(*places, *values[:1])))
 
 
 _HANDLED = {
