@@ -657,10 +657,11 @@ class ImportReport(Result):
         return lines + [f"    not read: {line}" for line in self.unread_tolerances]
 
 
-def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:
+def _wrapped(words: Iterable[str]) -> list[str]:
+    """Lines of at most 100 characters with words between commas."""
     lines, line = [], "   "
     for word in words:
-        if len(line) + len(word) + 2 > width:
+        if len(line) + len(word) + 2 > 100:
             lines.append(line)
             line = "   "
         line += f" {word},"

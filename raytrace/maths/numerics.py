@@ -22,7 +22,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass as value
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, overload
 
 import numpy as np
 import torch
@@ -58,11 +58,6 @@ def in_forward_mode() -> bool:
     return getattr(forward_ad, "_current_level", -1) >= 0
 
 
-def has_forward_derivative(number: Tensor) -> bool:
-    """Whether a tensor carries a forward derivative of torch."""
-    return in_forward_mode() and forward_ad.unpack_dual(number).tangent is not None
-
-
 def varies(number: object) -> bool:
     """Whether a derivative by this number may be requested: backward, forward, by tangents
     (`maths.tangents`), or by a transform of torch.func.
@@ -73,7 +68,7 @@ def varies(number: object) -> bool:
         return False
     if number.requires_grad or hasattr(number, "tangents") or is_wrapped(number):
         return True
-    return has_forward_derivative(number)
+    return in_forward_mode() and forward_ad.unpack_dual(number).tangent is not None
 
 
 def differentiating() -> bool:
@@ -106,6 +101,10 @@ def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(nonzero, numerator / torch.where(nonzero, denominator, 1.0), 0.0)
 
 
+@overload
+def dot(a: Tensor | Sequence[Tensor], b: Tensor | Sequence[Tensor]) -> Tensor: ...
+@overload
+def dot(a: Iterable[Number], b: Iterable[Number]) -> Number: ...
 def dot(a: Iterable[Number], b: Iterable[Number]) -> Number:
     """Scalar product over the leading axis of length 3, of tensors or of three dual numbers each.
 
@@ -165,6 +164,10 @@ def unit(vector: Tensor) -> Tensor:
     return scaled / norm
 
 
+@overload
+def polynomial(coefficients: Tensor, x: Tensor) -> Tensor: ...
+@overload
+def polynomial(coefficients: Sequence[Number], x: Number) -> Number: ...
 def polynomial(coefficients: Sequence[Number] | Tensor, x: Number) -> Number:
     """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`, or m dual numbers."""
     if not isinstance(coefficients, Tensor):

@@ -347,23 +347,17 @@ def _unbind(x: MovingTensor, dim: int = 0) -> Several:
     return tuple(map(with_tangents, values, tangents))
 
 
-def _sum_over(
-    x: MovingTensor, dim: Axes | None = None, keepdim: bool = False, *, dtype: torch.dtype | None = None
-) -> MovingTensor:
-    value = x.sum(dtype=dtype) if dim is None else x.sum(dim, keepdim, dtype=dtype)
-    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
-    dim = tuple(range(x.dim())) if len(dim) == 0 else dim
-    moved = x.tangents if x.dim() == 0 else x.tangents.sum(_shifted(dim), keepdim, dtype=dtype)
-    return with_tangents(value, moved)
+def _reduced(function: Callable) -> Callable:
+    """The rule of sum and mean, over all axes without `dim`."""
 
+    def rule(
+        x: MovingTensor, dim: Axes | None = None, keepdim: bool = False, *, dtype: torch.dtype | None = None
+    ) -> MovingTensor:
+        value = function(x, dtype=dtype) if dim is None else function(x, dim, keepdim, dtype=dtype)
+        axes = (dim,) if isinstance(dim, int) else tuple(dim or range(x.dim()))
+        return with_tangents(value, function(x.tangents, _shifted(axes), keepdim, dtype=dtype) if axes else x.tangents)
 
-def _mean_over(
-    x: MovingTensor, dim: Axes | None = None, keepdim: bool = False, *, dtype: torch.dtype | None = None
-) -> MovingTensor:
-    value = x.mean(dtype=dtype) if dim is None else x.mean(dim, keepdim, dtype=dtype)
-    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
-    moved = x.tangents if x.dim() == 0 else x.tangents.mean(_shifted(dim), keepdim, dtype=dtype)
-    return with_tangents(value, moved)
+    return rule
 
 
 def _cumulated(x: MovingTensor, dim: int, *, dtype: torch.dtype | None = None) -> MovingTensor:
@@ -699,8 +693,8 @@ _row(["unbind"], _unbind, of_first=True)
 _row(["stack"], _joined(torch.stack))
 _row(["cat", "concatenate", "concat"], _joined(torch.cat))
 _row(["broadcast_tensors"], _broadcast)
-_row(["sum"], _sum_over, of_first=True)
-_row(["mean"], _mean_over, of_first=True)
+_row(["sum"], _reduced(torch.sum), of_first=True)
+_row(["mean"], _reduced(torch.mean), of_first=True)
 _row(["cumsum"], _cumulated, of_first=True)
 _row(["gather"], _gathered)
 _row(["index_copy"], _copied)
