@@ -3,7 +3,7 @@
     torchrun --nproc-per-node 2 -m raytrace psf LENS …
 
 Every process takes its `Share`; `total` sums the parts, in all of them; within `agreeing` they also take the same
-decisions and fail together. A single process needs none of this, at no cost.
+decisions and fail together. In a single process they do nothing.
 """
 
 import contextlib
@@ -186,7 +186,7 @@ def _begin() -> "distributed.Store":
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """torchrun ends the other processes by SIGTERM if one fails: make that an error, so that files are cleaned up."""
+    """Within the block, SIGTERM, by which torchrun ends the others if a process fails, raises: files are cleaned up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -406,7 +406,7 @@ def _refuse_overflow(lens: Lens, file: str) -> None:
 
 
 def _in_order(data: OptimizationData | None) -> OptimizationData | None:
-    """Optimisation data with variables and solves by their places; a file does not keep another order."""
+    """Optimisation data with variables and solves in the order of surfaces, the only order that a file keeps."""
     if data is None:
         return None
 

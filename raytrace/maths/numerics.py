@@ -155,7 +155,7 @@ def placed(entries: Tensor, mask: Tensor) -> Tensor:
 def unit(vector: Tensor) -> Tensor:
     """vector/|vector| over the leading axis of length 3; scaled first, so that 1e-200 and 1e200 keep their direction.
 
-    A zero or non-finite vector comes back as NaN-free zeros, which callers flag by `norm == 0`.
+    A zero or non-finite vector gives zeros, without nan.
     """
     largest = vector.detach().abs().amax(0)
     usable = (largest > 0) & (largest < torch.inf)
@@ -273,12 +273,12 @@ class Dual:
 
 
 def value_of(number: Number) -> Number:
-    """The value of a number that may be a dual one."""
+    """The value of a number, dual or not."""
     return number.value if isinstance(number, Dual) else number
 
 
 def slope_of(number: Number, variables: int) -> np.ndarray:
-    """The derivatives (n, ...) of a number by n variables; 0 where it is no dual one."""
+    """The derivatives (n, ...) of a number by n variables; 0 of a number that is not dual."""
     return number.full() if isinstance(number, Dual) else np.zeros((variables, *np.shape(number)))
 
 

@@ -48,11 +48,11 @@ class Edge(NamedTuple):
     size: Number | None = None
 
     def within(self) -> Tensor:
-        """Which points (...) lie within, the edge itself included."""
+        """Whether points (...) lie within, the edge itself included."""
         return self.measure >= self.limit if self.is_inner else self.measure <= self.limit
 
     def strictly(self) -> Tensor:
-        """Which points (...) lie within, without the edge."""
+        """Whether points (...) lie within, without the edge."""
         return self.measure > self.limit if self.is_inner else self.measure < self.limit
 
     def distance(self) -> Tensor:
@@ -144,13 +144,13 @@ SHAPES = {
 
 
 def edges(aperture: Aperture, hit: Tensor | Sequence[Tensor]) -> list[Edge]:
-    """The edges of an aperture as seen from points (2 or 3, ...) mm."""
+    """The edges of an aperture, measured at points (2 or 3, ...) mm."""
     x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
     return SHAPES[aperture.shape].edges(x, y, aperture.extent)
 
 
 def inside(apertures: Sequence[Aperture], hit: Tensor | Sequence[Tensor]) -> Tensor | None:
-    """Which points (...) pass all the apertures; None if there are none. An edge belongs to the clear side."""
+    """Whether points (...) pass all the apertures; None without apertures. An edge belongs to the clear side."""
     passed: Tensor | None = None
     for aperture in apertures:
         sides = [edge.strictly() if aperture.obscures else edge.within() for edge in edges(aperture, hit)]

@@ -19,7 +19,7 @@ Path = tuple[str | int | tuple[int, ...], ...]
 
 
 class ScaledPath(NamedTuple):
-    """Where a lens holds the number of an operand: factor · number + offset, as a pickup has it."""
+    """The path of the number of an operand in a lens, which holds factor · number + offset, as for a pickup."""
 
     path: Path
     factor: float = 1.0
@@ -32,7 +32,7 @@ class Operand:
 
     name, number, parameter: of OpticStudio, "THIC" of surface `number`, "PRAM" of a surface and a parameter, "YFIE" of
         a field point; 0 where the operand has none.
-    paths: where the lens holds it; empty if it does not affect rays, as the weight of a configuration.
+    paths: of it in the lens; empty if it does not affect rays, as the weight of a configuration.
     numbers: (C,) as the lens holds them, mm or degrees, one per configuration; or media: a glass each; or words: for
         each configuration the contents of every path.
     refusal: why the operand is not supported; configurations in which it differs are refused.

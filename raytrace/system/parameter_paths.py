@@ -2,7 +2,7 @@
 
 thickness:5,6 curvature:1-4 a4:3 sensor     numbers of surfaces, which are counted as in the file
 sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
-2:15                                        least and greatest
+2:15                                        smallest and largest
 
 `parameter_paths` lists the numbers of a surface of any kind: of its shape, its phase and its poses.
 `with_numbers_of` is the lens with other numbers, by surface and name.
@@ -26,7 +26,7 @@ from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
 from raytrace.words import RaytraceError
 
-#: A number of a lens: of which surface, and which.
+#: A number of a lens: its surface and its name.
 Address = tuple[int, str]
 
 #: Numbers of the lens that no surface has: of the system aperture, and of the air (°C, atm).
@@ -50,7 +50,7 @@ _OF_SEVERAL = [field.name for field in _NUMERIC if field.name not in (*_SINGLE, 
 
 
 class ParameterPath(NamedTuple):
-    """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
+    """The path of a number in a surface: the fields down to it, and the entry of a tensor of several."""
 
     path: tuple[str, ...]
     entry: int | None = None
@@ -61,7 +61,7 @@ class ParameterPath(NamedTuple):
         return self.path if self.entry is None else (*self.path, (self.entry,))
 
 
-#: Where a lens holds the numbers that no surface has.
+#: The paths of the numbers of a lens that no surface has.
 OF_LENS = {
     APERTURE: ParameterPath(("aperture", "value")),
     TEMPERATURE: ParameterPath(("environment", "temperature")),
@@ -133,7 +133,7 @@ class UnknownNumber(RaytraceError, ValueError):
 
 
 def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
-    """Where a surface holds a number. Raises UnknownNumber."""
+    """The path of a number in a surface, by its name. Raises UnknownNumber."""
     if quantity.startswith(GLASS_NUMBER):
         return ParameterPath(("glass", "coefficients"), int(quantity.removeprefix(GLASS_NUMBER)) - 1)
     known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}

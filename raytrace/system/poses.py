@@ -94,7 +94,7 @@ def direction_out(pose: Pose, direction: Vector) -> Vector:
 
 
 def undone(pose: Pose) -> Pose:
-    """The pose that leads back."""
+    """The inverse pose."""
     numbers = {name: number for name in ("x", "y", "z", *_TURNS) if (number := getattr(pose, name)) is not None}
     negated: dict[str, Any] = {name: -number for name, number in numbers.items()}
     return dataclasses.replace(pose, tilts_first=not pose.tilts_first, **negated)
@@ -143,13 +143,13 @@ def rows_along(steps: Sequence[Pose | Tensor | None]) -> Rows:
 
 
 def rows_back(rows: Rows) -> Rows:
-    """The rows that lead back: new = rotationᵀ · (old - shift)."""
+    """The inverse rows: new = rotationᵀ · (old - shift)."""
     turned = [[rows[j][i] for j in range(3)] for i in range(3)]
     return [[*row, _negative(_dot(row, [entry[3] for entry in rows]))] for row in turned]
 
 
 def rows_of_both(first: Rows, second: Rows) -> Rows:
-    """The rows of one passage and then another."""
+    """The rows of two passages in sequence."""
     columns = list(zip(*first, strict=True))
     return [
         [_sum(_dot(row[:3], column), row[3] if j == 3 else 0.0) for j, column in enumerate(columns)] for row in second

@@ -1,9 +1,9 @@
 """Sag terms: D(x, y), added to the conic and even terms of a surface, z = S(r²) + D(x, y).
 
     GridSag         D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
-    SplineSag       the same by its coefficients c, computed once
+    SplineSag       that spline by its coefficients c, computed once
     ZernikeSag      D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
-    FringeSag       the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
+    FringeSag       D = Σ_j c_j F_j((x - x_0)/R, (y - y_0)/R), the fringe polynomials, which are 1 at the rim
     PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
     IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
     TiltSag         D = x tan_x + y tan_y
@@ -31,7 +31,7 @@ from raytrace.system.poses import cos_sin
 
 _LEAST = 4  # points along a side of a grid: a cubic
 _FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
-_BLOCK = 128  # coefficients that are found together
+_BLOCK = 128  # coefficients that are computed together
 _FRINGE_DEGREE = 5  # of powers that fringe terms hold
 
 
@@ -42,7 +42,7 @@ class GridSag:
     Row 0 lies at the smallest y, column 0 at the smallest x. The spline is cubic with continuous second derivatives;
     at the ends the third derivative is continuous at the last point but one ("not a knot"), so that the error falls as
     pitch⁴ up to the rim. The surface ends half a pitch beyond the outermost points: a ray that crosses farther out
-    misses it. Every meeting of rays and surface finds the coefficients of the spline anew: see `spline`.
+    misses it. The coefficients of the spline are computed anew for every batch of rays: see `spline`.
     """
 
     heights: Tensor
@@ -194,7 +194,7 @@ def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -
 
 
 def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
-    """The same of the fringe terms, which are 1 at the rim."""
+    """Σ_j c_j F_j of the fringe terms at points (...) mm."""
     c, radius, centre_x, centre_y = (number.to(x.dtype) for number in numbers)
     terms = [(fringe(j), a) for j, a in enumerate(c.unbind(0), 1)]
     return _summed(terms, radius, x - centre_x, y - centre_y, highest)
@@ -271,7 +271,7 @@ class PowerSag:
 
 
 def as_polynomial(sag_terms: IrregularSag | TiltSag) -> PolynomialSag:
-    """The same as a sum of powers."""
+    """An irregular sag or a tilted plane as a sum of powers."""
     if isinstance(sag_terms, TiltSag):
         return PolynomialSag(torch.stack([sag_terms.tan_x, sag_terms.tan_y]), torch.ones_like(sag_terms.tan_x))
     cosine, sine = cos_sin(sag_terms.angle)
@@ -301,21 +301,21 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 
 
 def powers_of_polynomial(sag_terms: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
-    """The same as powers about the vertex."""
-    given = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
-    zero = torch.zeros_like(given.radius)
-    return PowerSag(zero, zero, given.radius, zero, given.coefficients)
+    """A sum of powers about the vertex as powers about a centre."""
+    polynomial = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
+    zero = torch.zeros_like(polynomial.radius)
+    return PowerSag(zero, zero, polynomial.radius, zero, polynomial.coefficients)
 
 
 def powers_of_fringe(sag_terms: FringeSag) -> PowerSag:
-    """The same as powers about its centre."""
+    """Fringe terms as powers about their centre."""
     orders = [fringe(j) for j in range(1, len(sag_terms.coefficients) + 1)]
     height, powers_ = _powers_of(orders, sag_terms.coefficients)
     return PowerSag(sag_terms.centre_x, sag_terms.centre_y, sag_terms.radius, height, powers_)
 
 
 def powers_of_zernike(sag_terms: ZernikeSag) -> PowerSag:
-    """The same as powers about the vertex."""
+    """Noll's terms as powers about the vertex."""
     orders = [noll(j) for j in range(1, len(sag_terms.coefficients) + 1)]
     norms = sag_terms.coefficients.new_tensor([norm(*order) for order in orders])
     height, powers_ = _powers_of(orders, norms * sag_terms.coefficients)
@@ -344,13 +344,13 @@ def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class SagTermKind:
-    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
+    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, computed once for a batch of rays.
 
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
     prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
-    axes: of each of its numbers itself; further ones vary from lens to lens, and from ray to ray.
-    powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
+    axes: of each of its numbers in one lens; further axes vary from lens to lens, and from ray to ray.
+    powers: to powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
     traced by torch alone.
     """
 
@@ -403,7 +403,7 @@ class Relief:
         return broadcast_shape(*(number.shape[axes:] for number, axes in self._with_axes()))
 
     def flat(self, batch: Sequence[int]) -> "Relief":
-        """The same with the numbers that vary for the rays of a batch in one axis."""
+        """The sag terms for the rays of a batch in one axis, along which their numbers vary."""
         numbers = []
         for number, axes in self._with_axes():
             if number.dim() > axes:
@@ -414,7 +414,7 @@ class Relief:
         return Relief(self.kind, numbers)
 
     def of(self, few: Tensor) -> "Relief":
-        """The same for few of the rays of one axis."""
+        """The sag terms for some of the rays of one axis."""
         numbers = [number[..., few] if number.dim() > axes else number for number, axes in self._with_axes()]
         return Relief(self.kind, numbers)
 
@@ -452,7 +452,7 @@ def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor
 
 
 def _powers(sag_terms: SagTerms) -> PowerSag:
-    """The same as powers about a centre. Raises ValueError for a grid of heights, which is no such sum."""
+    """Sag terms as powers about a centre. Raises ValueError for a grid of heights, which is no such sum."""
     convert = SAG_TERMS[type(sag_terms).__name__].powers
     if convert is None:
         raise ValueError("a grid of heights is no sum of powers")
@@ -460,7 +460,7 @@ def _powers(sag_terms: SagTerms) -> PowerSag:
 
 
 def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
-    """The same as a sum of powers about the vertex, and the height () mm to be added to it.
+    """Sag terms as a sum of powers about the vertex, and the height () mm to be added to it.
 
     Raises ValueError for a grid of heights, which is no such sum.
     """
@@ -473,7 +473,7 @@ def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
 
 
 def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
-    """The same as a sum of fringe terms over a disc of twice the radius; None for powers of a degree above 5.
+    """A sum of powers as fringe terms over a disc of twice the radius; None for powers of a degree above 5.
 
     The 36 terms with n + |m| ≤ 10 hold every power to x⁵ … y⁵. Piston makes the sag at the vertex 0.
     """

@@ -1,6 +1,6 @@
 """Glasses of a CODE V sequence: of a catalog, by index and Abbe number, and private ones; read and written.
 
-NBK7_SCHOTT is the glass of that catalog whose name is the same but for hyphens and the like, which CODE V leaves out.
+NBK7_SCHOTT is the glass of the catalog SCHOTT whose name is NBK7 without its hyphens, blanks and points.
 517642 and 517.642, with any number of digits on either side of the point, give n_d - 1 and V_d; so does 1.517:64.2.
 PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
 """
@@ -255,7 +255,7 @@ def _table(
 def _table_error(glass: Glass, nodes: list[float], indices: list[float], waves: list[float]) -> float:
     """The error of a formula through indices at other wavelengths, estimated by the difference from another formula.
 
-    That has a term less; for three indices or fewer it is A + B/λ + C/λ^3.5, which is as good as Schott's.
+    The other formula has one term less; for three indices or fewer it is A + B/λ + C/λ^3.5, as accurate as Schott's.
     """
     if len(nodes) > 3:
         other = refractive_index(from_table(nodes, indices, terms=min(len(nodes), _TERMS) - 1), double(waves))
@@ -296,7 +296,7 @@ def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: P
 
 
 def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
-    """The name of a private glass; one without a name gets one that is free."""
+    """The name of a private glass; a glass without a name gets a free name."""
     if not glass.name:
         same = (key for key, other in private.items() if not other.name and same_figures(other, glass))
         name = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)

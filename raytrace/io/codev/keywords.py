@@ -59,7 +59,7 @@ RING = "RING"
 COMMENT = "!RAYTRACE"
 _COMMENT_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 
-#: Decentres and tilts by the numbers of a pose; those about x and y are left-handed, their sign turns.
+#: Decentres and tilts by the numbers of a pose; tilts about x and y are left-handed: their sign changes.
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
 LEFT_HANDED = ("ADE", "BDE")
 
@@ -190,7 +190,7 @@ def unquoted(word: str) -> str:
 
 
 class Stream:
-    """A file sorted, its commands read in their order as CODE V does: the system and the surfaces.
+    """The commands of a file in the order in which CODE V executes them, sorted: the system and the surfaces.
 
     private: private glasses by name; comments: those of this package.
     """
@@ -321,7 +321,7 @@ class Stream:
         self.in_catalog = record.keyword == "PRV"
 
     def _zoom(self, record: Record) -> None:
-        """The first of the zoom positions: the first of the values of a command that is zoomed."""
+        """Take the first zoom position: the first value of a zoomed command."""
         if not record.words or is_number(record.words[0]):
             self.system.records.setdefault("ZOO", []).append(record)
             return

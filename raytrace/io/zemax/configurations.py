@@ -10,8 +10,8 @@ reported.
 
 Temperature and pressure: ENVD gives those of the lens (°C, atm, and whether indices follow them; 0: those of the
 catalogs). TEMP and PRES of the multi-configuration table hold for the surfaces that the operands after them name (CRVT,
-THIC, GLSS), up to the next one of the same name; the last is the lens's own, which ENVD repeats. With this rule the
-stored image distance of OpticStudio's sample of an evacuated cell is reproduced to 4e-12 mm.
+THIC, GLSS), up to the next operand of the same name; the last sets the environment of the lens, as ENVD. With this rule
+the stored image distance of OpticStudio's sample of an evacuated cell is reproduced to 4e-12 mm.
 """
 
 import dataclasses
@@ -218,10 +218,7 @@ class PlacedOperand(NamedTuple):
 
 
 def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens, list[Vary | Solve]]:
-    """The lens, as its surfaces are stored, with its operands, and in the requested configuration.
-
-    And the variables and pickups of the numbers that its operands set.
-    """
+    """The lens with its operands, in the stored or the requested configuration; variables and pickups of operands."""
     sections, lens = file.sections, file.lens
     head = sections.system.last("MNUM")
     if head is None:
@@ -328,7 +325,7 @@ def _with_quantity(air: Environment, cell: Cell, value: float) -> Environment:
 def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | None:
     """Whether the lens as stored holds the operand of a configuration; None where that cannot be decided.
 
-    Operands are saved with 13 digits. A semi-diameter of 0 is left to be computed.
+    Operands are saved with 13 digits. A semi-diameter of 0 is automatic.
     """
     operand, k = placed.operand, configuration - 1
     if not operand.paths:
@@ -396,7 +393,7 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
 
 
 def _paths(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
-    """The path of a row and those that follow it, none of a value that the lens lacks; and a lens that models them."""
+    """The paths of a row's value and of those that follow it, none where the lens lacks it; a lens that models them."""
     lens, k, path = file.lens, cell.number, row.path_in_lens(cell.number)
     paths, like = [path], lens
     if row.path.startswith("environment"):
@@ -487,7 +484,7 @@ def _solves(file: LensFile) -> list[Solve]:
 def _picked_up(paths: Sequence[ScaledPath], file: LensFile) -> tuple[list[ScaledPath], dict[int, Surface]]:
     """The paths of pickups of a value, from the object on, as a pickup looks back; and surfaces that model them.
 
-    A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
+    A pickup whose stored value differs from its rule is left out: its meaning is not known.
     """
     followed, likes = {scaled.path: scaled for scaled in paths}, {}
     for solve in (rule for rule in _solves(file) if rule.kind == "pickup"):
@@ -521,7 +518,7 @@ def _numbered(block: Block, keyword: str, number: str) -> Record | None:
 
 
 def power_of(row: ValueRow, lens: Lens) -> int | None:
-    """The power of length in the value of a row, which of fields and of the aperture depends on their kind."""
+    """The power of length in the value of a row; that of fields and of the aperture depends on their kind."""
     is_length = lens.aperture.kind in ("entrance_pupil_diameter", "float_by_stop")
     has_none = (row.argument == "field" and lens.fields.kind == "angle") or (
         row.path == "aperture.value" and not is_length
@@ -729,7 +726,7 @@ def is_of_surfaces(operand: Operand) -> bool:
 def with_environments(lens: Lens, place: Place) -> Lens:
     """The lens with operands that give the environments of its surfaces.
 
-    Raises LensFileError where the lens has none itself, for indices then follow none in such a file.
+    Raises LensFileError for a lens without an environment: the indices of its file follow none.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if s.environment is not None and not _is_set(lens, k)]
     if lens.environment is None and missing:
@@ -753,7 +750,7 @@ def with_environments(lens: Lens, place: Place) -> Lens:
 
 
 def _is_set(lens: Lens, k: int) -> bool:
-    """Whether operands of the lens set the environment of a surface; the quantities they do not set are the lens's."""
+    """Whether operands of the lens set the environment of a surface, and all other quantities are those of the lens."""
     if lens.environment is None:
         return False
     held = {path for operand in lens.operands for path, *_ in operand.paths}

@@ -1,10 +1,9 @@
 """Write a lens as a .zmx file of Zemax OpticStudio: system, surfaces, merit function, configurations.
 
-Every number has the digits that bring it back exactly; numbers of other terms than those of a file are converted first
-(`written_form`). Lines are made in mm. A merit function of lengths and pure
-numbers depends on the unit, so a lens with one is written in the unit of its file: a number read from such a file is
-written such that reading it again gives the same number of mm; of other numbers, two of which may lie between
-neighbouring numbers of the file, the nearest one or the next.
+Every number is written with the digits that read back exactly. Surfaces by numbers that a file does not hold are
+converted first (`written_form`). Lines are made in mm. A merit function of lengths and pure numbers depends on the
+unit, so a lens with a merit function is written in the unit of its file. A number that came from such a file reads back
+as the same number of mm; of other numbers, the file holds the nearest number or its neighbour.
 """
 
 import dataclasses
