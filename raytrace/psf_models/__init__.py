@@ -23,6 +23,7 @@ Tests: tests/test_psf_MODULE.py; test_psf (the call), test_psf_laws (all models)
 test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_shards (processes), test_plot_psf.
 """
 
+from raytrace import namespace
 from raytrace.psf_models.figures import CloseUp as CloseUp
 from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import DRT as DRT
@@ -34,8 +35,11 @@ from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.models import Paraxial as Paraxial
 from raytrace.psf_models.models import Wave as Wave
 from raytrace.psf_models.models import model_of as model_of
+from raytrace.psf_models.models import name_of as name_of
 from raytrace.psf_models.models import psf as psf
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels
 from raytrace.psf_models.result import Psf as Psf
 from raytrace.tracing.scene import Memo as Memo
+
+__getattr__, __dir__ = namespace(__name__)
