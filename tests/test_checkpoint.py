@@ -130,7 +130,7 @@ def test_a_checkpoint_of_an_older_version_is_refused(kept, tmp_path):
     document = json.loads(kept.read_text())
     path = tmp_path / "old.json"
     path.write_text(json.dumps({key: document[key] for key in ("merit", "cycles", "variables")}))
-    with pytest.raises(BadCheckpoint, match=r"old.json: does not say what it is of; an older version wrote it"):
+    with pytest.raises(BadCheckpoint, match=r"old.json: has no identity \('of'\); an older version wrote it"):
         rt.optimize(TRIPLET, resume=path, merit="spot", vary="curvature:1-4 sensor")
 
 
