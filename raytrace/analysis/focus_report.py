@@ -305,7 +305,7 @@ def _check_rays(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, w
         with torch.no_grad():
             valid = image_rays(trial, points, fields=fields, wavelengths=wavelengths).valid
         at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
-        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
+        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, prefix=at)
         arrived.append(valid.double().mean())
     lost = 1 - float(sum(arrived)) / len(arrived)
     if lost == 1:

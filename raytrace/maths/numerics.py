@@ -22,7 +22,7 @@ import types
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass as value
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,9 @@ from torch._C._functorch import get_unwrapped
 from torch._C._functorch import is_functorch_wrapped_tensor as is_wrapped
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
+
+#: A number of any type: a tensor, an array, a dual number or a plain number.
+Number: TypeAlias = Any
 
 #: A context in which torch's functions take tensors of a subclass as plain ones.
 plain_functions = torch._C.DisableTorchFunctionSubclass

@@ -371,7 +371,7 @@ def psf(
             where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
             at = where if len(distances) > 1 else ""
             trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
-            warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+            warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), prefix=at)
     return dataclasses.replace(
         psfs,
         lens=lens,

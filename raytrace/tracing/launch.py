@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import (
+    Number,
     broadcast_shape,
     detached,
     dot,
@@ -96,7 +97,7 @@ def launch(
     lens: Lens,
     pupil: Tensor,
     *,
-    fields: Tensor | None = None,
+    fields: Tensor | Sequence | None = None,
     wavelengths: Tensor | None = None,
     ray_aiming: str | None = None,
 ) -> Rays:
@@ -110,6 +111,7 @@ def launch(
     vignetted = vignette(lens, fields[:, :, None, None], pupil)
     field, wavelength = fields[:, :, None, None], wavelengths[:, None]
     rays = rays_of_field(lens, field, vignetted, wavelength=wavelength, ray_aiming=ray_aiming)
+    assert rays.opl is not None  # as `start` makes rays with paths
     batch = broadcast_shape(rays.shape, rays.opl.shape)
     position, direction = rays.position.expand(3, *batch), rays.direction.expand(3, *batch)
     return Rays(position, direction, rays.valid.expand(batch), rays.opl.expand(batch))
@@ -139,8 +141,8 @@ def rays_of_field(
 
     if _is_aimed(lens):
         radius = _aimed_radius(lens, beam, entrance)
-        pupil, found = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
-        reached = reached & found
+        pupil, aimed = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
+        reached = reached & aimed
     rays = through(pupil)
     return dataclasses.replace(rays, valid=rays.valid & reached)
 
@@ -156,12 +158,12 @@ def rays_from_point(point: Tensor, aim: Tensor, *, index: Tensor) -> Rays:
     return start(aim, chord, index * path_from_point(aim, point, dot(chord, unit(chord)), dot(point, unit(point))))
 
 
-def path_from_point(aim, point, chord, distance):
+def path_from_point(aim: Number, point: Number, chord: Number, distance: Number) -> Number:
     """Path in mm (n = 1) at aim points A less the distance |O| of the point; chord: |A - O|. Any number type."""
     return (dot(aim, aim) - 2 * dot(aim, point)) / (chord + distance)
 
 
-def path_towards_lens(path, distance, *, backward, virtual, nearer):
+def path_towards_lens(path: Number, distance: Number, *, backward: Number, virtual: Number, nearer: Number) -> Number:
     """Path of a ray that travels towards +z, started at the nearer of object point and aim point. Any number type.
 
     path: as of `path_from_point`; distance: |O|; backward: whether A lies before O; virtual: O behind surface 1;
@@ -330,10 +332,12 @@ def _through_entrance_pupil(
                 "object space is telecentric, which needs an aperture given as object NA or cone angle, not "
                 f"{lens.aperture.kind}"
             )
+        assert point is not None  # `lens.check` refuses objects at infinity
         radius, depth = -point[2] * torch.tan(cone_angle(lens, index)), torch.zeros_like(depth)
         aim_x, aim_y = point[0] + radius * pupil[0], point[1] + radius * pupil[1]
     elif entrance is not None:
-        aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
+        spread = _turned(entrance.spread, pupil)
+        aim_x, aim_y = entrance.centre[0] + spread[0], entrance.centre[1] + spread[1]
         depth = entrance.position
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
@@ -359,7 +363,7 @@ def _through_entrance_pupil(
     )
 
 
-def _scaled(field: Tensor, factor: Tensor) -> Tensor:
+def _scaled(field: Tensor, factor: Tensor | float) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
 
@@ -396,6 +400,7 @@ def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
     """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...), with the derivatives of the interpolation everywhere."""
     listed = torch.stack([lens.fields.x, lens.fields.y])
+    assert lens.fields.vignetting is not None
     vdx, vdy, vcx, vcy, angle = lens.fields.vignetting
     angle = torch.deg2rad(angle)
     maps = torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy])
@@ -484,16 +489,16 @@ def _at_least(maps: Tensor, knots: Tensor) -> Tensor:
     return torch.gather(maps, 1, place.expand(5, *place.shape))
 
 
-def _rise(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
-    """Maps (5, ...) at (1, ...), less that of the smallest knot; linear between knots (F, ...), constant outside.
+def _rise(knots: Tensor, maps: Tensor, place: Tensor) -> Tensor:
+    """Maps (5, ...) at a place (1, ...), less that of the smallest knot.
 
-    The derivative at a knot is the mean of those on both sides.
+    They are linear between knots (F, ...) and constant outside; at a knot the derivative is the mean of both sides.
     """
     knots, order = knots.sort(0)
     maps = torch.gather(maps, 1, order.expand_as(maps))
     width = knots.diff(dim=0)
     # Equal arguments of maximum and minimum have half of the derivative each.
-    beyond = torch.minimum(torch.maximum(at - knots[:-1], torch.zeros_like(at)), width)
+    beyond = torch.minimum(torch.maximum(place - knots[:-1], torch.zeros_like(place)), width)
     return (safe_divide(beyond, width) * maps.diff(dim=1)).sum(1)
 
 
@@ -569,17 +574,17 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most
-        at = int(worst.amax(-1).argmax())
-        radius = beams.radius.expand(len(worst), 1, 1, 1)[at, 0, 0, 0]
-        beams, worst = Filling(beams.chief[at], beams.marginal[at], beams.lost[at], radius), worst[at]
+        k = int(worst.amax(-1).argmax())
+        radius = beams.radius.expand(len(worst), 1, 1, 1)[k, 0, 0, 0]
+        beams, worst = Filling(beams.chief[k], beams.marginal[k], beams.lost[k], radius), worst[k]
     if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
         return ""
-    at = int(worst.argmax())
-    named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
+    f = int(worst.argmax())
+    field = f"{name_of_field(fields[:, f])} {FIELD_UNITS[lens.fields.kind]}"
     many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
     return (
-        f"field {named}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
-        f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
+        f"field {field}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
+        f"{_words(beams.chief[f], 'centre')}, marginal rays {_words(beams.marginal[f], 'rim')}"
         f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')"
     )
 

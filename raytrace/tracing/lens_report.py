@@ -13,8 +13,9 @@ from raytrace.maths.numerics import detached, summary, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
-from raytrace.system.phases import IdealLens
-from raytrace.system.poses import Pose
+from raytrace.system.phases import IdealLens, Phase
+from raytrace.system.poses import Pose, Turn
+from raytrace.system.sag_terms import SagTerms
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, vertex_curvature
 from raytrace.tracing.base_ray import base_ray
@@ -89,7 +90,7 @@ def _pose(pose: Pose | None) -> list[str]:
     return parts[::-1] if pose.tilts_first else parts
 
 
-def _fields(part) -> dict:
+def _fields(part: SagTerms | Phase | Pose | Turn) -> dict:
     """The fields of a value that are not None, tensors as numbers."""
     document = {}
     for field in dataclasses.fields(part):
@@ -212,8 +213,9 @@ class Info(Result):
             *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
         ]
-        shown = {**self.columns(), "radius": ["-" if s.is_break else _radius(s) for s in lens.surfaces]}
-        return [Table(shown, lines)]
+        columns: dict[str | Column, Tensor | Sequence] = {**self.columns()}
+        columns["radius"] = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
+        return [Table(columns, lines)]
 
 
 def info(lens: Lens) -> Info:

@@ -110,29 +110,29 @@ def warn_of_failures(
     fields: Tensor,
     wavelengths: Tensor | None = None,
     ray_aiming: str | None = None,
-    at: str = "",
+    prefix: str = "",
 ) -> None:
     """Warn LostRays for every field that loses all its rays at a wavelength, where and why; and of too wide a beam.
 
     pupil: (2, P), through which rays are traced once more; dark: (F, W), which of the fields (2, F) and wavelengths
-    (W,), the lens's by default; at: prefix of the message, as the object distance.
+    (W,), the lens's by default; prefix: of the message, as the object distance.
     """
     if not bool(dark.any()):
         return
     if dark.dim() > 2:  # of a batch: the first lens that loses a field
         of_lens = dark.any(-1).any(-1)
         first, several = int(of_lens.int().argmax()), f"{int(of_lens.sum())} of {len(of_lens)} lenses"
-        lens, dark, at = one_lens(lens, first), dark[first], f"{at}lens {first} ({several} lose fields): "
+        lens, dark, prefix = one_lens(lens, first), dark[first], f"{prefix}lens {first} ({several} lose fields): "
     some = dark.any(1)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
+    losses = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
     for place, (field, lost) in enumerate(zip(fields[:, some].unbind(1), dark[some].tolist(), strict=True)):
         wavelengths_of: dict[str, list[str]] = {}
         for w, wavelength in enumerate(wavelengths.tolist()):
             if lost[w]:
-                wavelengths_of.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
+                wavelengths_of.setdefault(losses.words(place, w), []).append(f"{wavelength:g}")
         for words, colours in wavelengths_of.items():
-            _warn(f"{at}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
+            _warn(f"{prefix}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
         _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")
 
@@ -155,10 +155,10 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
         dark = (~arrives.any(-1)[:, 0]).nonzero()[:, 0].tolist()
         if not dark:
             return
-        found = ray_failures(lens, pupil, fields=tried[:, dark], wavelengths=primary)
+        losses = ray_failures(lens, pupil, fields=tried[:, dark], wavelengths=primary)
     names, help_words = [_named(lens, tried[:, f]) for f in dark], _help(lens, fields)
     messages = [
-        f"no ray of field {name} reaches the sensor: {found.words(place, 0)}; {help_words}"
+        f"no ray of field {name} reaches the sensor: {losses.words(place, 0)}; {help_words}"
         for place, name in enumerate(names)
     ]
     if every or len(dark) == tried.shape[1]:

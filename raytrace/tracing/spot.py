@@ -76,8 +76,9 @@ def spot_of_points(
         around = itertools.repeat(None) if about is None else about.expand(2, *shape[:-1]).split(size, 1)
         parts = zip(points.split(size, 1), valid.expand(shape).split(size), weights.split(size), around, strict=False)
         each = zip(*(_statistics(*part) for part in parts), strict=True)
-        figures = [torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each)]
-    return Spot(*where_lit(*figures, empty=empty), points=points, valid=valid, rays=valid.sum(-1))
+        figures = tuple(torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each))
+    centroid, mean_square, rms, geometric = where_lit(*figures, empty=empty)
+    return Spot(centroid, mean_square, rms, geometric, points, valid, valid.sum(-1))
 
 
 def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | None) -> tuple[Tensor, ...]:
@@ -144,6 +145,9 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status
 
+#: Fields (2, F) and lenses of one trace.
+Chunk = tuple[Tensor, Lens]
+
 
 @value
 class Arrivals(Result):
@@ -188,7 +192,7 @@ def arrivals(
     *,
     fields: Tensor | None = None,
     ray_aiming: str | None = None,
-    progress: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter,
+    progress: Callable[[Sequence[Chunk]], Iterable[Chunk]] = iter,
 ) -> Arrivals:
     """Trace points (2, P) of the pupil and their weights (P,) to the sensor, as many fields at once as a chunk holds.
 
@@ -209,7 +213,7 @@ def arrivals(
         launched = launch(part, pupil, fields=some, ray_aiming=ray_aiming)
         launched = dataclasses.replace(launched, opl=None)
         rays = trace_lens(part, launched, lens.wavelengths[:, None])
-        on_sensor = rays, rays.valid, None
+        on_sensor: tuple[Rays, Tensor, Tensor | None] = rays, rays.valid, None
         if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails
             reached = launched.valid
             for crossing, status in ray_status(part, launched, lens.wavelengths[:, None]):
@@ -217,7 +221,7 @@ def arrivals(
                 on_sensor = crossing.rays, reached, status
         each.append(on_sensor)
 
-    def joined(parts: Sequence[Tensor]) -> Tensor:
+    def joined(parts: list[Tensor]) -> Tensor:
         rows = [parts[k : k + len(lenses)] for k in range(0, len(parts), len(lenses))]
         return _cat([_cat(row, -4) for row in rows], -3)
 
@@ -232,7 +236,7 @@ def arrivals(
     return Arrivals(rays, status, reached, weight, pupil, fields, lens.wavelengths)
 
 
-def _cat(parts: Sequence[Tensor], dim: int) -> Tensor:
+def _cat(parts: list[Tensor], dim: int) -> Tensor:
     return torch.cat(parts, dim) if len(parts) > 1 else parts[0]
 
 

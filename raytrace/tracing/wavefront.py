@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import dot, root, safe_divide, safe_sqrt, unit, value
+from raytrace.maths.numerics import Number, dot, root, safe_divide, safe_sqrt, unit, value
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays
@@ -55,7 +55,7 @@ class Wavefront:
     index: Tensor
 
 
-def path_to_reference_sphere(rays, centre, curvature, index):
+def path_to_reference_sphere(rays: Number, centre: Number, curvature: Number, index: Number) -> Number:
     """Reduced path W (...) in mm of rays up to the reference sphere they are about to cross; OPD = W - W_chief.
 
         W = W_rays + n [ κ e²/(1 + √(1 - κ² e²)) - (P - Q)·d ],   e = |(P - Q) - ((P - Q)·d) d|
@@ -72,7 +72,7 @@ def path_to_reference_sphere(rays, centre, curvature, index):
     return rays.opl + index * (bend / (1 + root(1 - curvature * bend)) - along)
 
 
-def towards_centre(rays, centre, curvature):
+def towards_centre(rays: Number, centre: Number, curvature: Number) -> Number:
     """Unit vectors (3, ...) from where rays cross the reference sphere to its centre, (Q - q)/R.
 
     s = √(1 - κ² e²) d - κ e: the ray's own direction for a plane. Arguments as for `path_to_reference_sphere`.
@@ -188,10 +188,10 @@ def _from_bent_pupil(scene: Scene, centre: Tensor, direction: Tensor) -> Tensor:
     tangential, sagittal = base.exit_pupil_position
     place = safe_divide(2 * tangential, 1 + tangential / sagittal)
     place = torch.where(torch.isinf(tangential), 2 * sagittal, place)
-    at, along = (vector[..., None] for vector in (base.position, base.direction))
+    vertex, along = (vector[..., None] for vector in (base.position, base.direction))
     slant = dot(direction, along)
     finite = base.valid[..., None] & torch.isfinite(place)[..., None] & (slant != 0)
-    ahead = dot(centre - at, along) - torch.where(finite, place[..., None], 0.0)
+    ahead = dot(centre - vertex, along) - torch.where(finite, place[..., None], 0.0)
     radius = ahead / torch.where(finite, slant, 1.0)
     return torch.where(finite & (radius != 0), radius, torch.inf)
 
@@ -228,12 +228,12 @@ def zernike_coefficients(
     """
     if numbering not in zernike.NUMBERINGS:
         raise ValueError(f"Zernike terms by {numbering!r}: expected one of {', '.join(zernike.NUMBERINGS)}")
-    order, unity = zernike.NUMBERINGS[numbering]
-    orders = [order(j) for j in range(1, count + 1)]
+    order_of, unity = zernike.NUMBERINGS[numbering]
+    orders = [order_of(j) for j in range(1, count + 1)]
     basis = _basis(wavefront, orders)
-    found, known = zernike.fit_known(wavefront.opd, basis, wavefront.energy, worst=_WORST_CONDITION)
-    found = found * found.new_tensor([zernike.norm(*o) for o in orders]) if unity == "rim" else found
-    return where_lit(known[..., None], found, empty=empty)[0]
+    terms, known = zernike.fit_known(wavefront.opd, basis, wavefront.energy, worst=_WORST_CONDITION)
+    terms = terms * terms.new_tensor([zernike.norm(*order) for order in orders]) if unity == "rim" else terms
+    return where_lit(known[..., None], terms, empty=empty)[0]
 
 
 def without(wavefront: Wavefront, count: int) -> Tensor:
