@@ -19,7 +19,7 @@ from raytrace.analysis.setting import (
 )
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.plotting.style import GREY, array, styled
+from raytrace.plotting.style import GREY, Figure, array, styled
 from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector
 from raytrace.tracing.f_number import axial_f_number
@@ -56,10 +56,10 @@ class EncircledEnergy(Analysis):
         return _encircled(self.lens, self.fields, fine(self.radii), self.geometric)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Share of the light over the radius about the centroid. Radii that were asked for are marked."""
         curves = self.drawn()
-        _, panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
+        panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
         radii = 1e3 * array(curves.radii)
         by_field(panel, curves, radii, share=array(curves.share))
         if self.marked:

@@ -118,7 +118,7 @@ def unfold(grid: Grid, values: Tensor) -> Tensor:
     return values[..., index]
 
 
-def _offsets(rows: int, columns: int) -> list[np.ndarray]:
+def _offsets(rows: int, columns: int) -> Sequence[np.ndarray]:
     """y and x (rows, columns) of the centres of the pixels, in pixels."""
     return np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in (rows, columns)), indexing="ij")
 

@@ -57,7 +57,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
-from raytrace.tracing.paraxial import CONES, Beam, axial_beam, cone_angle, field_scale
+from raytrace.tracing.paraxial import CONES, Beam, FirstOrder, axial_beam, cone_angle, field_scale
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
 from raytrace.words import RaytraceWarning, calling_level, named_value
 
@@ -209,7 +209,7 @@ def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]
     return aim_at_image(lens, through, field, estimate, radius)
 
 
-def paraxial_field(lens: Lens, field: Tensor, beam: Beam) -> Tensor:
+def paraxial_field(lens: Lens, field: Tensor, beam: Beam | FirstOrder) -> Tensor:
     """As `object_field`, real image heights as if they were paraxial ones."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind == "object_height":
@@ -220,7 +220,7 @@ def paraxial_field(lens: Lens, field: Tensor, beam: Beam) -> Tensor:
     return extent if kind == "angle" and at_infinity else _scaled(extent, _paraxial_scale(lens, beam))
 
 
-def field_of_object(lens: Lens, extent: Tensor, beam: Beam) -> Tensor:
+def field_of_object(lens: Lens, extent: Tensor, beam: Beam | FirstOrder) -> Tensor:
     """Field points (2, ...) of slopes, or object heights in mm, (2, ...): the inverse of `paraxial_field`."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind != "object_height" and not (kind == "angle" and at_infinity):
@@ -236,7 +236,7 @@ def object_point(lens: Lens, height: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(x, y, z - source.thickness))
 
 
-def _paraxial_scale(lens: Lens, beam: Beam) -> Tensor | float:
+def _paraxial_scale(lens: Lens, beam: Beam | FirstOrder) -> Tensor | float:
     """`field_scale` of the kind of field of a lens."""
     return field_scale(
         lens.fields.kind,

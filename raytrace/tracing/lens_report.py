@@ -213,9 +213,8 @@ class Info(Result):
             *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
         ]
-        columns: dict[str | Column, Tensor | Sequence] = {**self.columns()}
-        columns["radius"] = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
-        return [Table(columns, lines)]
+        radius = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
+        return [Table({**self.columns(), "radius": radius}, lines)]
 
 
 def info(lens: Lens) -> Info:

@@ -187,7 +187,7 @@ def hits(shot: Shot, pupil: Tensor) -> tuple[Tensor, Tensor]:
     return rays.position[:2], rays.valid
 
 
-def chunk_size(shot: Shot, max_bytes: int, *, kept: int = 0, recorded: bool = False) -> int:
+def chunk_size(shot: Shot, max_bytes: float, *, kept: int = 0, recorded: bool = False) -> int:
     """Rays of a chunk, a power of two, whose temporaries stay within max_bytes less those `kept` for results.
 
     recorded: whether a graph is recorded. Raises ValueError for fewer than 256 rays.

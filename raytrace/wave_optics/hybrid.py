@@ -193,7 +193,7 @@ def hybrid_psf(
     view = scene(lens, fields, distances, colours)
     chief = chief_landing(dataclasses.replace(view, wavelengths=lens.primary[None]))
     window = make_grid(like.new_tensor(pixel), size, chief.expand(*chief.shape[:-1], len(colours)))
-    psfs = polychromatic(kernels(view, parts, window, order=order), None, "hybrid")
+    psfs = polychromatic(kernels(view, parts, window, order=order), view, None, "hybrid")
     weights = torch.ones_like(colours) if wavelengths is not None else lens.wavelength_weights
     return dataclasses.replace(
         psfs,
