@@ -240,7 +240,7 @@ def kernels_of_rays(
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
     like = scene.lens.surfaces[-2].thickness
     points, _ = sampling(rays, dtype=like.dtype, device=like.device)
-    return dataclasses.replace(kernels_of_points(scene, grid, points, width=width), rays=rays)
+    return kernels_of_points(scene, grid, points, width=width, rays=rays)
 
 
 def trace_fans(scene: Scene, order: int) -> Fans:
@@ -385,15 +385,17 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(weights.sum((-2, -1)) > 0, centroid, 0.0), covariance
 
 
-def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, *, width: float = _RAY_WIDTH) -> Kernels:
-    """Kernels of independent rays through pupil points (2, P), all of one weight."""
-    traced = trace_scene(scene, disc)
-    energy = torch.where(traced.valid, 1 / disc.shape[1], 0.0).expand(*scene.shape, -1)
+def kernels_of_points(
+    scene: Scene, grid: Grid, disc: Tensor, *, width: float = _RAY_WIDTH, rays: int | None = None
+) -> Kernels:
+    """Kernels of independent rays through pupil points (2, P), all of one weight, 1/rays; rays: P by default."""
+    traced, rays = trace_scene(scene, disc), disc.shape[1] if rays is None else rays
+    energy = torch.where(traced.valid, 1 / rays, 0.0).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]
     centroid, covariance = moments_of_rays(points, energy)
-    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=energy.sum(-1) * light)
+    return Kernels(kernel, grid, centroid, covariance, rays, arrived=energy.sum(-1) * light)
 
 
 @torch.no_grad()
